@@ -1,0 +1,724 @@
+"""ActPC: active predictive coding as a Stable-Baselines3 algorithm (Ororbia & Mali, arXiv 2209.09174, Algorithm 1)."""
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, ClassVar, NamedTuple, TypeVar
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+
+from sb3_actpc.actpc.diagnostics import Diagnostics
+from sb3_actpc.actpc.policies import ActPCPolicy, MlpPolicy, MultiInputPolicy
+from sb3_actpc.actpc.signals import SIGNAL_ERRORS, make_normalizer, summed_squared_errors
+from sb3_actpc.common.buffers import _SignalReplay, combined_buffer_class
+from sb3_actpc.common.checks import check_choices, check_finite, check_numbers
+from sb3_actpc.common.demonstrations import Demonstrations, resolve
+from sb3_actpc.common.episodes import Episodes, map_observations, sample_union
+from sb3_actpc.common.type_aliases import ImitationSamples, TensorObservations
+from sb3_actpc.ngc import HebbianChanges, settle_coupled
+
+SelfActPC = TypeVar("SelfActPC", bound="ActPC")
+
+BOOTSTRAPS = ("joint", "literal")
+TARGET_UPDATES = ("polyak", "hard")
+OBSERVATION_NORMALIZATIONS = ("none", "demonstrations")
+EXPERT_SIGNALS_INTERVAL = 1000  # updates between two evaluations of the demonstrations' signals
+
+
+class Batch(NamedTuple):
+    """
+    Transitions as the circuits see them, B rows, the newest first, demonstrations (if mixed in) last.
+
+    :param features: normalised observations, (B, n_features)
+    :param actions: (B, A), in [-1, 1]
+    :param next_features: (B, n_features)
+    :param memory: m_t, (B, n_memory), or None
+    :param next_memory: m_{t+1}, (B, n_memory), or None
+    :param rewards: the combined reward r_t, (B, 1)
+    :param dones: (B, 1)
+    :param discounts: (B, 1), or the number γ
+    :param n_replayed: how many rows come from the replay buffer
+    """
+
+    features: th.Tensor
+    actions: th.Tensor
+    next_features: th.Tensor
+    memory: th.Tensor | None
+    next_memory: th.Tensor | None
+    rewards: th.Tensor
+    dones: th.Tensor
+    discounts: th.Tensor | float
+    n_replayed: int
+
+
+class ActPC(OffPolicyAlgorithm):
+    """
+    Active predictive coding: four NGC circuits that learn by settling and Hebbian changes, never by backprop.
+
+    The actor acts; the critic values its actions; the generator's surprise is an epistemic reward; the prior, learned from
+    demonstrations and then frozen, gives an instrumental one. Paper: https://arxiv.org/abs/2209.09174. Defaults are the
+    paper's (its tables for HalfCheetah) except where a comment at the constructor says otherwise. Without demonstrations
+    there is no prior, and the task's reward takes its role.
+
+    :param policy: "MlpPolicy", "MultiInputPolicy" or a class
+    :param env: the environment, or its id
+    :param learning_rate: of all circuits, or a schedule; circuits can have their own (``actor_kwargs`` and so on)
+    :param buffer_size: transitions in the replay buffer
+    :param learning_starts: environment steps with random actions before anything is learned
+    :param batch_size: of all circuits; circuits can have their own
+    :param tau: Polyak rate of the targets
+    :param gamma: discount
+    :param train_freq: environment steps (or episodes) between updates
+    :param gradient_steps: updates each time; -1 for as many as steps were collected
+    :param action_noise: exploration noise added to the action; the paper has none
+    :param replay_buffer_class: None, or one of SB3's classes (its ActPC counterpart is used)
+    :param replay_buffer_kwargs: keywords of the buffer
+    :param optimize_memory_usage: as in SB3
+    :param n_steps: length of n-step returns
+    :param settling: "iterative" (the paper) or "scheduled" (cheaper, numerically backprop without autograd)
+    :param circuit_kwargs: further keywords of every :class:`~sb3_actpc.ngc.NGCCircuit` (``n_settling_steps``, ``feedback``,
+        ``dynamics``, ``activation``, ``synaptic_scaling``, ...)
+    :param actor_kwargs: the same for the actor alone, and its ``net_arch``, ``learning_rate`` and ``batch_size``
+    :param critic_kwargs: the same for the critic
+    :param generator_kwargs: the same for the generator
+    :param prior_kwargs: the same for the prior
+    :param demonstrations: a path, or a :class:`~sb3_actpc.common.demonstrations.Demonstrations`
+    :param n_demonstrations: use only the first so many episodes of them
+    :param n_demonstration_transitions: use only the first so many transitions (the paper's "300 samples")
+    :param prior_updates: updates of the prior on the demonstrations before learning starts; then it is frozen
+    :param actor_warm_start: updates of the actor on the demonstrations before learning starts
+    :param refresh_weight: weight of the actor's refresh from the demonstrations and its own best episodes
+    :param self_imitation_size: transitions in the memory of the agent's own best episodes; 0 for none
+    :param demonstration_fraction: share of the critic's batch that comes from the demonstrations
+    :param alpha_ep: weight of the epistemic signal
+    :param alpha_in: weight of the instrumental signal
+    :param alpha_ext: weight of the task's reward; by default 0 with demonstrations (the paper) and 1 without
+    :param signal_normalizer: "max" (running maximum, the paper), "saturating" (r / (r + 1)) or "quantile"
+    :param signal_errors: the signals sum the squared errors of "all" layers (the paper) or of the "output" alone
+    :param actor_pressure: weight of the critic's pressure on the actor; 0 leaves refresh alone (cloning)
+    :param scale_pressure: divide the pressure by the batch's mean absolute action-value
+    :param nudge: scale of the critic's clamped error while actor and critic settle as one (1 is the paper's)
+    :param critic_warmup: updates before the critic's pressure reaches the actor
+    :param n_critics: critic circuits; with two or more the smallest target value bootstraps
+    :param bootstrap: "joint" (target critic at the target actor's next action, the appendix) or "literal" (at the action
+        taken, the main text's equation)
+    :param target_policy_noise: standard deviation of the noise on the target actor's action; 0 for none
+    :param target_noise_clip: its bound
+    :param target_update: "polyak" (every update) or "hard" (a copy every ``target_update_interval`` transitions)
+    :param target_update_interval: C
+    :param combined_replay: the newest transition of every environment is in every batch
+    :param working_memory: feed actor, generator and prior the last ``memory_history`` observations
+    :param memory_history: H
+    :param observation_normalization: "none" (the paper) or "demonstrations" (their mean and standard deviation, fixed)
+    :param policy_kwargs: further keywords of :class:`~sb3_actpc.actpc.policies.ActPCPolicy`
+    :param stats_window_size: as in SB3
+    :param tensorboard_log: as in SB3
+    :param verbose: as in SB3
+    :param device: as in SB3
+    :param seed: as in SB3
+    :raises ValueError: for a keyword with a value that is not allowed, for action spaces that are not Boxes, for
+        demonstrations that do not fit the environment
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": MlpPolicy, "MultiInputPolicy": MultiInputPolicy}
+    policy: ActPCPolicy  # type: ignore[assignment]
+    replay_buffer: _SignalReplay | None  # type: ignore[assignment]
+
+    def __init__(
+        self,
+        policy: str | type[ActPCPolicy],
+        env: GymEnv | str,
+        learning_rate: float | Schedule = 4e-4,
+        buffer_size: int = 1_000_000,
+        learning_starts: int = 100,
+        batch_size: int = 256,
+        tau: float = 0.005,  # the paper's 0.05 to 0.15 chases its own tail when the task's reward counts
+        gamma: float = 0.99,
+        train_freq: int | tuple[int, str] = 1,
+        gradient_steps: int = 1,
+        action_noise: ActionNoise | None = None,
+        replay_buffer_class: type[ReplayBuffer] | None = None,
+        replay_buffer_kwargs: dict[str, Any] | None = None,
+        optimize_memory_usage: bool = False,
+        n_steps: int = 1,
+        *,
+        settling: str = "iterative",
+        circuit_kwargs: dict[str, Any] | None = None,
+        actor_kwargs: dict[str, Any] | None = None,
+        critic_kwargs: dict[str, Any] | None = None,
+        generator_kwargs: dict[str, Any] | None = None,
+        prior_kwargs: dict[str, Any] | None = None,
+        demonstrations: Demonstrations | str | Path | None = None,
+        n_demonstrations: int | None = None,
+        n_demonstration_transitions: int | None = None,
+        prior_updates: int = 2000,
+        actor_warm_start: int = 0,
+        refresh_weight: float = 1.0,
+        self_imitation_size: int = 100_000,
+        demonstration_fraction: float = 0.0,
+        alpha_ep: float = 1.0,
+        alpha_in: float = 1.0,
+        alpha_ext: float | None = None,
+        signal_normalizer: str = "max",
+        signal_errors: str = "all",
+        actor_pressure: float = 1.0,
+        scale_pressure: bool = False,
+        nudge: float = 0.01,
+        critic_warmup: int = 0,
+        n_critics: int = 1,
+        bootstrap: str = "joint",
+        target_policy_noise: float = 0.0,
+        target_noise_clip: float = 0.5,
+        target_update: str = "polyak",
+        target_update_interval: int = 500,
+        combined_replay: bool = True,
+        working_memory: bool = False,
+        memory_history: int = 7,
+        observation_normalization: str = "none",
+        policy_kwargs: dict[str, Any] | None = None,
+        stats_window_size: int = 100,
+        tensorboard_log: str | None = None,
+        verbose: int = 0,
+        device: th.device | str = "auto",
+        seed: int | None = None,
+        _init_setup_model: bool = True,
+    ) -> None:
+        given = dict(locals())
+        check_choices(
+            given,
+            signal_errors=SIGNAL_ERRORS,
+            bootstrap=BOOTSTRAPS,
+            target_update=TARGET_UPDATES,
+            observation_normalization=OBSERVATION_NORMALIZATIONS,
+        )
+        check_numbers(
+            given,
+            at_least_0="prior_updates actor_warm_start refresh_weight self_imitation_size actor_pressure critic_warmup "
+            "target_policy_noise target_noise_clip",
+            at_least_1="n_critics target_update_interval memory_history",
+            fraction="demonstration_fraction nudge",
+        )
+        super().__init__(
+            policy,
+            env,
+            learning_rate,
+            buffer_size,
+            learning_starts,
+            batch_size,
+            tau,
+            gamma,
+            train_freq,
+            gradient_steps,
+            action_noise=action_noise,
+            replay_buffer_class=replay_buffer_class,
+            replay_buffer_kwargs=replay_buffer_kwargs,
+            optimize_memory_usage=optimize_memory_usage,
+            n_steps=n_steps,
+            policy_kwargs=policy_kwargs,
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            verbose=verbose,
+            device=device,
+            seed=seed,
+            sde_support=False,
+            supported_action_spaces=(spaces.Box,),
+            support_multi_env=True,
+        )
+        own = set(given) - {"self", "policy", "env", "policy_kwargs", "_init_setup_model", "__class__"}
+        for name in own - set(self.__dict__) | {"demonstrations"}:
+            setattr(self, name, given[name])
+        self.epistemic_normalizer = make_normalizer(signal_normalizer)
+        self.instrumental_normalizer = make_normalizer(signal_normalizer)
+        self.pretrained = False
+        if _init_setup_model:
+            self._setup_model()
+
+    # The keywords stored above, for readers and type checkers
+    settling: str
+    circuit_kwargs: dict[str, Any] | None
+    actor_kwargs: dict[str, Any] | None
+    critic_kwargs: dict[str, Any] | None
+    generator_kwargs: dict[str, Any] | None
+    prior_kwargs: dict[str, Any] | None
+    demonstrations: Demonstrations | str | Path | None
+    n_demonstrations: int | None
+    n_demonstration_transitions: int | None
+    prior_updates: int
+    actor_warm_start: int
+    refresh_weight: float
+    self_imitation_size: int
+    demonstration_fraction: float
+    alpha_ep: float
+    alpha_in: float
+    alpha_ext: float | None
+    signal_errors: str
+    actor_pressure: float
+    scale_pressure: bool
+    nudge: float
+    critic_warmup: int
+    n_critics: int
+    bootstrap: str
+    target_policy_noise: float
+    target_noise_clip: float
+    target_update: str
+    target_update_interval: int
+    combined_replay: bool
+    working_memory: bool
+    memory_history: int
+    observation_normalization: str
+
+    # ------------------------------------------------------------------ setting up
+
+    def _setup_model(self) -> None:
+        if not np.all(np.isfinite([self.action_space.low, self.action_space.high])):  # type: ignore[attr-defined]
+            raise ValueError(f"action_space={self.action_space} must have finite bounds; wrap the environment to rescale it")
+        asked = self.replay_buffer_class, self.replay_buffer_kwargs, self.policy_kwargs, self.n_steps
+        self.replay_buffer_class = combined_buffer_class(self.replay_buffer_class, self.observation_space)
+        self.replay_buffer_kwargs = {
+            "combined": self.combined_replay,
+            "history": self.history,
+            "self_imitation_size": self.self_imitation_size,
+            "n_steps": self.n_steps,
+            "gamma": self.gamma,
+            **self.replay_buffer_kwargs,
+        }
+        self.policy_kwargs = self._merged_policy_kwargs()
+        self.n_steps = 1  # the buffer knows; SB3 would warn that a custom one does not
+        super()._setup_model()
+        self.replay_buffer_kwargs, self.policy_kwargs, self.n_steps = asked[1:]
+        self._create_aliases()
+        self._setup_demonstrations()
+        self.diagnostics = Diagnostics(self.policy)
+
+    def _merged_policy_kwargs(self) -> dict[str, Any]:
+        own = {
+            "n_critics": self.n_critics,
+            "memory_history": self.history,
+            **{f"{name}_kwargs": getattr(self, f"{name}_kwargs") for name in ("actor", "critic", "generator", "prior")},
+        }
+        merged = {**own, **self.policy_kwargs}
+        merged["circuit_kwargs"] = {"settling": self.settling, **(self.circuit_kwargs or {}), **merged.get("circuit_kwargs", {})}
+        return merged
+
+    @property
+    def history(self) -> int:
+        """Observations in the working memory; 0 without one."""
+        return self.memory_history if self.working_memory else 0
+
+    def _create_aliases(self) -> None:
+        self.actor = self.policy.actor
+        self.critic = self.policy.critic
+        self.generator = self.policy.generator
+        self.prior = self.policy.prior
+        self.actor_target = self.policy.actor_target
+        self.critic_target = self.policy.critic_target
+
+    def _setup_demonstrations(self) -> None:
+        """Check the demonstrations against the environment, cut them, and derive what follows from having them."""
+        self.expert: Episodes | None = None
+        if self.demonstrations is None:
+            if self.demonstration_fraction or self.actor_warm_start or self.observation_normalization == "demonstrations":
+                raise ValueError(
+                    "demonstration_fraction, actor_warm_start and observation_normalization='demonstrations' need "
+                    "demonstrations=; pass a file or leave them out"
+                )
+            return
+        demonstrations = resolve(self.demonstrations).select(self.n_demonstrations, self.n_demonstration_transitions)
+        demonstrations.check(self.observation_space, self.action_space, self._env_id())
+        assert isinstance(self.action_space, spaces.Box)
+        self.expert = Episodes.from_demonstrations(demonstrations, self.observation_space, self.action_space)
+        self._expert_transitions = demonstrations
+        if self.observation_normalization == "demonstrations" and not self.pretrained:
+            features = self._features(self._to_tensors(self.expert.observations))
+            self.actor.normalizer.fit(features)
+        self._expert_signals = np.zeros((2, len(self.expert)), dtype=np.float32)
+
+    def _env_id(self) -> str | None:
+        if self.env is None or not self.env.has_attr("spec"):
+            return None
+        spec = self.env.get_attr("spec", indices=0)[0]
+        return None if spec is None else spec.id
+
+    @property
+    def has_prior(self) -> bool:
+        """Whether there are demonstrations, and with them a prior circuit."""
+        return self.expert is not None
+
+    @property
+    def reward_weights(self) -> tuple[float, float, float]:
+        """(α_ext, α_ep, α_in) as used: without demonstrations there is no prior and the task's reward takes its role."""
+        if self.has_prior:
+            return (0.0 if self.alpha_ext is None else self.alpha_ext), self.alpha_ep, self.alpha_in
+        return (1.0 if self.alpha_ext is None else self.alpha_ext), self.alpha_ep, 0.0
+
+    # ------------------------------------------------------------------ before learning: prior and warm start
+
+    def _setup_learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        reset_num_timesteps: bool = True,
+        tb_log_name: str = "run",
+        progress_bar: bool = False,
+    ) -> tuple[int, BaseCallback]:
+        result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
+        if reset_num_timesteps or not hasattr(self, "_rollout_state"):
+            self._rollout_state: tuple[np.ndarray, ...] | None = None
+            self._rollout_starts = np.ones(self.n_envs, dtype=bool)
+        self.pretrain()
+        return result
+
+    def pretrain(self) -> None:
+        """Train the prior (and, if asked for, the actor) on the demonstrations, once; ``learn`` calls this."""
+        if self.pretrained or self.expert is None:
+            return
+        for _ in range(self.prior_updates):
+            self._update_prior(self.policy.batch_size_of("prior", self.batch_size))
+        for _ in range(self.actor_warm_start):
+            self.actor.circuit.apply_changes(self._refresh_changes(), self.actor.circuit.optimizer)
+        self.actor_target.load_state_dict(self.actor.circuit.state_dict())
+        self.pretrained = True
+
+    def _update_prior(self, batch_size: int) -> None:
+        rows = np.random.randint(0, len(self._expert_transitions), size=batch_size)
+        features, _, next_features, memory, _ = self._expert_rows(rows)
+        state = self.prior.settle(features, next_features, memory)
+        self.prior.apply_changes(self.prior.hebbian_update(state), self.prior.optimizer)
+
+    # ------------------------------------------------------------------ collecting
+
+    def _sample_action(
+        self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
+    ) -> tuple[np.ndarray, np.ndarray]:
+        if self.num_timesteps < learning_starts:
+            unscaled = np.array([self.action_space.sample() for _ in range(n_envs)])
+        else:
+            assert self._last_obs is not None
+            unscaled, _ = self.policy.predict(self._last_obs, self._rollout_state, self._rollout_starts)
+        scaled = self.policy.scale_action(unscaled)
+        check_finite("actor", "actions", scaled, self.num_timesteps)
+        if action_noise is not None:
+            scaled = np.clip(scaled + action_noise(), -1.0, 1.0)
+        return self.policy.unscale_action(scaled), scaled
+
+    def _store_transition(
+        self,
+        replay_buffer: ReplayBuffer,
+        buffer_action: np.ndarray,
+        new_obs: np.ndarray | dict[str, np.ndarray],
+        reward: np.ndarray,
+        dones: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        map_observations(lambda array: check_finite("environment", "observations", array, self.num_timesteps), new_obs)
+        check_finite("environment", "rewards", reward, self.num_timesteps)
+        if self.history:
+            assert self._last_obs is not None
+            _, self._rollout_state = self.policy.predict(self._last_obs, self._rollout_state, self._rollout_starts)
+        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+        self._rollout_starts = np.array(dones, dtype=bool)
+        self._compute_newest_signals()
+
+    def _compute_newest_signals(self) -> None:
+        """The signals of the transitions just stored (Algorithm 1, lines 10 to 13)."""
+        _, alpha_ep, alpha_in = self.reward_weights
+        if not (alpha_ep or alpha_in):
+            return
+        assert self.replay_buffer is not None
+        newest = self.replay_buffer.newest_transitions(self._vec_normalize_env)
+        features, next_features = self._features(newest.observations), self._features(newest.next_observations)
+        memory = self._memory(newest.history, newest.history_mask)
+        raw_ep, raw_in = self._raw_signals(features, newest.actions, next_features, memory)
+        epistemic = self.epistemic_normalizer(raw_ep) if alpha_ep else raw_ep
+        instrumental = -self.instrumental_normalizer(raw_in) if alpha_in else raw_in
+        check_finite("generator", "signals", epistemic, self.num_timesteps)
+        check_finite("prior", "signals", instrumental, self.num_timesteps)
+        self.replay_buffer.set_newest_signals(epistemic, instrumental)
+        self.diagnostics.follow(epistemic_signal=epistemic.mean(), instrumental_signal=instrumental.mean())
+
+    def _raw_signals(
+        self, features: th.Tensor, actions: th.Tensor, next_features: th.Tensor, memory: th.Tensor | None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Summed squared errors of generator and prior, (B,) each; zeros where the signal has no weight."""
+        _, alpha_ep, alpha_in = self.reward_weights
+        epistemic, instrumental = np.zeros((2, len(features)), dtype=np.float32)
+        if alpha_ep:
+            state = self.generator.settle(th.cat([features, actions], dim=1), next_features, memory)
+            epistemic = summed_squared_errors(state, self.signal_errors).cpu().numpy()
+        if alpha_in:
+            state = self.prior.settle(features, next_features, memory)
+            instrumental = summed_squared_errors(state, self.signal_errors).cpu().numpy()
+        return epistemic, instrumental
+
+    # ------------------------------------------------------------------ learning
+
+    def train(self, gradient_steps: int, batch_size: int = 256) -> None:
+        """
+        The updates of Algorithm 1 (lines 15 to 23), ``gradient_steps`` times.
+
+        :param gradient_steps: how many updates of every circuit
+        :param batch_size: B
+        """
+        self.policy.set_training_mode(True)
+        self._update_learning_rate([circuit.optimizer for _, circuit in self.policy.named_circuits()])
+        for _ in range(gradient_steps):
+            self._n_updates += 1
+            self.diagnostics.begin_update(self._n_updates, self.num_timesteps)
+            batch = self._sample_batch(batch_size)
+            self._update_actor(batch)
+            self._update_critic(batch)
+            self._update_generator(batch)
+            if self.target_update == "polyak":
+                self._update_targets(self.tau)
+        self._log_training()
+
+    def _update_learning_rate(self, optimizers: list[th.optim.Optimizer] | th.optim.Optimizer) -> None:
+        """SB3's schedule, times what each parameter group asks for (γ_e, a circuit's own learning rate)."""
+        super()._update_learning_rate(optimizers)
+        for optimizer in optimizers if isinstance(optimizers, Iterable) else [optimizers]:
+            for group in optimizer.param_groups:
+                group["lr"] *= group["lr_scale"]
+
+    def _sample_batch(self, batch_size: int) -> Batch:
+        """Replayed transitions, the newest among them, then the share that comes from the demonstrations."""
+        assert self.replay_buffer is not None
+        n_expert = round(self.demonstration_fraction * batch_size) if self.expert is not None else 0
+        replayed = self.replay_buffer.sample(batch_size - n_expert, env=self._vec_normalize_env)
+        features = self._features(replayed.observations)
+        weights = self.reward_weights
+        rewards = weights[0] * replayed.rewards + weights[1] * replayed.epistemic + weights[2] * replayed.instrumental
+        memory = self._memory(replayed.history, replayed.history_mask)
+        batch = Batch(
+            features,
+            replayed.actions,
+            self._features(replayed.next_observations),
+            memory,
+            self._next_memory(replayed.history, replayed.history_mask, features),
+            rewards,
+            replayed.dones,
+            self.gamma if replayed.discounts is None else replayed.discounts,
+            len(features),
+        )
+        self.diagnostics.follow(internal_reward=(rewards - weights[0] * replayed.rewards).mean, task_reward=replayed.rewards.mean)
+        return self._with_expert(batch, n_expert) if n_expert else batch
+
+    def _update_actor(self, batch: Batch) -> None:
+        """Motor-action circuit: pressure of the critic (line 17) plus refresh (line 23), in one step of the optimiser."""
+        changes = self._refresh_changes() if self.refresh_weight and self._imitated() else None
+        if changes is not None:
+            changes.scale_(self.refresh_weight)
+        if self.actor_pressure and self._n_updates > self.critic_warmup:
+            rows = slice(self.policy.batch_size_of("actor", len(batch.features)))
+            memory = None if batch.memory is None else batch.memory[rows]
+            critic = self.critic[0]
+            coupled = settle_coupled(self.actor.circuit, critic, batch.features[rows], memory, self.nudge)
+            pressure = self.actor.circuit.hebbian_update(coupled.actor)
+            weight = self.actor_pressure / coupled.action_values.abs().mean() if self.scale_pressure else self.actor_pressure
+            changes = pressure.scale_(weight) if changes is None else changes.add_(pressure.scale_(weight))
+            self.diagnostics.coupled(coupled, pressure, batch.features[rows], memory)
+        if changes is not None:
+            self.actor.circuit.apply_changes(changes, self.actor.circuit.optimizer)
+
+    def _update_critic(self, batch: Batch) -> None:
+        """Policy circuit(s): settle on the bootstrapped targets (lines 19 and 20)."""
+        rows = slice(self.policy.batch_size_of("critic", len(batch.features)))
+        inputs = th.cat([batch.features, batch.actions], dim=1)[rows]
+        targets = self._critic_targets(batch)[rows]
+        for index, critic in enumerate(self.critic):
+            state = critic.settle(inputs, targets)
+            critic.apply_changes(critic.hebbian_update(state), critic.optimizer)
+            self.diagnostics.settled(f"critic.{index}", state)
+
+    def _critic_targets(self, batch: Batch) -> th.Tensor:
+        """t = r + γ c, or r alone when terminal; one and the same reward for every action output, (B, A)."""
+        if self.bootstrap == "literal":
+            next_actions = batch.actions
+        else:
+            next_actions = self.actor_target.project(batch.next_features, batch.next_memory)
+            if self.target_policy_noise:
+                noise = th.randn_like(next_actions) * self.target_policy_noise
+                next_actions = (next_actions + noise.clamp(-self.target_noise_clip, self.target_noise_clip)).clamp(-1.0, 1.0)
+        inputs = th.cat([batch.next_features, next_actions], dim=1)
+        values = self.critic_target[0].project(inputs)
+        for other in self.critic_target[1:]:
+            values = th.minimum(values, other.project(inputs))
+        return batch.rewards + (1.0 - batch.dones) * batch.discounts * values
+
+    def _update_generator(self, batch: Batch) -> None:
+        """World model: settle on the next observation (line 21). Without weight in the reward it has no role."""
+        if not self.alpha_ep:
+            return
+        rows = slice(min(batch.n_replayed, self.policy.batch_size_of("generator", batch.n_replayed)))
+        inputs = th.cat([batch.features[rows], batch.actions[rows]], dim=1)
+        state = self.generator.settle(inputs, batch.next_features[rows], None if batch.memory is None else batch.memory[rows])
+        self.generator.apply_changes(self.generator.hebbian_update(state), self.generator.optimizer)
+        self.diagnostics.settled("generator", state)
+
+    def _update_targets(self, tau: float) -> None:
+        """Move the target circuits by ``tau`` (1 copies)."""
+        for target, circuit in zip(
+            [self.actor_target, *self.critic_target], [self.actor.circuit, *self.critic], strict=True
+        ):
+            th._foreach_lerp_(list(target.parameters()), list(circuit.parameters()), tau)
+
+    def _on_step(self) -> None:
+        """A hard copy of the targets every ``target_update_interval`` transitions."""
+        if self.target_update == "hard":
+            interval, now = self.target_update_interval, self.num_timesteps
+            if now // interval > (now - self.n_envs) // interval:
+                self._update_targets(1.0)
+
+    # ------------------------------------------------------------------ demonstrations and self-imitation
+
+    def _imitated(self) -> list[Episodes]:
+        """What refresh draws from: the demonstrations and the self-imitation memory."""
+        assert self.replay_buffer is not None
+        memory = self.replay_buffer.self_imitation
+        own = [memory.episodes] if memory is not None and len(memory) else []
+        return own if self.expert is None else [self.expert, *own]
+
+    def _refresh_changes(self) -> HebbianChanges:
+        """Settle the actor on imitated actions."""
+        samples: ImitationSamples = sample_union(
+            self._imitated(), self.policy.batch_size_of("actor", self.batch_size), self.history
+        )
+        features = self._features(self._to_tensors(samples.observations))
+        mask = None if samples.history_mask is None else self._tensor(samples.history_mask)
+        memory = self._memory(None if samples.history is None else self._to_tensors(samples.history, batch_dims=2), mask)
+        state = self.actor.circuit.settle(features, self._tensor(samples.actions), memory)
+        self.diagnostics.settled("actor", state)
+        return self.actor.circuit.hebbian_update(state)
+
+    def _expert_rows(
+        self, rows: np.ndarray
+    ) -> tuple[th.Tensor, th.Tensor, th.Tensor, th.Tensor | None, th.Tensor | None]:
+        """Demonstrated transitions as the circuits see them: features, actions, next features, memory, next memory."""
+        assert self.expert is not None
+        samples = self.expert.take(rows, self.history)
+        features = self._features(self._to_tensors(samples.observations))
+        following = Episodes.from_next_observations(self._expert_transitions, rows, self.observation_space)
+        history = None if samples.history is None else self._to_tensors(samples.history, batch_dims=2)
+        mask = None if samples.history_mask is None else self._tensor(samples.history_mask)
+        return (
+            features,
+            self._tensor(samples.actions),
+            self._features(self._to_tensors(following)),
+            self._memory(history, mask),
+            self._next_memory(history, mask, features),
+        )
+
+    def _with_expert(self, batch: Batch, n: int) -> Batch:
+        """Add ``n`` demonstrated transitions, with their signals as last computed, to the batch."""
+        if self._n_updates % EXPERT_SIGNALS_INTERVAL == 1:
+            self._refresh_expert_signals()
+        rows = np.random.randint(0, len(self._expert_transitions), size=n)
+        features, actions, next_features, memory, next_memory = self._expert_rows(rows)
+        weights, source = self.reward_weights, self._expert_transitions
+        task = source.rewards[rows]
+        if self._vec_normalize_env is not None:
+            task = self._vec_normalize_env.normalize_reward(task)
+        rewards = weights[0] * task + weights[1] * self._expert_signals[0, rows] + weights[2] * self._expert_signals[1, rows]
+        discounts = batch.discounts
+        if isinstance(discounts, th.Tensor):
+            discounts = th.cat([discounts, discounts.new_full((n, 1), self.gamma)])
+        return Batch(
+            th.cat([batch.features, features]),
+            th.cat([batch.actions, actions]),
+            th.cat([batch.next_features, next_features]),
+            None if batch.memory is None or memory is None else th.cat([batch.memory, memory]),
+            None if batch.next_memory is None or next_memory is None else th.cat([batch.next_memory, next_memory]),
+            th.cat([batch.rewards, self._tensor(rewards)[:, None]]),
+            th.cat([batch.dones, self._tensor(source.terminations[rows].astype(np.float32))[:, None]]),
+            discounts,
+            batch.n_replayed,
+        )
+
+    def _refresh_expert_signals(self) -> None:
+        """Signals of all demonstrated transitions under the present generator (the normalisers do not move)."""
+        _, alpha_ep, alpha_in = self.reward_weights
+        if not (alpha_ep or alpha_in):
+            return
+        for start in range(0, len(self._expert_transitions), 1024):
+            rows = np.arange(start, min(start + 1024, len(self._expert_transitions)))
+            features, actions, next_features, memory, _ = self._expert_rows(rows)
+            raw_ep, raw_in = self._raw_signals(features, actions, next_features, memory)
+            self._expert_signals[0, rows] = self.epistemic_normalizer.rescale(raw_ep) if alpha_ep else 0.0
+            self._expert_signals[1, rows] = -self.instrumental_normalizer.rescale(raw_in) if alpha_in else 0.0
+
+    # ------------------------------------------------------------------ tensors
+
+    def _tensor(self, array: np.ndarray) -> th.Tensor:
+        return th.as_tensor(array, dtype=th.float32, device=self.device)
+
+    def _to_tensors(self, observations: Any, batch_dims: int = 1) -> TensorObservations:
+        """Observations of episodes (numpy, as the environment gave them), normalised like the replay buffer's."""
+        if self._vec_normalize_env is not None:
+            shape = next(iter(observations.values())).shape if isinstance(observations, dict) else observations.shape
+            lead = shape[:batch_dims]
+            flat = map_observations(lambda array: array.reshape(-1, *array.shape[batch_dims:]), observations)
+            normalized = self._vec_normalize_env.normalize_obs(flat)  # type: ignore[arg-type]
+            observations = map_observations(lambda array: array.reshape(*lead, *array.shape[1:]), normalized)
+        return map_observations(lambda array: th.as_tensor(array, device=self.device), observations)  # type: ignore[return-value]
+
+    def _features(self, observations: TensorObservations) -> th.Tensor:
+        """What the circuits see of a batch of observations, (B, n_features)."""
+        return self.actor.features(observations)
+
+    def _memory(self, history: TensorObservations | None, mask: th.Tensor | None) -> th.Tensor | None:
+        """m_t from the observations before each row, (B, n_memory); None without a working memory."""
+        past = self._past_features(history, mask)
+        return None if past is None else self.actor.memory(past)  # type: ignore[misc]
+
+    def _next_memory(
+        self, history: TensorObservations | None, mask: th.Tensor | None, features: th.Tensor
+    ) -> th.Tensor | None:
+        """m_{t+1}: one step on, the present observation is the newest of the past."""
+        past = self._past_features(history, mask)
+        return None if past is None else self.actor.memory(th.cat([past[:, 1:], features[:, None]], dim=1))  # type: ignore[misc]
+
+    def _past_features(self, history: TensorObservations | None, mask: th.Tensor | None) -> th.Tensor | None:
+        if history is None or mask is None:
+            return None
+        flat = map_observations(lambda tensor: tensor.flatten(0, 1), history)
+        return self._features(flat).view(*mask.shape, -1) * mask[:, :, None]  # type: ignore[arg-type]
+
+    # ------------------------------------------------------------------ logging, saving
+
+    def _log_training(self) -> None:
+        assert self.replay_buffer is not None
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        for key, value in self.diagnostics.summary().items():
+            self.logger.record(f"train/{key}", value)
+        memory = self.replay_buffer.self_imitation
+        if memory is not None:
+            self.logger.record("train/self_imitation_size", len(memory))
+            self.logger.record("train/self_imitation_best_return", memory.best_return)
+
+    def learn(
+        self: SelfActPC,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 4,
+        tb_log_name: str = "ActPC",
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> SelfActPC:
+        return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+
+    def _excluded_save_params(self) -> list[str]:
+        aliases = ["actor", "critic", "generator", "prior", "actor_target", "critic_target"]
+        derived = ["expert", "_expert_transitions", "_expert_signals", "diagnostics"]
+        return [*super()._excluded_save_params(), *aliases, *derived]
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        names = [name if name != "actor" else "actor.circuit" for name, _ in self.policy.named_circuits()]
+        return ["policy", *(f"policy.{name}.optimizer" for name in names)], []
+

@@ -1,0 +1,69 @@
+"""What is logged about the circuits, measured every so many updates so that it costs next to nothing."""
+
+from collections.abc import Callable
+from typing import Any
+
+import torch as th
+
+from sb3_actpc.actpc.policies import ActPCPolicy
+from sb3_actpc.ngc import CoupledState, HebbianChanges, NGCCircuit, SettledState
+
+INTERVAL = 100  # updates between two measurements
+
+
+class Diagnostics:
+    """
+    Collects energies, settling residuals, action-values and signals; checks the synapses for NaN and infinity.
+
+    :param policy: whose circuits are watched
+    """
+
+    def __init__(self, policy: ActPCPolicy) -> None:
+        self.circuits: dict[str, NGCCircuit] = dict(policy.named_circuits())
+        self.active = False
+        self.values: dict[str, float] = {}
+
+    def begin_update(self, n_updates: int, step: int) -> None:
+        """
+        Decide whether this update is measured, and if so check all synapses.
+
+        :raises ValueError: naming the circuit and the step when a synapse is not finite
+        """
+        self.active = n_updates % INTERVAL == 1
+        if not self.active:
+            return
+        for name, circuit in self.circuits.items():
+            if not all(bool(th.isfinite(parameter).all()) for parameter in circuit.parameters()):
+                raise ValueError(
+                    f"{name}: synapses are not finite at step {step}; lower its learning rate, bound them with "
+                    "circuit_kwargs=dict(synaptic_scaling='column_norm', weight_bound=...), or normalise the observations"
+                )
+
+    def follow(self, **values: Any) -> None:
+        """Log the latest of these values; a callable is evaluated only when this update is measured."""
+        for key, value in values.items():
+            if not isinstance(value, Callable):  # type: ignore[arg-type]
+                self.values[key] = float(value)
+            elif self.active:
+                self.values[key] = float(value())
+
+    def settled(self, name: str, state: SettledState) -> None:
+        """Energy (batch mean) and settling residual of a circuit."""
+        if self.active:
+            self.values[f"{name}_energy"] = float(state.total_discrepancy().mean())
+            self.values[f"{name}_residual"] = float(self.circuits[name].residual(state))
+
+    def coupled(
+        self, state: CoupledState, changes: HebbianChanges, features: th.Tensor, memory: th.Tensor | None
+    ) -> None:
+        """Action-values, and per layer how the actor's pressure compares with the deterministic policy gradient."""
+        if not self.active:
+            return
+        self.values["action_value"] = float(state.action_values.mean())
+        self.values["action_saturation"] = float((state.actions.abs() > 0.97).float().mean())
+        for layer, change in enumerate(changes.weights):
+            self.values[f"actor_pressure_norm_{layer}"] = float(change.norm())
+
+    def summary(self) -> dict[str, float]:
+        """Everything measured last."""
+        return self.values

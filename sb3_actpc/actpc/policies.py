@@ -1,0 +1,333 @@
+"""The policy object: four NGC circuits (actor, critic, generator, prior), their targets and their optimisers."""
+
+import copy
+import warnings
+from typing import Any
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.preprocessing import is_image_space
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor, FlattenExtractor
+from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
+from torch import nn
+
+from sb3_actpc.ngc import NGCCircuit, WorkingMemory
+
+CIRCUITS = ("actor", "critic", "generator", "prior")
+OBSERVATION_CLIP = 10.0
+PRIOR_NET_ARCH = (512, 256)  # paper: prior of all MuJoCo tasks
+
+
+class ObservationNormalizer(nn.Module):
+    """(o - mean) / std by fixed statistics, clipped to ±10; the identity until :meth:`fit` is called."""
+
+    mean: th.Tensor
+    scale: th.Tensor
+
+    def __init__(self, n_features: int) -> None:
+        super().__init__()
+        self.register_buffer("mean", th.zeros(n_features))
+        self.register_buffer("scale", th.ones(n_features))
+        self.register_buffer("clip", th.full((), float("inf")))
+
+    def fit(self, features: th.Tensor) -> None:
+        """:param features: (N, n_features) whose mean and standard deviation are used from now on"""
+        self.mean.copy_(features.mean(0))
+        self.scale.copy_(1.0 / features.std(0).clamp_min(1e-3))
+        self.clip.fill_(OBSERVATION_CLIP)
+
+    def forward(self, features: th.Tensor) -> th.Tensor:
+        """:param features: (..., n_features)
+        :return: the same shape, normalised"""
+        return th.clamp((features - self.mean) * self.scale, -self.clip, self.clip)
+
+
+class ActPCActor(BasePolicy):
+    """
+    The motor-action circuit with everything between an observation and its input: extractor, normaliser, working memory.
+
+    :param observation_space: Observation space
+    :param action_space: Box with finite bounds
+    :param features_extractor: fixed (it is never trained)
+    :param circuit_kwargs: keywords of :class:`~sb3_actpc.ngc.NGCCircuit`
+    :param net_arch: hidden sizes
+    :param memory_history: H observations in the working memory; 0 for none
+    :param normalize_images: divide image observations by 255
+    """
+
+    action_space: spaces.Box
+
+    def __init__(
+        self,
+        observation_space: spaces.Space,
+        action_space: spaces.Box,
+        features_extractor: BaseFeaturesExtractor,
+        net_arch: list[int],
+        circuit_kwargs: dict[str, Any],
+        memory_history: int = 0,
+        normalize_images: bool = True,
+    ) -> None:
+        super().__init__(
+            observation_space,
+            action_space,
+            features_extractor=features_extractor,
+            normalize_images=normalize_images,
+            squash_output=True,
+        )
+        n_features = features_extractor.features_dim
+        self.net_arch, self.circuit_kwargs, self.memory_history = list(net_arch), circuit_kwargs, memory_history
+        self.normalizer = ObservationNormalizer(n_features)
+        self.memory = WorkingMemory(n_features, memory_history) if memory_history else None
+        self.circuit = NGCCircuit(
+            n_features,
+            int(np.prod(action_space.shape)),
+            net_arch,
+            output_activation="tanh",
+            n_memory=self.memory.size if self.memory else 0,
+            **circuit_kwargs,
+        )
+        self._warned_of_empty_memory = False
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        data = super()._get_constructor_parameters()
+        data.update(
+            features_extractor=self.features_extractor,
+            net_arch=self.net_arch,
+            circuit_kwargs=self.circuit_kwargs,
+            memory_history=self.memory_history,
+        )
+        return data
+
+    def features(self, observations: PyTorchObs) -> th.Tensor:
+        """:param observations: (B, *obs_shape) or a dict of such
+        :return: (B, n_features), what every circuit sees of them"""
+        with th.no_grad():
+            return self.normalizer(self.extract_features(observations, self.features_extractor))
+
+    def forward(self, observations: PyTorchObs, history: th.Tensor | None = None) -> th.Tensor:
+        """:param observations: (B, *obs_shape) or a dict of such
+        :param history: (B, H, n_features) for a working memory, zeros before the episode's start
+        :return: actions in [-1, 1], (B, A)"""
+        features = self.features(observations)
+        if self.memory is None:
+            return self.circuit.project(features)
+        if history is None:
+            history = features.new_zeros(len(features), self.memory_history, features.shape[1])
+        return self.circuit.project(features, self.memory(history))
+
+    def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        return self(observation)
+
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """
+        SB3's ``predict``. With a working memory ``state`` carries it: one array (n_envs, H, n_features), returned updated.
+
+        A bare ``predict(obs)`` then acts with an empty memory and warns once.
+        """
+        if self.memory is None:
+            return super().predict(observation, state, episode_start, deterministic)
+        if state is None and episode_start is None and not self._warned_of_empty_memory:
+            warnings.warn(
+                "This agent has a working memory: predict(obs) acts with an empty one. Pass the returned state and "
+                "episode_start back in, as with SB3's recurrent policies.",
+                stacklevel=3,
+            )
+            self._warned_of_empty_memory = True
+        self.set_training_mode(False)
+        observations, vectorized = self.obs_to_tensor(observation)
+        with th.no_grad():
+            features = self.features(observations)
+            shape = (len(features), self.memory_history, features.shape[1])
+            history = np.zeros(shape, dtype=np.float32) if state is None else state[0].copy()
+            if episode_start is not None:
+                history[np.asarray(episode_start, dtype=bool)] = 0.0
+            past = th.as_tensor(history, device=self.device)
+            actions = self.circuit.project(features, self.memory(past)).cpu().numpy()
+        state = (np.concatenate([history[:, 1:], features.cpu().numpy()[:, None]], axis=1),)
+        actions = self.unscale_action(actions.reshape(-1, *self.action_space.shape))
+        return (actions if vectorized else actions[0]), state
+
+
+class ActPCPolicy(BasePolicy):
+    """
+    Actor, critic(s), generator and prior with their target circuits; no parameter requires a gradient.
+
+    :param observation_space: Observation space
+    :param action_space: Box with finite bounds
+    :param lr_schedule: learning rate as a function of the remaining progress; circuits with a ``learning_rate`` of their own
+        keep its ratio to the schedule's start
+    :param net_arch: hidden sizes of actor, critic and generator, or a dict with the keys ``pi``, ``qf``, ``generator``
+        and ``prior`` (sizes left out stay at their defaults)
+    :param n_critics: critic circuits; with two or more the smallest value bootstraps
+    :param circuit_kwargs: keywords of every :class:`~sb3_actpc.ngc.NGCCircuit`
+    :param actor_kwargs: the same for the actor alone, and ``net_arch``, ``learning_rate``, ``batch_size``
+    :param critic_kwargs: the same for the critic
+    :param generator_kwargs: the same for the generator
+    :param prior_kwargs: the same for the prior
+    :param memory_history: H observations in the working memory of actor, generator and prior; 0 for none
+    :param features_extractor_class: fixed features extractor (it is never trained)
+    :param features_extractor_kwargs: its keywords
+    :param normalize_images: divide image observations by 255
+    :param optimizer_class: a ``torch.optim`` class
+    :param optimizer_kwargs: its keywords but the learning rate
+    :raises ValueError: for observations or keywords that do not fit
+    """
+
+    actor: ActPCActor
+    action_space: spaces.Box
+
+    def __init__(
+        self,
+        observation_space: spaces.Space,
+        action_space: spaces.Box,
+        lr_schedule: Schedule,
+        net_arch: list[int] | dict[str, list[int]] | None = None,
+        n_critics: int = 1,
+        circuit_kwargs: dict[str, Any] | None = None,
+        actor_kwargs: dict[str, Any] | None = None,
+        critic_kwargs: dict[str, Any] | None = None,
+        generator_kwargs: dict[str, Any] | None = None,
+        prior_kwargs: dict[str, Any] | None = None,
+        memory_history: int = 0,
+        features_extractor_class: type[BaseFeaturesExtractor] = FlattenExtractor,
+        features_extractor_kwargs: dict[str, Any] | None = None,
+        normalize_images: bool = True,
+        optimizer_class: type[th.optim.Optimizer] = th.optim.Adam,
+        optimizer_kwargs: dict[str, Any] | None = None,
+    ) -> None:
+        if features_extractor_class is FlattenExtractor and is_image_space(observation_space):
+            raise ValueError(
+                f"observations of shape {observation_space.shape} are images: ActPC learns no convolutions; pass a fixed "
+                "extractor as policy_kwargs=dict(features_extractor_class=...) or use vector observations"
+            )
+        super().__init__(
+            observation_space,
+            action_space,
+            features_extractor_class=features_extractor_class,
+            features_extractor_kwargs=features_extractor_kwargs,
+            optimizer_class=optimizer_class,
+            optimizer_kwargs=optimizer_kwargs,
+            normalize_images=normalize_images,
+            squash_output=True,
+        )
+        self.net_arch, self.n_critics, self.memory_history = net_arch, n_critics, memory_history
+        self.circuit_kwargs = dict(circuit_kwargs or {})
+        self.kwargs_of = dict(
+            zip(CIRCUITS, (actor_kwargs, critic_kwargs, generator_kwargs, prior_kwargs), strict=True)
+        )
+        self.lr_schedule = lr_schedule
+        self._build()
+
+    def _build(self) -> None:
+        extractor = self.make_features_extractor()
+        extractor.requires_grad_(False)
+        arch, kwargs = self._net_arch_of("actor"), self._circuit_kwargs_of("actor")
+        self.actor = ActPCActor(
+            self.observation_space, self.action_space, extractor, arch, kwargs, self.memory_history, self.normalize_images
+        )
+        n_features, n_actions = extractor.features_dim, int(np.prod(self.action_space.shape))
+        n_memory = self.actor.memory.size if self.actor.memory else 0
+        self.critic = nn.ModuleList(
+            self._circuit("critic", n_features + n_actions, n_actions, n_feedback_inputs=n_actions)
+            for _ in range(self.n_critics)
+        )
+        self.generator = self._circuit("generator", n_features + n_actions, n_features, n_memory=n_memory)
+        self.prior = self._circuit("prior", n_features, n_features, n_memory=n_memory)
+        self.actor_target = copy.deepcopy(self.actor.circuit)
+        self.critic_target = copy.deepcopy(self.critic)
+        for name, circuit in self.named_circuits():
+            circuit.optimizer = self._optimizer(name.partition(".")[0], circuit)
+
+    def named_circuits(self) -> list[tuple[str, NGCCircuit]]:
+        """The circuits that learn, with their names: actor, critic.0, ..., generator, prior."""
+        critics = [(f"critic.{index}", critic) for index, critic in enumerate(self.critic)]
+        return [("actor", self.actor.circuit), *critics, ("generator", self.generator), ("prior", self.prior)]  # type: ignore[list-item]
+
+    def _settings_of(self, name: str) -> dict[str, Any]:
+        return dict(self.kwargs_of[name] or {})
+
+    def _net_arch_of(self, name: str) -> list[int]:
+        default = list(PRIOR_NET_ARCH) if name == "prior" else [256, 256]
+        own = self._settings_of(name).get("net_arch")
+        if own is not None:
+            return list(own)
+        if isinstance(self.net_arch, dict):
+            return list(self.net_arch.get({"actor": "pi", "critic": "qf"}.get(name, name), default))
+        return default if self.net_arch is None else list(self.net_arch)
+
+    def _circuit_kwargs_of(self, name: str) -> dict[str, Any]:
+        default = {"activation": "relu"} if name == "prior" else {}
+        own = {k: v for k, v in self._settings_of(name).items() if k not in ("net_arch", "learning_rate", "batch_size")}
+        return {**default, **self.circuit_kwargs, **own}
+
+    def _circuit(self, name: str, n_inputs: int, n_outputs: int, **extra: int) -> NGCCircuit:
+        return NGCCircuit(n_inputs, n_outputs, self._net_arch_of(name), **self._circuit_kwargs_of(name), **extra)
+
+    def _optimizer(self, name: str, circuit: NGCCircuit) -> th.optim.Optimizer:
+        start = self.lr_schedule(1.0)
+        own = self._settings_of(name).get("learning_rate", start)
+        groups = circuit.parameter_groups(own)
+        for group in groups:
+            group["lr_scale"] *= own / start if start else 1.0
+        kwargs = dict(self.optimizer_kwargs)
+        if self.optimizer_class is th.optim.Adam:
+            kwargs.setdefault("fused", True)  # one kernel for all synapses
+        return self.optimizer_class(groups, **kwargs)  # type: ignore[call-arg]
+
+    def batch_size_of(self, name: str, default: int) -> int:
+        """Batch size of a circuit: its own ``batch_size`` or the agent's."""
+        return int(self._settings_of(name).get("batch_size", default))
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        data = super()._get_constructor_parameters()
+        data.update(
+            lr_schedule=self._dummy_schedule,  # not needed to act
+            net_arch=self.net_arch,
+            n_critics=self.n_critics,
+            circuit_kwargs=self.circuit_kwargs,
+            memory_history=self.memory_history,
+            optimizer_class=self.optimizer_class,
+            optimizer_kwargs=self.optimizer_kwargs,
+            features_extractor_class=self.features_extractor_class,
+            features_extractor_kwargs=self.features_extractor_kwargs,
+            **{f"{name}_kwargs": self.kwargs_of[name] for name in CIRCUITS},
+        )
+        return data
+
+    def features(self, observations: PyTorchObs) -> th.Tensor:
+        """What every circuit sees of the observations, (B, n_features)."""
+        return self.actor.features(observations)
+
+    def forward(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        return self._predict(observation, deterministic)
+
+    def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        return self.actor(observation)
+
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """SB3's ``predict``; see :meth:`ActPCActor.predict` for the working memory."""
+        return self.actor.predict(observation, state, episode_start, deterministic)
+
+
+MlpPolicy = ActPCPolicy
+
+
+class MultiInputPolicy(ActPCPolicy):
+    """:class:`ActPCPolicy` for Dict observations; images go through SB3's convolutions with fixed random weights."""
+
+    def __init__(self, *args: Any, features_extractor_class: type[BaseFeaturesExtractor] = CombinedExtractor, **kwargs: Any):
+        super().__init__(*args, features_extractor_class=features_extractor_class, **kwargs)

@@ -1,0 +1,92 @@
+"""The internal reward: epistemic and instrumental signals from the errors of settled circuits, and their normalisers."""
+
+import numpy as np
+import torch as th
+
+from sb3_actpc.ngc import SettledState
+
+NORMALIZERS = ("max", "saturating", "quantile")
+SIGNAL_ERRORS = ("all", "output")
+
+
+def summed_squared_errors(state: SettledState, which: str = "all") -> th.Tensor:
+    """
+    r̂ = Σ_l ||e^l||^2, the sum that both signals start from (paper, eqs. for r̂^ep and r̂^in).
+
+    :param state: a settled circuit (under "scheduled", the errors as they first arrive)
+    :param which: "all" layers, or the "output" layer's error only
+    :return: (B,)
+    """
+    errors = state.errors if which == "all" else state.errors[-1:]
+    return th.stack([error.square().sum(1) for error in errors]).sum(0)
+
+
+class RunningMaximum:
+    """r = r̂ / max(1, r̂_1, ..., r̂_t), the paper's normaliser (Algorithm 1, lines 4, 12 and 13): the maximum starts at 1."""
+
+    def __init__(self) -> None:
+        self.maximum = 1.0
+
+    def __call__(self, raw: np.ndarray) -> np.ndarray:
+        """
+        :param raw: (n_envs,) new values r̂ >= 0; the maximum follows them
+        :return: (n_envs,) in [0, 1]
+        """
+        self.maximum = max(self.maximum, float(raw.max()))
+        return raw / self.maximum
+
+    def rescale(self, raw: np.ndarray) -> np.ndarray:
+        """Normalise without moving the maximum; values above it count as 1."""
+        return np.minimum(raw / self.maximum, 1.0)
+
+
+class Saturating:
+    """r = r̂ / (r̂ + 1): no state, so the same transition keeps the same signal."""
+
+    def __call__(self, raw: np.ndarray) -> np.ndarray:
+        """:param raw: (n,) values r̂ >= 0
+        :return: (n,) in [0, 1)"""
+        return raw / (raw + 1.0)
+
+    rescale = __call__
+
+
+class RunningQuantile:
+    """
+    r = min(1, r̂ / q), where q follows the 0.9 quantile of r̂ by stochastic approximation on the log scale.
+
+    A single outlier moves q by a step, where it would hold down the running maximum for ever.
+    """
+
+    def __init__(self, quantile: float = 0.9, step: float = 0.02) -> None:
+        self.quantile, self.step, self.estimate = quantile, step, 0.0
+
+    def __call__(self, raw: np.ndarray) -> np.ndarray:
+        """
+        :param raw: (n_envs,) new values r̂ >= 0; the quantile follows them
+        :return: (n_envs,) in [0, 1]
+        """
+        for value in raw:
+            if self.estimate == 0.0:
+                self.estimate = max(float(value), 1e-12)
+            above = float(value > self.estimate)
+            self.estimate *= float(np.exp(self.step * (above - (1.0 - self.quantile))))
+        return self.rescale(raw)
+
+    def rescale(self, raw: np.ndarray) -> np.ndarray:
+        """Normalise without moving the quantile."""
+        return np.minimum(raw / max(self.estimate, 1e-12), 1.0)
+
+
+Normalizer = RunningMaximum | Saturating | RunningQuantile
+
+
+def make_normalizer(name: str) -> Normalizer:
+    """
+    :param name: one of ``NORMALIZERS``
+    :raises ValueError: for another name
+    """
+    kinds: dict[str, type[Normalizer]] = {"max": RunningMaximum, "saturating": Saturating, "quantile": RunningQuantile}
+    if name not in kinds:
+        raise ValueError(f"signal_normalizer={name!r} is unknown; choose one of {list(NORMALIZERS)}")
+    return kinds[name]()

@@ -1,0 +1,53 @@
+"""The command ``sb3-actpc``. Sub-commands import what they need when they run, so that ``--help`` is quick."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import pkgutil
+import sys
+from collections.abc import Sequence
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line.
+
+    :param argv: arguments, by default those of the process
+    :return: exit code: 0, or 2 for a mistake of the user's (one line on stderr says which), or 130 when interrupted
+    """
+    args = build_parser().parse_args(argv)
+    try:
+        return int(importlib.import_module(f"{__name__}.{args.command}").run(args))
+    except KeyboardInterrupt:
+        print("sb3-actpc: stopped", file=sys.stderr)
+        return 130
+    except user_errors() as error:
+        if args.debug:
+            raise
+        print(f"sb3-actpc: error: {' '.join(str(error).split()) or type(error).__name__}", file=sys.stderr)
+        return 2
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The parser with all its sub-commands: the modules of this package.
+
+    Each has ``add_parser(subparsers)`` and ``run(args)``, which returns the exit code.
+
+    :return: the parser; the parsed ``command`` is the name of the sub-command's module
+    """
+    parser = argparse.ArgumentParser(prog="sb3-actpc", description="Active predictive coding for Stable-Baselines3.")
+    parser.add_argument("--debug", action="store_true", help="show where an error came from")
+    subparsers = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    for module in pkgutil.iter_modules(__path__):
+        importlib.import_module(f"{__name__}.{module.name}").add_parser(subparsers)
+    return parser
+
+
+def user_errors() -> tuple[type[Exception], ...]:
+    """Errors whose message is for the user; imported only once one has been raised.
+
+    :return: exception classes
+    """
+    import gymnasium as gym
+
+    return ValueError, OSError, ImportError, gym.error.Error

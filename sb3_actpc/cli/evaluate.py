@@ -1,0 +1,61 @@
+"""``sb3-actpc evaluate``: replay a trained agent, with a video where the machine can render."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the sub-command.
+
+    :param subparsers: where to add it
+    """
+    parser = subparsers.add_parser(
+        "evaluate",
+        help="replay the agent of a run",
+        description="Play episodes with the agent of a run folder. Its model.zip is unpickled: open only runs you trust.",
+    )
+    parser.add_argument("folder", metavar="RUN", help="run folder, as written by sb3-actpc train")
+    parser.add_argument("--episodes", type=int, default=10, metavar="N", help="episodes to play (default: %(default)s)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the first episode (default: %(default)s)")
+    parser.add_argument("--video", metavar="FILE", help="video of the first episode, .mp4 or .gif (default: RUN/video.mp4)")
+    parser.add_argument("--no-video", action="store_true", help="no video")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Play, print the table, record.
+
+    :param args: parsed arguments
+    :return: exit code; a machine that cannot render is no error
+    :raises ValueError: when an argument is wrong or a file of the run is damaged
+    :raises FileNotFoundError: when the folder is not that of a run
+    """
+    from sb3_actpc.training.video import check_video_path, choose_gl_backend
+
+    folder = Path(args.folder)
+    video = None if args.no_video else Path(args.video or folder / "video.mp4")
+    if video is not None:
+        check_video_path(video)
+        choose_gl_backend()  # before MuJoCo is imported
+
+    from sb3_actpc.training import evaluate_run
+    from sb3_actpc.training.report import result_table
+
+    print(result_table(evaluate_run(folder, args.episodes, args.seed)), flush=True)
+    if video is not None:
+        _record(folder, video, args.seed)
+    return 0
+
+
+def _record(folder: Path, video: Path, seed: int) -> None:
+    from sb3_actpc.training.run import load_run
+    from sb3_actpc.training.video import RenderingUnavailable, record_video
+
+    record, model = load_run(folder)
+    try:
+        n_frames = record_video(model, record["env"], record["env_kwargs"], video, seed)
+    except RenderingUnavailable as error:
+        print(f"no video: rendering is not available here ({' '.join(str(error).split())})")
+    else:
+        print(f"video of {n_frames} frames written to {video}")

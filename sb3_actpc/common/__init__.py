@@ -1,0 +1,1 @@
+"""Parts shared by the agents, the environments and the commands."""

@@ -1,0 +1,261 @@
+"""Replay buffers: combined experience replay, the two internal signals, self-imitation and rebuilt working memory."""
+
+from typing import Any
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
+from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
+
+from sb3_actpc.common.episodes import SelfImitationMemory, map_observations
+from sb3_actpc.common.type_aliases import Observations, SignalReplaySamples, TensorObservations
+
+
+class _SignalReplay(ReplayBuffer):
+    """
+    What all ActPC buffers add to SB3's; combine it with one of them.
+
+    * Combined experience replay (Zhang & Sutton, 2017): the newest transition of every environment is always in the batch.
+    * The epistemic and the instrumental signal of every transition, stored apart from the task's reward.
+    * Self-imitation: a finished episode is offered to :class:`~sb3_actpc.common.episodes.SelfImitationMemory`.
+    * The working memory is not stored: the observations before a transition are gathered when it is sampled.
+
+    :param combined: put the newest transitions into every batch
+    :param history: H, how many preceding observations come with a transition; 0 for none
+    :param self_imitation_size: capacity of the self-imitation memory in transitions; 0 for none
+    :param n_steps: length of n-step returns
+    :param gamma: their discount
+    """
+
+    def __init__(
+        self,
+        *args: Any,
+        combined: bool = True,
+        history: int = 0,
+        self_imitation_size: int = 0,
+        n_steps: int = 1,
+        gamma: float = 0.99,
+        **kwargs: Any,
+    ) -> None:
+        super().__init__(*args, **kwargs)
+        if n_steps > 1 and (history or self.optimize_memory_usage):
+            raise ValueError(
+                f"n_steps={n_steps} works neither with a working memory nor with optimize_memory_usage=True; "
+                "use n_steps=1 or leave those out"
+            )
+        self.combined, self.history, self.n_steps, self.gamma = combined, history, n_steps, gamma
+        self.epistemic = np.zeros((self.buffer_size, self.n_envs), dtype=np.float32)
+        self.instrumental = np.zeros((self.buffer_size, self.n_envs), dtype=np.float32)
+        self.self_imitation = SelfImitationMemory(self_imitation_size) if self_imitation_size else None
+        self._running: list[list[tuple[Any, np.ndarray, float]]] = [[] for _ in range(self.n_envs)]
+
+    # ------------------------------------------------------------------ storing
+
+    def add(
+        self, obs: Any, next_obs: Any, action: np.ndarray, reward: np.ndarray, done: np.ndarray, infos: list[dict[str, Any]]
+    ) -> None:
+        super().add(obs, next_obs, action, reward, done, infos)
+        if self.self_imitation is not None:
+            self._follow_episodes(obs, action, reward, done)
+
+    def _follow_episodes(self, obs: Observations, action: np.ndarray, reward: np.ndarray, done: np.ndarray) -> None:
+        assert self.self_imitation is not None
+        action = action.reshape(self.n_envs, self.action_dim)
+        for env, steps in enumerate(self._running):
+            row = map_observations(lambda array, i=env: np.array(array[i]), obs)
+            steps.append((row, action[env].astype(np.float32), float(reward[env])))
+            if done[env]:
+                first = steps[0][0]
+                observations: Observations
+                if isinstance(first, dict):
+                    observations = {key: np.stack([step[0][key] for step in steps]) for key in first}
+                else:
+                    observations = np.stack([step[0] for step in steps])
+                self.self_imitation.offer(observations, np.stack([step[1] for step in steps]), sum(s[2] for s in steps))
+                steps.clear()
+
+    @property
+    def newest(self) -> int:
+        """Row of the newest transitions."""
+        return (self.pos - 1) % self.buffer_size
+
+    def set_newest_signals(self, epistemic: np.ndarray, instrumental: np.ndarray) -> None:
+        """Store the signals, (n_envs,) each, of the transitions added last."""
+        self.epistemic[self.newest] = epistemic
+        self.instrumental[self.newest] = instrumental
+
+    def reset(self) -> None:
+        super().reset()
+        self._running = [[] for _ in range(self.n_envs)]
+
+    # ------------------------------------------------------------------ sampling
+
+    def sample(self, batch_size: int, env: VecNormalize | None = None) -> SignalReplaySamples:  # type: ignore[override]
+        """
+        :param batch_size: B
+        :param env: VecNormalize whose statistics normalise observations and the task's rewards
+        :return: B transitions; with ``combined``, those of the last step (of every environment) come first
+        """
+        newest = np.arange(min(self.n_envs if self.combined else 0, batch_size))
+        rows, envs = self._draw(batch_size - len(newest))
+        rows = np.concatenate([np.full(len(newest), self.newest), rows])
+        envs = np.concatenate([newest, envs])
+        return self._gather(rows, envs, env)
+
+    def _draw(self, n: int) -> tuple[np.ndarray, np.ndarray]:
+        """``n`` stored (row, environment) pairs, uniformly."""
+        if not self.full:
+            return np.random.randint(0, self.pos, size=n), np.random.randint(0, self.n_envs, size=n)
+        # a full ring: rows at pos have lost their predecessors (or, memory-optimised, their successor)
+        skipped = min(self.history + int(self.optimize_memory_usage), self.buffer_size - 1)
+        ages = np.random.randint(skipped, self.buffer_size, size=n)
+        return (self.pos + ages) % self.buffer_size, np.random.randint(0, self.n_envs, size=n)
+
+    def _gather(self, rows: np.ndarray, envs: np.ndarray, env: VecNormalize | None) -> SignalReplaySamples:
+        last, mask = rows, None
+        if self.n_steps > 1:
+            last, mask = self._n_step_window(rows, envs)
+        return SignalReplaySamples(
+            observations=self._observations_at(rows, envs, env),
+            actions=self.to_torch(self.actions[rows, envs]),
+            next_observations=self._next_observations_at(last, envs, env),
+            dones=self.to_torch((self.dones[last, envs] * (1 - self.timeouts[last, envs])).reshape(-1, 1)),
+            rewards=self.to_torch(self._rewards_at(rows, envs, mask, env)),
+            discounts=None if mask is None else self.to_torch(self.gamma ** mask.sum(1, keepdims=True)),
+            epistemic=self.to_torch(self._summed(self.epistemic, rows, envs, mask)),
+            instrumental=self.to_torch(self._summed(self.instrumental, rows, envs, mask)),
+            **self._history_at(rows, envs, env),
+        )
+
+    def _observations_at(self, rows: np.ndarray, envs: np.ndarray, env: VecNormalize | None) -> TensorObservations:
+        return self._to_tensors(map_observations(lambda array: array[rows, envs], self.observations), env)
+
+    def _next_observations_at(self, rows: np.ndarray, envs: np.ndarray, env: VecNormalize | None) -> TensorObservations:
+        if self.optimize_memory_usage:
+            return self._observations_at((rows + 1) % self.buffer_size, envs, env)
+        return self._to_tensors(map_observations(lambda array: array[rows, envs], self.next_observations), env)
+
+    def _to_tensors(self, observations: Observations, env: VecNormalize | None) -> TensorObservations:
+        normalized = self._normalize_obs(observations, env)  # type: ignore[arg-type]
+        return map_observations(self.to_torch, normalized)  # type: ignore[return-value]
+
+    def _history_at(self, rows: np.ndarray, envs: np.ndarray, env: VecNormalize | None) -> dict[str, Any]:
+        """The ``history`` observations before each row in its episode, oldest first, and which of them exist."""
+        if not self.history:
+            return {"history": None, "history_mask": None}
+        earlier = rows[:, None] - np.arange(self.history, 0, -1)
+        # row r - 1 precedes r unless it ended its episode or lies before the first row stored
+        age = (rows - self.pos) % self.buffer_size if self.full else rows
+        exists = np.arange(self.history, 0, -1)[None] <= age[:, None]
+        earlier %= self.buffer_size
+        unbroken = exists & (self.dones[earlier, envs[:, None]] == 0)
+        mask = np.flip(np.logical_and.accumulate(np.flip(unbroken, axis=1), axis=1), axis=1).astype(np.float32)
+        shape = (len(rows) * self.history,)
+        flat = map_observations(
+            lambda array: array[earlier, envs[:, None]].reshape(*shape, *array.shape[2:]), self.observations
+        )
+        past = map_observations(
+            lambda array: array.reshape(len(rows), self.history, *array.shape[1:]), self._to_tensors(flat, env)  # type: ignore[arg-type]
+        )
+        return {"history": past, "history_mask": self.to_torch(mask)}
+
+    def newest_transitions(self, env: VecNormalize | None = None) -> SignalReplaySamples:
+        """The transitions added last, one per environment."""
+        n_steps, self.n_steps = self.n_steps, 1
+        try:
+            return self._gather(np.full(self.n_envs, self.newest), np.arange(self.n_envs), env)
+        finally:
+            self.n_steps = n_steps
+
+    def _n_step_window(self, rows: np.ndarray, envs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Last row of each n-step window and which of its ``n_steps`` rows count, (B,) and (B, n_steps)."""
+        window = (rows[:, None] + np.arange(self.n_steps)) % self.buffer_size
+        ended = (self.dones[window, envs[:, None]] != 0) | (window == self.newest)
+        before = np.cumsum(ended, axis=1) - ended
+        mask = (before == 0).astype(np.float32)
+        return window[np.arange(len(rows)), mask.sum(1).astype(int) - 1], mask
+
+    def _rewards_at(
+        self, rows: np.ndarray, envs: np.ndarray, mask: np.ndarray | None, env: VecNormalize | None
+    ) -> np.ndarray:
+        """The task's rewards (of the whole n-step window), normalised one by one before they are summed."""
+        if mask is None or env is None:
+            return self._normalize_reward(self._summed(self.rewards, rows, envs, mask), env)
+        window = (rows[:, None] + np.arange(self.n_steps)) % self.buffer_size
+        normalized = self._normalize_reward(self.rewards[window, envs[:, None]], env)
+        return (normalized * mask * self.gamma ** np.arange(self.n_steps, dtype=np.float32)).sum(1, keepdims=True)
+
+    def _summed(self, values: np.ndarray, rows: np.ndarray, envs: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
+        """``values`` at the rows, or their discounted sum over the n-step window, (B, 1)."""
+        if mask is None:
+            return values[rows, envs].reshape(-1, 1)
+        window = (rows[:, None] + np.arange(self.n_steps)) % self.buffer_size
+        discounts = self.gamma ** np.arange(self.n_steps, dtype=np.float32)
+        return (values[window, envs[:, None]] * mask * discounts).sum(1, keepdims=True)
+
+
+class CombinedReplayBuffer(_SignalReplay):
+    """ActPC's replay buffer for Box observations; see :class:`_SignalReplay`."""
+
+
+class CombinedDictReplayBuffer(_SignalReplay, DictReplayBuffer):
+    """ActPC's replay buffer for Dict observations; see :class:`_SignalReplay`."""
+
+
+class CombinedHerReplayBuffer(_SignalReplay, HerReplayBuffer):
+    """
+    Hindsight experience replay with ActPC's signals: relabelling touches the task's reward and the goals alone.
+
+    The newest transitions are real ones; of the rest SB3's ``her_ratio`` is relabelled.
+    """
+
+    def _draw(self, n: int) -> tuple[np.ndarray, np.ndarray]:
+        valid = np.flatnonzero(self.ep_length > 0)
+        if not len(valid):
+            raise RuntimeError(
+                "Unable to sample before the end of the first episode. We recommend choosing a value "
+                "for learning_starts that is greater than the maximum number of timesteps in the environment."
+            )
+        rows, envs = np.unravel_index(np.random.choice(valid, size=n), self.ep_length.shape)
+        return rows, envs
+
+    def _gather(self, rows: np.ndarray, envs: np.ndarray, env: VecNormalize | None) -> SignalReplaySamples:
+        batch = super()._gather(rows, envs, env)
+        finished = self.ep_length[rows, envs] > 0
+        relabelled = np.flatnonzero(finished)[: int(self.her_ratio * finished.sum())]
+        if not len(relabelled):
+            return batch
+        virtual = self._get_virtual_samples(rows[relabelled], envs[relabelled], env)
+        index = th.as_tensor(relabelled, device=self.device)
+        for key, value in virtual.observations.items():
+            batch.observations[key][index] = value
+            batch.next_observations[key][index] = virtual.next_observations[key]
+        batch.rewards[index] = virtual.rewards
+        return batch
+
+
+def combined_buffer_class(given: type[ReplayBuffer] | None, observation_space: spaces.Space) -> type[ReplayBuffer]:
+    """
+    :param given: the class the user asked for, or None
+    :param observation_space: Dict or not
+    :return: the ActPC buffer that does what ``given`` does
+    :raises ValueError: for a class that does not keep ActPC's signals
+    """
+    if given is None:
+        return CombinedDictReplayBuffer if isinstance(observation_space, spaces.Dict) else CombinedReplayBuffer
+    if issubclass(given, _SignalReplay):
+        return given
+    same: dict[type[ReplayBuffer], type[ReplayBuffer]] = {
+        ReplayBuffer: CombinedReplayBuffer,
+        NStepReplayBuffer: CombinedReplayBuffer,
+        DictReplayBuffer: CombinedDictReplayBuffer,
+        HerReplayBuffer: CombinedHerReplayBuffer,
+    }
+    if given in same:
+        return same[given]
+    raise ValueError(
+        f"replay_buffer_class={given.__name__} does not keep ActPC's signals; pass None, one of "
+        f"{[c.__name__ for c in same]} or a subclass of {[c.__name__ for c in set(same.values())]}"
+    )

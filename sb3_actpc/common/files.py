@@ -1,0 +1,59 @@
+"""Writing files so that a reader never meets half of one."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import uuid
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager
+from pathlib import Path
+from typing import IO, Any, Literal, overload
+
+
+@overload
+def atomic_write(path: str | os.PathLike[str]) -> AbstractContextManager[IO[bytes]]: ...
+
+
+@overload
+def atomic_write(path: str | os.PathLike[str], mode: Literal["wb"]) -> AbstractContextManager[IO[bytes]]: ...
+
+
+@overload
+def atomic_write(path: str | os.PathLike[str], mode: Literal["w"]) -> AbstractContextManager[IO[str]]: ...
+
+
+def atomic_write(path: str | os.PathLike[str], mode: Literal["wb", "w"] = "wb") -> AbstractContextManager[IO[Any]]:
+    """Open ``path`` for writing; the file appears, or replaces the old one, only when the block ends without an error.
+
+    The data goes to a temporary name in the same folder, is flushed to the disk and then renamed. When the block
+    raises, the temporary file is removed and an old file at ``path`` stays as it was.
+
+    :param path: file to write; missing folders are created, a link is followed, an old file's permissions are kept
+    :param mode: ``"wb"`` for bytes, ``"w"`` for UTF-8 text with ``\\n`` line ends
+    :return: context manager that yields the open temporary file
+    :raises ValueError: for any other ``mode``
+    :raises OSError: when the folder cannot be written, or ``path`` is a folder
+    """
+    if mode not in ("wb", "w"):
+        raise ValueError(f"mode must be 'wb' or 'w', found {mode!r}")
+    return _atomic_write(Path(os.path.realpath(path)), mode)
+
+
+@contextmanager
+def _atomic_write(target: Path, mode: str) -> Iterator[IO[Any]]:
+    if target.is_dir():
+        raise IsADirectoryError(f"cannot write a file over the folder {target}")
+    target.parent.mkdir(parents=True, exist_ok=True)
+    temporary = target.parent / f".{target.name[:32]}.{uuid.uuid4().hex[:12]}.tmp"
+    text_options = {} if mode == "wb" else {"encoding": "utf-8", "newline": "\n"}
+    try:
+        with open(temporary, mode.replace("w", "x"), **text_options) as file:  # type: ignore[call-overload]
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+        if target.exists():
+            shutil.copymode(target, temporary)
+        os.replace(temporary, target)
+    finally:
+        temporary.unlink(missing_ok=True)  # nothing is left to remove once it has been renamed

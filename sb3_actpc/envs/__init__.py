@@ -1,0 +1,42 @@
+"""Sparse-reward tasks, registered with Gymnasium when this package is imported.
+
+Importing this package is light: MuJoCo and the environment classes are loaded by ``gymnasium.make``.
+"""
+
+from gymnasium.envs.registration import register, registry
+
+SPARSE_MUJOCO_TASKS: tuple[str, ...] = ("Reacher", "HalfCheetah", "Walker2d", "Hopper", "Swimmer")
+SPARSE_MUJOCO_IDS: tuple[str, ...] = tuple(f"Sparse{task}-{v}" for v in ("v5", "v4") for task in SPARSE_MUJOCO_TASKS)
+
+
+def register_envs() -> None:
+    """Register the sparse tasks with Gymnasium; ids that are registered already are left alone.
+
+    The time limits are those of the base tasks: 50 steps for the Reacher, 1000 for the others.
+    """
+    for env_id in SPARSE_MUJOCO_IDS:
+        if env_id in registry:
+            continue
+        task, env_version = env_id.split("-")
+        register(
+            id=env_id,
+            entry_point=f"sb3_actpc.envs.sparse_mujoco:{task}{env_version.upper()}Env",
+            max_episode_steps=50 if task == "SparseReacher" else 1000,
+        )
+
+
+def dense_env_id(env_id: str) -> str:
+    """Id of the dense base task of a sparse MuJoCo task.
+
+    :param env_id: for example ``"SparseHopper-v5"``
+    :return: for example ``"Hopper-v5"``
+    :raises ValueError: if ``env_id`` is not one of ``SPARSE_MUJOCO_IDS``
+    """
+    if env_id not in SPARSE_MUJOCO_IDS:
+        raise ValueError(f"env_id={env_id!r} is not a sparse MuJoCo task: choose one of {', '.join(SPARSE_MUJOCO_IDS)}")
+    return env_id.removeprefix("Sparse")
+
+
+register_envs()
+
+__all__ = ["SPARSE_MUJOCO_IDS", "SPARSE_MUJOCO_TASKS", "dense_env_id", "register_envs"]

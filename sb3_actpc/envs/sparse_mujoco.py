@@ -1,0 +1,220 @@
+"""Gymnasium's MuJoCo tasks with sparse rewards.
+
+The tasks are those of Ororbia & Mali (arXiv 2209.09174). The Reacher is paid near its target. The locomotion tasks have
+two conditions: ``"displacement"``, the published benchmark of LOGO (Rengarajan et al., arXiv 2202.04628), which pays for
+having travelled a distance, and ``"forward"``, the wording of the paper's appendix, which pays for moving forward fast enough.
+
+The position along x is not observed, so the reward of ``"displacement"`` is no function of the observation; the reward of
+``"forward"`` nearly is.
+
+Every class is the base task with another reward: observations, actions, dynamics, falls, rendering and the base task's
+keywords are unchanged. The base task's reward is ``info["dense_reward"]``. Time limits are set by
+:func:`sb3_actpc.envs.register_envs`, and reported as truncation.
+"""
+
+import math
+from typing import Any, ClassVar
+
+import numpy as np
+from gymnasium import utils
+from gymnasium.envs.mujoco import (
+    MujocoEnv,
+    half_cheetah_v4,
+    half_cheetah_v5,
+    hopper_v4,
+    hopper_v5,
+    reacher_v4,
+    reacher_v5,
+    swimmer_v4,
+    swimmer_v5,
+    walker2d_v4,
+    walker2d_v5,
+)
+
+LOCOMOTION_CONDITIONS: tuple[str, ...] = ("displacement", "forward")
+
+
+def _check_threshold(threshold: float | None, default: float, meaning: str) -> float:
+    """Return the threshold in use.
+
+    :raises ValueError: if it is not a positive finite number
+    """
+    if threshold is None:
+        return default
+    if isinstance(threshold, bool) or not isinstance(threshold, int | float) or not 0.0 < threshold < math.inf:
+        raise ValueError(
+            f"threshold={threshold!r} must be a positive finite number ({meaning}): give one, or None for {default}"
+        )
+    return float(threshold)
+
+
+class _SparseMujocoEnv(MujocoEnv, utils.EzPickle):
+    """A base task whose reward is moved to ``info["dense_reward"]`` and replaced by a sparse one."""
+
+    # the base class promises NumPy floats; the reward here is a Python float
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:  # type: ignore[override]
+        """Advance the base task by one step.
+
+        :param action: (action_dim,) within the action space
+        :return: observation (obs_dim,), sparse reward, terminated (a fall), truncated, info with ``dense_reward`` (float)
+            and ``is_success`` (bool)
+        """
+        observation, dense_reward, terminated, truncated, base_info = super().step(action)
+        info: dict[str, Any] = dict(base_info)
+        reward, is_success = self._sparse_reward(info)
+        info.update(dense_reward=float(dense_reward), is_success=is_success)
+        return observation, reward, bool(terminated), truncated, info
+
+    def _sparse_reward(self, info: dict[str, Any]) -> tuple[float, bool]:
+        """Sparse reward and success of the state just reached."""
+        raise NotImplementedError
+
+
+class SparseReacherEnv(_SparseMujocoEnv):
+    """Reward 1 while the fingertip is near the target.
+
+    ``info["is_success"]`` is whether the present step is paid, so at the end of an episode, whether its last step was.
+
+    :param threshold: distance in metres at or below which a step is paid, None for 0.06
+    :param miss_reward: reward of every other step, 0 by default; baselines are often given -1
+    :param kwargs: the base task's keywords
+    :raises ValueError: for a threshold that is not positive and finite, a ``miss_reward`` that is not a finite number
+        below 1, or a ``condition``
+    """
+
+    default_threshold: ClassVar[float] = 0.06
+
+    def __init__(self, threshold: float | None = None, miss_reward: float = 0.0, **kwargs: Any) -> None:
+        if "condition" in kwargs:
+            raise ValueError(
+                f"condition={kwargs['condition']!r} is not allowed here, the Reacher has one condition: leave it out, "
+                "`threshold` is its distance"
+            )
+        if isinstance(miss_reward, bool) or not isinstance(miss_reward, int | float) or not -math.inf < miss_reward < 1.0:
+            raise ValueError(f"miss_reward={miss_reward!r} must be a finite number below 1: give 0.0, or -1.0 for baselines")
+        self.threshold = _check_threshold(threshold, self.default_threshold, "metres from the target")
+        self.miss_reward = float(miss_reward)
+        super().__init__(**kwargs)
+        utils.EzPickle.__init__(self, threshold=threshold, miss_reward=miss_reward, **kwargs)
+
+    def _sparse_reward(self, info: dict[str, Any]) -> tuple[float, bool]:
+        distance = np.linalg.norm(self.get_body_com("fingertip") - self.get_body_com("target"))
+        is_near = bool(distance <= self.threshold)
+        return (1.0 if is_near else self.miss_reward), is_near
+
+
+class SparseLocomotionEnv(_SparseMujocoEnv):
+    """Reward 1 for having come far enough, or for moving forward fast enough, else 0.
+
+    ``info["is_success"]`` is whether the distance of the ``"displacement"`` condition has been passed in this episode,
+    whichever condition pays.
+
+    :param condition: ``"displacement"`` pays every step at which x - x_0 exceeds the threshold, x_0 being x after the
+        reset; ``"forward"`` pays every step whose mean forward velocity exceeds it
+    :param threshold: metres or metres per second, None for the task's own ``default_distance`` or ``default_velocity``
+    :param kwargs: the base task's keywords
+    :raises ValueError: for an unknown condition, a threshold that is not positive and finite, or a ``miss_reward``
+    """
+
+    default_distance: ClassVar[float]
+    """Metres, of LOGO's benchmark."""
+    default_velocity: ClassVar[float]
+    """Metres per second, our choice: the paper gives none. Of the steps of uniformly random actions (10 episodes of -v5) it
+    pays 0 % (HalfCheetah, Walker2d), 4 % (Hopper) and 18 % (Swimmer, whose first segment swings along x)."""
+
+    def __init__(self, condition: str = "displacement", threshold: float | None = None, **kwargs: Any) -> None:
+        if condition not in LOCOMOTION_CONDITIONS:
+            raise ValueError(f"condition={condition!r} is not one of {LOCOMOTION_CONDITIONS}: choose one of these")
+        if "miss_reward" in kwargs:
+            raise ValueError(
+                f"miss_reward={kwargs['miss_reward']!r} is not allowed here, an unpaid step of a locomotion task gives 0: "
+                "leave it out, it is a keyword of the Reacher"
+            )
+        self.condition = condition
+        self.distance, self.velocity = self.default_distance, self.default_velocity
+        if condition == "displacement":
+            self.distance = _check_threshold(threshold, self.default_distance, "metres from the start")
+        else:
+            self.velocity = _check_threshold(threshold, self.default_velocity, "metres per second")
+        self._start_x = 0.0
+        self._has_passed = False
+        super().__init__(**kwargs)
+        utils.EzPickle.__init__(self, condition=condition, threshold=threshold, **kwargs)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
+        """Start an episode and remember its x.
+
+        :param seed: seed of the base task's noise, None to go on with its generator
+        :param options: passed to the base task
+        :return: observation (obs_dim,) and the base task's info
+        """
+        observation, info = super().reset(seed=seed, options=options)
+        self._start_x = float(self.data.qpos[0])
+        self._has_passed = False
+        return observation, info
+
+    def _sparse_reward(self, info: dict[str, Any]) -> tuple[float, bool]:
+        is_far = bool(self.data.qpos[0] - self._start_x > self.distance)
+        self._has_passed = self._has_passed or is_far
+        is_paid = is_far if self.condition == "displacement" else bool(info["x_velocity"] > self.velocity)
+        return float(is_paid), self._has_passed
+
+
+class _SparseHalfCheetahEnv(SparseLocomotionEnv):
+    default_distance = 20.0
+    default_velocity = 3.5
+
+
+class _SparseWalker2dEnv(SparseLocomotionEnv):
+    default_distance = 2.0
+    default_velocity = 1.0
+
+
+class _SparseHopperEnv(SparseLocomotionEnv):
+    default_distance = 2.0
+    default_velocity = 1.0
+
+
+class _SparseSwimmerEnv(SparseLocomotionEnv):
+    default_distance = 1.0
+    default_velocity = 0.3
+
+
+class SparseReacherV5Env(SparseReacherEnv, reacher_v5.ReacherEnv):
+    """``Reacher-v5`` (10 observations) paid near its target."""
+
+
+class SparseReacherV4Env(SparseReacherEnv, reacher_v4.ReacherEnv):
+    """``Reacher-v4`` (11 observations, as in the paper) paid near its target."""
+
+
+class SparseHalfCheetahV5Env(_SparseHalfCheetahEnv, half_cheetah_v5.HalfCheetahEnv):
+    """``HalfCheetah-v5`` (17 observations) paid beyond 20 m, or above 3.5 m/s."""
+
+
+class SparseHalfCheetahV4Env(_SparseHalfCheetahEnv, half_cheetah_v4.HalfCheetahEnv):
+    """``HalfCheetah-v4`` (17 observations) paid beyond 20 m, or above 3.5 m/s."""
+
+
+class SparseWalker2dV5Env(_SparseWalker2dEnv, walker2d_v5.Walker2dEnv):
+    """``Walker2d-v5`` (17 observations) paid beyond 2 m, or above 1 m/s."""
+
+
+class SparseWalker2dV4Env(_SparseWalker2dEnv, walker2d_v4.Walker2dEnv):
+    """``Walker2d-v4`` (17 observations) paid beyond 2 m, or above 1 m/s."""
+
+
+class SparseHopperV5Env(_SparseHopperEnv, hopper_v5.HopperEnv):
+    """``Hopper-v5`` (11 observations) paid beyond 2 m, or above 1 m/s."""
+
+
+class SparseHopperV4Env(_SparseHopperEnv, hopper_v4.HopperEnv):
+    """``Hopper-v4`` (11 observations) paid beyond 2 m, or above 1 m/s."""
+
+
+class SparseSwimmerV5Env(_SparseSwimmerEnv, swimmer_v5.SwimmerEnv):
+    """``Swimmer-v5`` (8 observations) paid beyond 1 m, or above 0.3 m/s."""
+
+
+class SparseSwimmerV4Env(_SparseSwimmerEnv, swimmer_v4.SwimmerEnv):
+    """``Swimmer-v4`` (8 observations) paid beyond 1 m, or above 0.3 m/s."""

@@ -1,0 +1,327 @@
+"""The neural generative coding (NGC) circuit: one stack of layers that predict, settle and learn by Hebbian changes."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch as th
+from torch import nn
+
+from sb3_actpc.ngc.activations import get_activation
+from sb3_actpc.ngc.dynamics import DYNAMICS, SettledState, SettlingChain, predict
+from sb3_actpc.ngc.plasticity import SYNAPTIC_SCALINGS, HebbianChanges, bound_columns_, hebbian_changes, soft_bound_
+from sb3_actpc.ngc.stability import power_iteration_, settling_rates
+
+SETTLINGS = ("iterative", "scheduled")
+FEEDBACKS = ("learned", "tied")
+
+
+class NGCCircuit(nn.Module):
+    """
+    A neural generative coding circuit of any depth and width (Ororbia & Mali, arXiv 2209.09174, section 2.1).
+
+    Layers are listed in forward order: ``weights[0]`` carries the clamped input to the first hidden layer, ``weights[-1]``
+    predicts the clamped output (the paper counts from the output). The input is not passed through φ, hidden g is the
+    identity. No parameter requires a gradient: learning goes through :meth:`settle`, :meth:`hebbian_update` and
+    :meth:`apply_changes`.
+
+    :param n_inputs: size of the input
+    :param n_outputs: size of the output
+    :param hidden: sizes of the hidden layers, first to last; may be empty
+    :param activation: φ of the hidden layers: relu6 (paper), relu, leaky_relu, elu, tanh or identity
+    :param output_activation: g of the output layer, same choices
+    :param settling: "iterative" (``n_settling_steps`` steps of eq. 1, then one change) or "scheduled" (each layer's change is
+        taken when the error first reaches it; numerically the gradient of the output's loss, about K times cheaper)
+    :param n_settling_steps: K (paper: 10 to 25)
+    :param dynamics: "error" (error neurons integrate, states follow their predictions) or "state" (eq. 1 to the letter);
+        same fixed points, see :class:`~sb3_actpc.ngc.dynamics.SettlingChain`
+    :param settling_rate: β, a number in (0, 1], or "auto": kept inside the stable range as the synapses grow
+    :param leak: γ of eq. 1; 0 by default
+    :param feedback: "learned" (own error synapses E, started independently of W: the paper's and the default) or "tied"
+        (``feedback_scale`` W^T; the only choice, and the default, under "scheduled")
+    :param feedback_scale: λ_e of tied error synapses
+    :param feedback_rate: γ_e, learning rate of E over that of W (the paper: below 1)
+    :param derivative_free: leave out φ' in the state update (appendix)
+    :param synaptic_scaling: "none", "soft_bound" (no synapse passes ±``weight_bound``) or "column_norm" (no column of W or E
+        has a norm above ``weight_bound``); acts on the step after the optimiser
+    :param weight_bound: the bound of ``synaptic_scaling``
+    :param n_memory: size of the working memory fed to every layer; 0 for none
+    :param memory_weight: α_m
+    :param n_feedback_inputs: error synapses also reach the last this-many inputs (the critic's action columns)
+    :raises ValueError: when a keyword has a value that is not allowed, or conflicts with ``settling="scheduled"``
+    """
+
+    def __init__(
+        self,
+        n_inputs: int,
+        n_outputs: int,
+        hidden: Sequence[int] = (256, 256),
+        *,
+        activation: str = "relu6",
+        output_activation: str = "identity",
+        settling: str = "iterative",
+        n_settling_steps: int = 10,
+        dynamics: str = "error",
+        settling_rate: float | str = "auto",
+        leak: float = 0.0,
+        feedback: str | None = None,
+        feedback_scale: float = 1.0,
+        feedback_rate: float = 0.9,
+        derivative_free: bool = False,
+        synaptic_scaling: str = "none",
+        weight_bound: float = 1.0,
+        n_memory: int = 0,
+        memory_weight: float = 1.0,
+        n_feedback_inputs: int = 0,
+    ) -> None:
+        super().__init__()
+        _check_choice("settling", settling, SETTLINGS)
+        _check_choice("dynamics", dynamics, DYNAMICS)
+        _check_choice("synaptic_scaling", synaptic_scaling, SYNAPTIC_SCALINGS)
+        feedback = feedback or ("tied" if settling == "scheduled" else "learned")
+        _check_choice("feedback", feedback, FEEDBACKS)
+        if min(n_inputs, n_outputs, *hidden) < 1 or n_settling_steps < 1 or n_memory < 0:
+            raise ValueError(
+                f"n_inputs={n_inputs}, n_outputs={n_outputs}, hidden={list(hidden)} and n_settling_steps={n_settling_steps} "
+                f"must be at least 1, n_memory={n_memory} at least 0"
+            )
+        if settling_rate != "auto" and not (isinstance(settling_rate, (int, float)) and 0.0 < settling_rate <= 1.0):
+            raise ValueError(f"settling_rate={settling_rate!r} must be 'auto' or a number in (0, 1]")
+        for name, value in {
+            "leak": leak,
+            "feedback_rate": feedback_rate,
+            "weight_bound": weight_bound,
+            "feedback_scale": feedback_scale,
+        }.items():
+            if value < 0.0:
+                raise ValueError(f"{name}={value} must not be negative")
+        if not 0 <= n_feedback_inputs <= n_inputs:
+            raise ValueError(f"n_feedback_inputs={n_feedback_inputs} must lie between 0 and n_inputs={n_inputs}")
+        if settling == "scheduled":
+            _check_scheduled(
+                feedback=feedback,
+                feedback_scale=feedback_scale,
+                leak=leak,
+                settling_rate=settling_rate,
+                derivative_free=derivative_free,
+            )
+        self.sizes = [n_inputs, *hidden, n_outputs]
+        self.activation = get_activation(activation)
+        self.output_activation = get_activation(output_activation)
+        self.settling, self.n_settling_steps, self.dynamics = settling, n_settling_steps, dynamics
+        self.settling_rate, self.leak, self.derivative_free = settling_rate, leak, derivative_free
+        self.feedback, self.feedback_scale, self.feedback_rate = feedback, feedback_scale, feedback_rate
+        self.synaptic_scaling, self.weight_bound = synaptic_scaling, weight_bound
+        self.n_memory, self.memory_weight = n_memory, memory_weight
+        self.n_feedback_inputs = n_feedback_inputs
+        self._create_synapses()
+
+    # ------------------------------------------------------------------ synapses
+
+    def _create_synapses(self) -> None:
+        pairs = list(zip(self.sizes[:-1], self.sizes[1:], strict=True))
+        self.weights = nn.ParameterList([_uniform(n_out, n_in, n_in) for n_in, n_out in pairs])
+        self.biases = nn.ParameterList([_uniform(n_out, 1, n_in).squeeze(1) for n_in, n_out in pairs])
+        self.memory_weights = nn.ParameterList(
+            [_uniform(n_out, self.n_memory, self.n_memory) for _, n_out in pairs] if self.n_memory else []
+        )
+        # E^T in the layout of W: (n_out, n_in), so that errors @ E^T is one product without a transposition
+        sources = [self.n_feedback_inputs, *self.sizes[1:-1]]
+        self.feedback_weights = nn.ParameterList(
+            [_uniform(n_out, source, n_in) for source, (n_in, n_out) in zip(sources, pairs, strict=True) if source]
+            if self.feedback == "learned"
+            else []
+        )
+        for parameter in self.parameters():
+            parameter.requires_grad_(False)
+        self.register_buffer("rates", th.zeros(max(1, self.n_hidden)))
+        self._keep_rates = self.settling == "iterative" and self.settling_rate == "auto" and self.n_hidden > 0
+        if self._keep_rates:
+            for name, matrix in self._coupling_matrices():
+                self.register_buffer(name, th.nn.functional.normalize(th.ones(matrix.shape[1]), dim=0))
+            self.update_settling_rates(n_iterations=30)
+        elif self.settling_rate != "auto":
+            self.rates.fill_(float(self.settling_rate))
+
+    @property
+    def n_hidden(self) -> int:
+        """Number of hidden layers."""
+        return len(self.sizes) - 2
+
+    def layer_biases(self, memory: th.Tensor | None) -> list[th.Tensor]:
+        """
+        What every layer's prediction adds to W φ(z): b (n_out,), or with a memory b + α_m M m_t, (B, n_out).
+
+        :raises ValueError: when a memory is missing, not wanted or of the wrong size
+        """
+        if (memory is not None) != bool(self.n_memory) or (memory is not None and memory.shape[1] != self.n_memory):
+            found = "no memory" if memory is None else f"a memory of size {memory.shape[1]}"
+            raise ValueError(f"this circuit has n_memory={self.n_memory} but was given {found}")
+        if memory is None:
+            return list(self.biases)
+        return [
+            th.addmm(bias, memory, weights.t(), alpha=self.memory_weight)
+            for bias, weights in zip(self.biases, self.memory_weights, strict=True)
+        ]
+
+    def feedback_matrix(self, layer: int) -> th.Tensor:
+        """
+        E^T of hidden layer ``layer`` (1 = first), shape (n_below, n_layer); layer 0 is the input's last
+        ``n_feedback_inputs`` columns.
+        """
+        if self.feedback == "learned":
+            return self.feedback_weights[layer if self.n_feedback_inputs else layer - 1]
+        weights = self.weights[layer] if layer else self.weights[0][:, self.sizes[0] - self.n_feedback_inputs :]
+        return weights if self.feedback_scale == 1.0 else self.feedback_scale * weights
+
+    # ------------------------------------------------------------------ inference
+
+    def project(self, x: th.Tensor, memory: th.Tensor | None = None) -> th.Tensor:
+        """
+        Ancestral projection f_proj: one feed-forward pass, no settling (paper, eq. for projection).
+
+        :param x: (B, n_inputs)
+        :param memory: m_t, (B, n_memory), for a circuit with a working memory
+        :return: (B, n_outputs)
+        """
+        biases = self.layer_biases(memory)
+        for weights, bias in zip(self.weights[:-1], biases[:-1], strict=True):
+            latents = predict(x, weights, bias)
+            x = self.activation.apply(latents, latents)
+        output = predict(x, self.weights[-1], biases[-1])
+        return self.output_activation.apply(output, output)
+
+    def settle(self, x: th.Tensor, target: th.Tensor, memory: th.Tensor | None = None) -> SettledState:
+        """
+        Clamp input and output and let the hidden layers settle from the projected state (f_inf). No synapse changes.
+
+        :param x: (B, n_inputs)
+        :param target: (B, n_outputs)
+        :param memory: m_t, (B, n_memory), for a circuit with a working memory
+        :return: latents, activations and errors of every layer
+        """
+        chain = SettlingChain(self, x, memory)
+        chain.clamp_output(target)
+        if self.settling == "scheduled":
+            chain.sweep()
+            return chain.state()
+        chain.start_settling()
+        rates = self.rates.tolist()
+        for _ in range(self.n_settling_steps if self.n_hidden else 0):
+            chain.integrate(rates)
+            chain.predict()
+        return chain.state()
+
+    def energy(self, state: SettledState) -> th.Tensor:
+        """1/2 Σ ||e||^2 over the layers, per sample, (B,) (paper: total discrepancy, appendix)."""
+        return state.total_discrepancy()
+
+    def residual(self, state: SettledState) -> th.Tensor:
+        """
+        How far from rest the hidden layers still are: RMS of eq. 1's right-hand side over RMS of the feedback in it, 0-d.
+
+        1 at the projected start of a circuit with one hidden layer, 0 at a fixed point.
+        """
+        moves, drives = [], []
+        for layer in range(1, self.n_hidden + 1):
+            signal = state.postsynaptic[layer] @ self.feedback_matrix(layer)
+            if not self.derivative_free:
+                signal = self.activation.damp(signal, state.latents[layer], state.activations[layer])
+            drives.append(signal.square().sum())
+            moves.append((signal - state.errors[layer - 1] - self.leak * state.latents[layer]).square().sum())
+        if not moves:
+            return th.zeros(())
+        return (th.stack(moves).sum() / th.stack(drives).sum().clamp_min(1e-30)).sqrt()
+
+    # ------------------------------------------------------------------ learning
+
+    def hebbian_update(self, state: SettledState) -> HebbianChanges:
+        """
+        The changes *to be added* that the settled ``state`` asks for: e φ(z)^T and its like, means over the batch.
+
+        For the error synapses see :attr:`HebbianChanges.feedback`. Nothing is changed yet: :meth:`apply_changes` does that.
+        """
+        return hebbian_changes(state.postsynaptic, state.activations, state.memory, self.memory_weight)
+
+    def parameter_groups(self, learning_rate: float) -> list[dict[str, Any]]:
+        """
+        Parameter groups for a ``torch.optim`` optimiser. The error synapses' rate is γ_e times the weights': an adaptive
+        optimiser cancels a constant factor on the change itself. ``lr_scale`` tells a scheduler that ratio.
+        """
+        forward = [*self.weights, *self.biases, *self.memory_weights]
+        groups: list[dict[str, Any]] = [{"params": forward, "lr": learning_rate, "lr_scale": 1.0}]
+        if len(self.feedback_weights):
+            scale = self.feedback_rate
+            groups.append({"params": list(self.feedback_weights), "lr": learning_rate * scale, "lr_scale": scale})
+        return groups
+
+    def apply_changes(self, changes: HebbianChanges, optimizer: th.optim.Optimizer) -> None:
+        """
+        Hand the changes to the optimiser, bound the step it takes, and keep the settling rates stable.
+
+        The one place where a change becomes minus a gradient.
+        """
+        old = [parameter.clone() for parameter in self._scaled_synapses()] if self.synaptic_scaling == "soft_bound" else []
+        targets = [*self.weights, *self.biases, *self.memory_weights]
+        for parameter, gradient in zip(targets, th._foreach_neg(changes.tensors()), strict=True):
+            parameter.grad = gradient
+        first = 0 if self.n_feedback_inputs else 1
+        # E^T is stored in the layout of W, so that its change is ΔW itself
+        for parameter, weights in zip(self.feedback_weights, list(self.weights)[first:], strict=len(self.feedback_weights) > 0):
+            assert weights.grad is not None
+            parameter.grad = weights.grad[:, weights.shape[1] - parameter.shape[1] :].contiguous()
+        optimizer.step()
+        self._scale_synapses(old)
+        if self._keep_rates:
+            self.update_settling_rates()
+
+    def _scaled_synapses(self) -> list[th.Tensor]:
+        return [*self.weights, *self.feedback_weights]
+
+    def _scale_synapses(self, old: list[th.Tensor]) -> None:
+        if self.synaptic_scaling == "soft_bound":
+            for synapses, before in zip(self._scaled_synapses(), old, strict=True):
+                soft_bound_(synapses, before, self.weight_bound)
+        elif self.synaptic_scaling == "column_norm":
+            for synapses in self._scaled_synapses():
+                bound_columns_(synapses, self.weight_bound)
+
+    # ------------------------------------------------------------------ stability
+
+    def _coupling_matrices(self) -> list[tuple[str, th.Tensor]]:
+        """The matrices between hidden layers and output, with the names of their power-iteration vectors."""
+        named = [(f"singular_vector_{layer}", self.weights[layer]) for layer in range(1, self.n_hidden + 1)]
+        if self.feedback == "learned":
+            named += [
+                (f"feedback_singular_vector_{layer}", self.feedback_matrix(layer)) for layer in range(1, self.n_hidden + 1)
+            ]
+        return named
+
+    def update_settling_rates(self, n_iterations: int = 1) -> None:
+        """Follow the spectral norms of the synapses by power iteration and set the rates that are stable for them."""
+        norms = th.stack([power_iteration_(m, getattr(self, name), n_iterations) for name, m in self._coupling_matrices()])
+        forward = norms[: self.n_hidden].tolist()
+        feedback = norms[self.n_hidden :].tolist() or [self.feedback_scale * norm for norm in forward]
+        self.rates.copy_(th.tensor(settling_rates(self.dynamics, forward, feedback)))
+
+
+def _uniform(n_out: int, n_in: int, fan_in: int) -> nn.Parameter:
+    """U(-1/sqrt(fan_in), 1/sqrt(fan_in)), as ``torch.nn.Linear`` starts; (n_out, n_in), without a gradient."""
+    bound = fan_in**-0.5
+    return nn.Parameter(th.empty(n_out, n_in).uniform_(-bound, bound), requires_grad=False)
+
+
+def _check_choice(name: str, value: str, allowed: Sequence[str]) -> None:
+    if value not in allowed:
+        raise ValueError(f"{name}={value!r} is unknown; choose one of {list(allowed)}")
+
+
+def _check_scheduled(**given: Any) -> None:
+    """Scheduled settling implies these settings: say which explicit one conflicts."""
+    implied = {"feedback": "tied", "feedback_scale": 1.0, "leak": 0.0, "settling_rate": ("auto", 1.0), "derivative_free": False}
+    for name, value in given.items():
+        allowed = implied[name] if isinstance(implied[name], tuple) else (implied[name],)
+        if value not in allowed:
+            raise ValueError(
+                f"{name}={value!r} conflicts with settling='scheduled', which implies {name}={allowed[0]!r}; "
+                f"leave {name} out or use settling='iterative'"
+            )

@@ -1,0 +1,102 @@
+"""Two circuits that settle as one: the actor under the critic (paper, sections on the policy and motor-action circuits)."""
+
+from dataclasses import dataclass
+
+import torch as th
+
+from sb3_actpc.ngc.circuit import NGCCircuit
+from sb3_actpc.ngc.dynamics import SettledState, SettlingChain
+
+COUPLED_RATE = 0.5  # with its output error clamped the pair has no loop: any rate up to 1 is stable
+
+
+@dataclass
+class CoupledState:
+    """
+    :param actor: the actor's settled state; its output error is the perturbation d_a the critic asked for
+    :param actions: the actor's projected actions, (B, A), that were held while settling
+    :param action_values: the critic's projected values of them, (B, n_outputs)
+    """
+
+    actor: SettledState
+    actions: th.Tensor
+    action_values: th.Tensor
+
+
+def settle_coupled(
+    actor: NGCCircuit, critic: NGCCircuit, x: th.Tensor, memory: th.Tensor | None = None, nudge: float = 0.01
+) -> CoupledState:
+    """
+    Project actor and critic, hold the action, clamp the critic's output error to +1/A and settle both as one circuit.
+
+    At every step the actor's output error is clamped to d_a = E_a e, the critic's perturbation of its action inputs. (The
+    paper prints -1/A; with changes that are *added*, that sign would lower the action-values.) Neither circuit changes.
+
+    The clamped error is applied as ``nudge`` / A and the actor's errors are divided by ``nudge`` afterwards: the smaller the
+    nudge, the closer the settled errors are to those of an infinitesimal perturbation, and the actor's change to the
+    deterministic policy gradient (tied feedback). 1 is the paper's.
+
+    :param actor: observation (and memory) -> action
+    :param critic: [observation, action] -> action-values; its last A inputs are the action
+    :param x: observations, (B, n_observation)
+    :param memory: the actor's m_t, (B, n_memory), or None
+    :param nudge: scale of the perturbation, in (0, 1]
+    :return: the actor's state, the actions and their values
+    :raises ValueError: when the critic's error synapses do not reach the actor's outputs, or the schedules differ
+    """
+    n_actions = actor.sizes[-1]
+    if critic.n_feedback_inputs != n_actions or critic.sizes[0] != x.shape[1] + n_actions:
+        raise ValueError(
+            f"the critic has n_inputs={critic.sizes[0]} and n_feedback_inputs={critic.n_feedback_inputs}; under this actor it "
+            f"needs {x.shape[1] + n_actions} and {n_actions}"
+        )
+    if actor.settling != critic.settling:
+        raise ValueError(f"actor settling={actor.settling!r} and critic settling={critic.settling!r} must agree")
+    motor = SettlingChain(actor, x, memory)
+    value = SettlingChain(critic, th.cat([x, motor.output], dim=1), None)
+    scale = nudge if actor.settling == "iterative" else 1.0
+    value.clamp_output_drive(_damped(value, th.full_like(value.output, scale / value.output.shape[1])))
+    if actor.settling == "scheduled":
+        value.sweep()
+        _clamp_actor(motor, value)
+        motor.sweep()
+    else:
+        _settle_both(motor, value)
+        for error in [*motor.errors, motor.output_error]:
+            error.div_(scale)
+        if motor.drive is not motor.output_error:
+            motor.drive.div_(scale)
+    return CoupledState(motor.state(), motor.output, value.output)
+
+
+def _settle_both(motor: SettlingChain, value: SettlingChain) -> None:
+    value.start_settling()
+    motor.start_settling()
+    value_rates = [COUPLED_RATE] * value.n_hidden
+    motor_rates = [COUPLED_RATE] * motor.n_hidden
+    actor_waits = value.n_hidden  # steps until the critic's first layer has an error to pass on
+    for step in range(value.circuit.n_settling_steps):
+        if step >= actor_waits:
+            _clamp_actor(motor, value)
+            motor.integrate(motor_rates)
+        value.integrate(value_rates)
+        if step >= actor_waits:
+            motor.predict(output=False)
+        value.predict(output=False)
+    _clamp_actor(motor, value)
+
+
+def _clamp_actor(motor: SettlingChain, value: SettlingChain) -> None:
+    """The actor's output error becomes d_a = E_a e of the critic's first layer (of its output, without hidden layers)."""
+    below = value.errors[0] if value.n_hidden else value.drive
+    perturbation = below @ value.circuit.feedback_matrix(0)
+    motor.output_error = perturbation
+    motor.drive = _damped(motor, perturbation)
+
+
+def _damped(chain: SettlingChain, error: th.Tensor) -> th.Tensor:
+    """The output error times g' at the held output; the error itself when g is the identity."""
+    activation = chain.circuit.output_activation
+    if activation.name == "identity":
+        return error
+    return activation.damp(error.clone(), chain.output_prediction, chain.output)

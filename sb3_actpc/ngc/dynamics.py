@@ -1,0 +1,175 @@
+"""Settling: how the latent states and error neurons of a circuit move while its synapses stand still."""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch as th
+
+if TYPE_CHECKING:
+    from sb3_actpc.ngc.circuit import NGCCircuit
+
+DYNAMICS = ("error", "state")
+
+
+@dataclass
+class SettledState:
+    """
+    Where a circuit came to rest; all lists in forward order (first layer first).
+
+    :param latents: z, L + 1 tensors (B, n): the clamped input, every hidden layer, the clamped (or, when the output's error
+        was clamped instead, the predicted) output. The paper counts from the other end: its z^L is ``latents[0]``
+    :param activations: φ(z) of the layers that predict, L tensors; ``activations[l]`` is presynaptic to ``weights[l]``
+    :param errors: e = z - z̄, L tensors; ``errors[l]`` belongs to the layer that ``weights[l]`` predicts
+    :param output_drive: the output's error times g', what reaches the synapses and the layer above (B, n_outputs)
+    :param memory: the working memory m_t, (B, n_memory), or None
+    """
+
+    latents: list[th.Tensor]
+    activations: list[th.Tensor]
+    errors: list[th.Tensor]
+    output_drive: th.Tensor
+    memory: th.Tensor | None
+
+    @property
+    def postsynaptic(self) -> list[th.Tensor]:
+        """The errors as the synapses see them: hidden g is the identity, the output's error is multiplied by g'."""
+        return [*self.errors[:-1], self.output_drive]
+
+    def total_discrepancy(self) -> th.Tensor:
+        """The energy 1/2 Σ_l ||e_l||^2 of every sample (paper: total discrepancy), (B,)."""
+        return 0.5 * th.stack([error.square().sum(1) for error in self.errors]).sum(0)
+
+
+class SettlingChain:
+    """
+    The live latents and errors of one circuit, advanced step by step without any allocation.
+
+    A step has two halves. :meth:`integrate` moves the hidden layers by eq. 1 of the paper, all from the same instant;
+    :meth:`predict` brings predictions and errors up to date. ``dynamics="state"`` is eq. 1 to the letter (states integrate,
+    errors follow); ``dynamics="error"`` lets the error neurons integrate the same right-hand side while the states ride
+    on their predictions (z = z̄ + e). Both rest where the right-hand side vanishes, so they have the same fixed points.
+
+    Layers that no error has reached yet stand still and cost nothing.
+
+    :param circuit: the circuit whose synapses are used (never changed)
+    :param x: the clamped input, (B, n_inputs)
+    :param memory: m_t, (B, n_memory), or None
+    """
+
+    def __init__(self, circuit: "NGCCircuit", x: th.Tensor, memory: th.Tensor | None) -> None:
+        self.circuit = circuit
+        self.memory = memory
+        self.biases = circuit.layer_biases(memory)
+        self.latents: list[th.Tensor] = [x]
+        self.activations: list[th.Tensor] = [x]
+        for weights, bias in zip(circuit.weights[:-1], self.biases[:-1], strict=True):
+            latents = predict(self.activations[-1], weights, bias)
+            self.latents.append(latents)
+            self.activations.append(circuit.activation.apply(latents, th.empty_like(latents)))
+        self.output_prediction = predict(self.activations[-1], circuit.weights[-1], self.biases[-1])
+        self.output = circuit.output_activation.apply(self.output_prediction, th.empty_like(self.output_prediction))
+        self.n_hidden = len(self.latents) - 1
+        self.lowest_reached = self.n_hidden + 1
+        self.target: th.Tensor | None = None
+        self.drive = self.output_prediction  # replaced as soon as the output is clamped
+        self.errors: list[th.Tensor] = []
+
+    def start_settling(self) -> None:
+        """Give every hidden layer its error neurons (at rest: 0) and its buffers."""
+        hidden = self.latents[1:]
+        self.errors = [th.zeros_like(z) for z in hidden]
+        self.feedback = [th.empty_like(z) for z in hidden]
+        self.first_prediction = hidden[0].clone() if hidden else None
+
+    def clamp_output(self, target: th.Tensor) -> None:
+        """Clamp the output layer to ``target`` (B, n_outputs): its error is target - g(z̄), now and after every step."""
+        self.target = target
+        self.output_error = th.empty_like(self.output)
+        self.drive = th.empty_like(self.output) if self.circuit.output_activation.name != "identity" else self.output_error
+        self._refresh_output_error()
+
+    def clamp_output_drive(self, drive: th.Tensor) -> None:
+        """Clamp the output's error itself (already multiplied by g'), (B, n_outputs), whatever the circuit predicts."""
+        self.drive = drive
+        self.output_error = drive
+
+    def _refresh_output_error(self) -> None:
+        assert self.target is not None
+        th.sub(self.target, self.output, out=self.output_error)
+        if self.drive is not self.output_error:
+            self.drive.copy_(self.output_error)
+            self.circuit.output_activation.damp(self.drive, self.output_prediction, self.output)
+
+    def feedback_to(self, layer: int) -> th.Tensor:
+        """(E_l e_{l+1}) ⊙ φ'(z_l), what the layer below tells hidden layer ``layer`` (1 = first) of its error, (B, n)."""
+        circuit = self.circuit
+        below = self.drive if layer == self.n_hidden else self.errors[layer]
+        signal = th.mm(below, circuit.feedback_matrix(layer), out=self.feedback[layer - 1])
+        if not circuit.derivative_free:
+            circuit.activation.damp(signal, self.latents[layer], self.activations[layer])
+        return signal
+
+    def integrate(self, rates: list[float]) -> None:
+        """One step of eq. 1 for every hidden layer that an error has reached; ``rates`` are the β, first layer first."""
+        circuit = self.circuit
+        self.lowest_reached = 1 if circuit.leak else max(1, self.lowest_reached - 1)
+        for layer in range(self.lowest_reached, self.n_hidden + 1):
+            signal, error, rate = self.feedback_to(layer), self.errors[layer - 1], rates[layer - 1]
+            if circuit.leak:
+                signal.sub_(self.latents[layer], alpha=circuit.leak)
+            if circuit.dynamics == "error" or layer == 1:  # the first layer's prediction is constant: both are the same
+                error.lerp_(signal, rate)
+            else:
+                self.latents[layer].add_(signal.sub_(error), alpha=rate)
+
+    def predict(self, output: bool = True) -> None:
+        """
+        Bring states, activations and errors up to date after :meth:`integrate`.
+
+        :param output: also predict the output (needless where its error is clamped)
+        """
+        circuit = self.circuit
+        for layer in range(self.lowest_reached, self.n_hidden + 1):
+            latents, error = self.latents[layer], self.errors[layer - 1]
+            if layer == 1:
+                th.add(self.first_prediction, error, out=latents)
+            elif circuit.dynamics == "error":
+                th.add(error, self.biases[layer - 1], out=latents)
+                latents.addmm_(self.activations[layer - 1], circuit.weights[layer - 1].t())
+            else:
+                th.sub(latents, self.biases[layer - 1], out=error)
+                error.addmm_(self.activations[layer - 1], circuit.weights[layer - 1].t(), alpha=-1.0)
+            self.activations[layer] = circuit.activation.apply(latents, self.activations[layer])
+        if output:
+            th.addmm(self.biases[-1], self.activations[-1], circuit.weights[-1].t(), out=self.output_prediction)
+            self.output = circuit.output_activation.apply(self.output_prediction, self.output)
+            if self.target is not None:
+                self._refresh_output_error()
+
+    def sweep(self) -> None:
+        """
+        The scheduled shortcut: every layer's error is taken at the step when it first arrives, the states at projection.
+
+        From ago109/active-neural-generative-coding, ``src/model/ngc.py``. With tied feedback this is, numerically, the
+        gradient of the output's loss.
+        """
+        self.feedback = [th.empty_like(z) for z in self.latents[1:]]
+        self.errors = self.feedback
+        for layer in range(self.n_hidden, 0, -1):
+            self.feedback_to(layer)
+
+    def state(self) -> SettledState:
+        """The state reached so far (tensors are handed over, not copied)."""
+        output = self.output if self.target is None else self.target
+        return SettledState(
+            latents=[*self.latents, output],
+            activations=self.activations,
+            errors=[*self.errors, self.output_error],
+            output_drive=self.drive,
+            memory=self.memory,
+        )
+
+
+def predict(activations: th.Tensor, weights: th.Tensor, bias: th.Tensor) -> th.Tensor:
+    """z̄ = W φ(z) + b, with ``bias`` (n_out,) or, memory included, (B, n_out)."""
+    return th.addmm(bias, activations, weights.t())

@@ -1,0 +1,80 @@
+"""Hebbian plasticity: the changes that a settled circuit asks of its synapses, and the bounds on them."""
+
+from dataclasses import dataclass
+
+import torch as th
+
+SYNAPTIC_SCALINGS = ("none", "soft_bound", "column_norm")
+
+
+@dataclass
+class HebbianChanges:
+    """
+    Changes *to be added* to the synapses of one circuit, in forward order (first layer first).
+
+    :param weights: ΔW, each (n_out, n_in)
+    :param biases: Δb, each (n_out,)
+    :param memory: ΔM, each (n_out, n_memory); empty without a working memory
+    """
+
+    weights: list[th.Tensor]
+    biases: list[th.Tensor]
+    memory: list[th.Tensor]
+
+    @property
+    def feedback(self) -> list[th.Tensor]:
+        """ΔE = (ΔW)^T, each (n_in, n_out), as views. γ_e is the ratio of the learning rates: see ``parameter_groups``."""
+        return [change.t() for change in self.weights]
+
+    def tensors(self) -> list[th.Tensor]:
+        """All changes but the error synapses', which follow from the weights'."""
+        return [*self.weights, *self.biases, *self.memory]
+
+    def add_(self, other: "HebbianChanges", weight: float = 1.0) -> "HebbianChanges":
+        """Add ``weight`` times the ``other`` changes of the same circuit, in place."""
+        th._foreach_add_(self.tensors(), other.tensors(), alpha=weight)
+        return self
+
+    def scale_(self, factor: float | th.Tensor) -> "HebbianChanges":
+        """Multiply all changes by ``factor`` (a number or a 0-d tensor), in place."""
+        th._foreach_mul_(self.tensors(), factor)
+        return self
+
+
+def hebbian_changes(
+    errors: list[th.Tensor], activations: list[th.Tensor], memory: th.Tensor | None, memory_weight: float
+) -> HebbianChanges:
+    """
+    ΔW = e φ(z)^T, Δb = e, ΔM = α_m e m^T, each the mean over the batch (paper: eq. for ΔW and the appendix).
+
+    :param errors: postsynaptic errors, each (B, n_out); the output layer's already multiplied by g'
+    :param activations: presynaptic activity, each (B, n_in)
+    :param memory: (B, n_memory) or None
+    :param memory_weight: α_m
+    :return: the changes to be added
+    """
+    inverse_batch = 1.0 / len(errors[0])
+    scaled = [error * inverse_batch for error in errors]
+    return HebbianChanges(
+        weights=[error.t() @ activity for error, activity in zip(scaled, activations, strict=True)],
+        biases=[error.sum(0) for error in scaled],
+        memory=[] if memory is None else [memory_weight * (error.t() @ memory) for error in scaled],
+    )
+
+
+def soft_bound_(new: th.Tensor, old: th.Tensor, bound: float) -> None:
+    """
+    Scale the step that led from ``old`` to ``new`` by M = (w_b - |W|) / w_b, so that no synapse passes ±w_b.
+
+    (ago109/active-neural-generative-coding, ``src/model/ngc.py``, scales by w_b - |W|; divided by w_b here so that a small
+    synapse takes the step the optimiser chose.) ``new`` is overwritten.
+    """
+    step = new - old
+    step.mul_((1.0 - old.abs() / bound).clamp_(0.0, 1.0))
+    th.add(old, step, out=new).clamp_(-bound, bound)
+
+
+def bound_columns_(weights: th.Tensor, bound: float) -> None:
+    """Shrink, in place, every column of ``weights`` (n_out, n_in) whose Euclidean norm passes ``bound`` to that norm."""
+    norms = th.linalg.vector_norm(weights, dim=0, keepdim=True)
+    weights.mul_((bound / norms.clamp_min(bound)))

@@ -1,0 +1,15 @@
+"""Training runs: settings, evaluation, records and replay. The commands are thin wrappers around this package."""
+
+from sb3_actpc.training.config import ALGORITHMS, RunConfig
+from sb3_actpc.training.evaluation import EpisodeStatistics, EvaluationCallback, play_episodes
+from sb3_actpc.training.run import evaluate_run, train_run
+
+__all__ = [
+    "ALGORITHMS",
+    "EpisodeStatistics",
+    "EvaluationCallback",
+    "RunConfig",
+    "evaluate_run",
+    "play_episodes",
+    "train_run",
+]

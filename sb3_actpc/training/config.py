@@ -1,0 +1,308 @@
+"""From a preset file and the user's choices to everything that one training run needs."""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+import inspect
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch as th
+import yaml
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+
+# name on the command line -> "module:class", imported only when it is used
+ALGORITHMS = {"actpc": "sb3_actpc.actpc:ActPC"}
+
+PACKAGE_FOLDER = Path(__file__).resolve().parents[1]
+# inside an installed wheel, or beside the package in a source checkout
+HYPERPARAMS_FOLDERS = (PACKAGE_FOLDER / "hyperparams", PACKAGE_FOLDER.parent / "hyperparams")
+DATA_FOLDER = PACKAGE_FOLDER / "data"
+
+NOISE_TYPES = ("normal", "ornstein-uhlenbeck")
+# constructor keywords that have an option of their own
+_OPTION_OF = {
+    "env": "--env",
+    "seed": "--seed",
+    "device": "--device",
+    "demonstrations": "--demonstrations",
+    "action_noise": "--set noise_type=normal --set noise_std=0.1",
+}
+_EXPONENT_FLOAT = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+")
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """What the user chose for one training run.
+
+    :param env: Gymnasium id of the task
+    :param algo: key of ``ALGORITHMS``
+    :param preset: name of a file of ``hyperparams/``, or a path ending in ``.yml``; by default the name of the algorithm
+    :param n_timesteps: environment steps to train for; by default the preset's
+    :param seed: seed of the agent and of the training environment
+    :param demonstrations: ``"shipped"`` (the file in the package for a sparse task), ``"none"``, or a path
+    :param overrides: settings that replace the preset's
+    :param env_kwargs: keywords of the environment, added to the preset's
+    :param eval_freq: environment steps between two evaluations; by default a tenth of the training
+    :param eval_episodes: episodes in each evaluation
+    :param output: run folder; by default ``runs/<env>/<algo>_<preset>_seed<seed>``
+    :param device: torch device
+    :param n_envs: parallel training environments; by default the preset's, or 1
+    :param threads: threads that torch uses
+    :param progress: show a progress bar
+    :raises ValueError: when a number is too small, or the algorithm or the device is unknown
+    """
+
+    env: str
+    algo: str = "actpc"
+    preset: str | None = None
+    n_timesteps: int | None = None
+    seed: int = 0
+    demonstrations: str = "shipped"
+    overrides: dict[str, Any] = field(default_factory=dict)
+    env_kwargs: dict[str, Any] = field(default_factory=dict)
+    eval_freq: int | None = None
+    eval_episodes: int = 5
+    output: str | None = None
+    device: str = "cpu"
+    n_envs: int | None = None
+    threads: int = 1
+    progress: bool = True
+
+    def __post_init__(self) -> None:
+        if self.algo not in ALGORITHMS:
+            raise ValueError(f"unknown algorithm {self.algo!r}: expected one of {', '.join(sorted(ALGORITHMS))}")
+        if self.seed < 0:
+            raise ValueError(f"seed must be at least 0, found {self.seed}")
+        for name in ("n_timesteps", "eval_freq", "eval_episodes", "n_envs", "threads"):
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise ValueError(f"{name} must be at least 1, found {value}")
+        _check_device(self.device)
+
+    @property
+    def preset_name(self) -> str:
+        """Name of the preset without folder and suffix."""
+        return Path(self.preset or self.algo).stem
+
+
+@dataclass(frozen=True)
+class RunPlan:
+    """Everything resolved: what :func:`resolve_run` makes of a :class:`RunConfig`.
+
+    :param algorithm: the SB3 class
+    :param policy: policy name, such as ``"MlpPolicy"``
+    :param n_timesteps: environment steps to train for
+    :param n_envs: parallel training environments
+    :param eval_freq: environment steps between two evaluations
+    :param env_kwargs: keywords of the environment
+    :param noise: type and standard deviation of the action noise, or None
+    :param algorithm_kwargs: constructor keywords of the algorithm
+    :param demonstrations: demonstrations file, or None
+    """
+
+    algorithm: type[OffPolicyAlgorithm]
+    policy: str
+    n_timesteps: int
+    n_envs: int
+    eval_freq: int
+    env_kwargs: dict[str, Any]
+    noise: tuple[str, float] | None
+    algorithm_kwargs: dict[str, Any]
+    demonstrations: Path | None
+
+    @property
+    def uses_demonstrations(self) -> bool:
+        """Whether the algorithm is given the demonstrations (TD3, say, has no keyword for them)."""
+        return self.demonstrations is not None and "demonstrations" in _constructor_parameters(self.algorithm)
+
+
+def resolve_run(config: RunConfig) -> RunPlan:
+    """Read the preset, apply the overrides, find the demonstrations and check it all.
+
+    :param config: the user's choices
+    :return: the plan of the run
+    :raises FileNotFoundError: when the preset or the demonstrations file does not exist
+    :raises ValueError: when a setting is unknown or has a wrong value, or a sparse task has no demonstrations
+    """
+    algorithm = load_algorithm(config.algo)
+    settings = {**load_preset(config.preset or config.algo, config.env), **config.overrides}
+    n_timesteps = _whole_number("n_timesteps", config.n_timesteps or settings.pop("n_timesteps", None))
+    n_envs = _whole_number("n_envs", config.n_envs or settings.pop("n_envs", 1))
+    env_kwargs = settings.pop("env_kwargs", None) or {}
+    if not isinstance(env_kwargs, Mapping):
+        raise ValueError(f"env_kwargs must be a mapping, found {env_kwargs!r}")
+    policy = settings.pop("policy", "MlpPolicy")
+    if not isinstance(policy, str):
+        raise ValueError(f"policy must be a name, found {policy!r}")
+    noise = _pop_noise(settings)
+    for name in ("n_timesteps", "n_envs"):
+        settings.pop(name, None)
+    if isinstance(settings.get("train_freq"), list):
+        settings["train_freq"] = tuple(settings["train_freq"])
+    check_keywords(algorithm, settings)
+    return RunPlan(
+        algorithm=algorithm,
+        policy=policy,
+        n_timesteps=n_timesteps,
+        n_envs=n_envs,
+        eval_freq=config.eval_freq or max(1, n_timesteps // 10),
+        env_kwargs={**env_kwargs, **config.env_kwargs},
+        noise=noise,
+        algorithm_kwargs=settings,
+        demonstrations=find_demonstrations(config.env, config.demonstrations),
+    )
+
+
+def load_algorithm(name: str) -> type[OffPolicyAlgorithm]:
+    """Import an algorithm of the table.
+
+    :param name: key of ``ALGORITHMS``
+    :return: the class
+    :raises ValueError: when there is no such name
+    """
+    if name not in ALGORITHMS:
+        raise ValueError(f"unknown algorithm {name!r}: expected one of {', '.join(sorted(ALGORITHMS))}")
+    module, _, class_name = ALGORITHMS[name].partition(":")
+    return getattr(importlib.import_module(module), class_name)
+
+
+def load_preset(preset: str, env_id: str) -> dict[str, Any]:
+    """Settings of one environment in a preset file: its own entry, else ``default`` (never both).
+
+    :param preset: name of a file of ``hyperparams/`` without suffix, or a path ending in ``.yml`` or ``.yaml``
+    :param env_id: Gymnasium id
+    :return: a new dictionary of plain values
+    :raises FileNotFoundError: when there is no such preset
+    :raises ValueError: when the file is not a YAML mapping, or has neither entry
+    """
+    path = _preset_path(preset)
+    try:
+        entries = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path}: not a YAML file ({' '.join(str(error).split())})") from error
+    if not isinstance(entries, Mapping):
+        raise ValueError(f"{path}: expected a mapping from environment ids to settings")
+    settings = entries.get(env_id, entries.get("default"))
+    if not isinstance(settings, Mapping):
+        raise ValueError(f"{path}: expected a mapping under {env_id!r} or 'default', found {settings!r}")
+    return {str(key): _with_floats(value) for key, value in settings.items()}
+
+
+def parse_assignments(assignments: Iterable[str]) -> dict[str, Any]:
+    """Turn ``key=value`` texts into a dictionary; the values are read as YAML.
+
+    :param assignments: such as ``["gamma=0.98", "policy_kwargs={net_arch: [64, 64]}"]``
+    :return: such as ``{"gamma": 0.98, "policy_kwargs": {"net_arch": [64, 64]}}``
+    :raises ValueError: when a text has no ``=`` or no key, or the value is not YAML
+    """
+    values = {}
+    for assignment in assignments:
+        key, separator, text = assignment.partition("=")
+        if not separator or not key.strip():
+            raise ValueError(f"expected key=value, found {assignment!r}")
+        try:
+            values[key.strip()] = _with_floats(yaml.safe_load(text))
+        except yaml.YAMLError as error:
+            raise ValueError(f"the value of {assignment!r} is not YAML ({' '.join(str(error).split())})") from error
+    return values
+
+
+def check_keywords(algorithm: type[OffPolicyAlgorithm], settings: Mapping[str, Any]) -> None:
+    """Check that a class takes these settings.
+
+    :param algorithm: the class
+    :param settings: constructor keywords
+    :raises ValueError: naming the first one that it does not take, or that has an option of its own
+    """
+    known = _constructor_parameters(algorithm)
+    for name in settings:
+        if name in _OPTION_OF:
+            raise ValueError(f"{name!r} is not set here: use {_OPTION_OF[name]}")
+        if name not in known:
+            close = difflib.get_close_matches(name, known, n=1)
+            hint = f" (did you mean {close[0]!r}?)" if close else ""
+            raise ValueError(f"{algorithm.__name__} has no setting {name!r}{hint}")
+
+
+def find_demonstrations(env_id: str, choice: str) -> Path | None:
+    """The demonstrations file of a run.
+
+    :param env_id: Gymnasium id of the task
+    :param choice: ``"shipped"`` (for a task whose name begins with ``Sparse``), ``"none"``, or a path
+    :return: the file, or None for none
+    :raises FileNotFoundError: when the path does not exist, or a sparse task has no shipped file
+    """
+    if choice == "none":
+        return None
+    if choice != "shipped":
+        if not Path(choice).is_file():
+            raise FileNotFoundError(f"no demonstrations file at {choice}")
+        return Path(choice)
+    name = re.sub(r"-v\d+$", "", env_id.rpartition(":")[2])
+    if not name.startswith("Sparse"):
+        return None
+    path = DATA_FOLDER / f"sparse_{name.removeprefix('Sparse').lower()}.npz"
+    if not path.is_file():
+        raise FileNotFoundError(
+            f"no demonstrations of {env_id} are shipped: collect them (sb3-actpc demos collect --env {env_id}) and pass "
+            "--demonstrations FILE, or train without (--demonstrations none)"
+        )
+    return path
+
+
+def _check_device(device: str) -> None:
+    if device == "auto":
+        return
+    try:
+        th.device(device)
+    except RuntimeError as error:
+        raise ValueError(f"device must be 'auto' or a torch device such as 'cpu' or 'cuda:0', found {device!r}") from error
+
+
+def _preset_path(preset: str) -> Path:
+    if Path(preset).suffix in (".yml", ".yaml"):
+        if not Path(preset).is_file():
+            raise FileNotFoundError(f"no preset file at {preset}")
+        return Path(preset)
+    for folder in HYPERPARAMS_FOLDERS:
+        if (folder / f"{preset}.yml").is_file():
+            return folder / f"{preset}.yml"
+    names = sorted({path.stem for folder in HYPERPARAMS_FOLDERS for path in folder.glob("*.yml")})
+    raise FileNotFoundError(f"no preset {preset!r}: expected one of {', '.join(names)}, or a path ending in .yml")
+
+
+def _pop_noise(settings: dict[str, Any]) -> tuple[str, float] | None:
+    noise_type, noise_std = settings.pop("noise_type", None), settings.pop("noise_std", None)
+    if noise_type is None:
+        return None
+    if noise_type not in NOISE_TYPES:
+        raise ValueError(f"noise_type must be one of {', '.join(NOISE_TYPES)}, found {noise_type!r}")
+    if not isinstance(noise_std, (int, float)) or isinstance(noise_std, bool) or noise_std < 0:
+        raise ValueError(f"noise_std must be a number of at least 0, found {noise_std!r}")
+    return noise_type, float(noise_std)
+
+
+def _whole_number(name: str, value: Any) -> int:
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not float(value).is_integer() or value < 1:
+        raise ValueError(f"{name} must be a whole number of at least 1, found {value!r}")
+    return int(value)
+
+
+def _with_floats(value: Any) -> Any:
+    """YAML 1.1 reads 1e-3 as text; here it is a number."""
+    if isinstance(value, str) and _EXPONENT_FLOAT.fullmatch(value):
+        return float(value)
+    if isinstance(value, Mapping):
+        return {key: _with_floats(part) for key, part in value.items()}
+    if isinstance(value, list):
+        return [_with_floats(part) for part in value]
+    return value
+
+
+def _constructor_parameters(algorithm: type[OffPolicyAlgorithm]) -> list[str]:
+    return [name for name in inspect.signature(algorithm).parameters if not name.startswith("_")]

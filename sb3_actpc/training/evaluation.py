@@ -1,0 +1,194 @@
+"""Playing whole episodes with a trained policy, and doing so every so often while it is trained."""
+
+from __future__ import annotations
+
+import csv
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from io import BufferedIOBase
+from pathlib import Path
+from typing import Any, Protocol, cast
+
+import gymnasium as gym
+import numpy as np
+from stable_baselines3.common.callbacks import BaseCallback
+
+from sb3_actpc.common.files import atomic_write
+
+EVALUATION_COLUMNS = (
+    "timesteps",
+    "dense_return",
+    "dense_return_std",
+    "sparse_return",
+    "success_rate",
+    "episode_length",
+    "wall_seconds",
+)
+
+
+class Predictor(Protocol):
+    """Anything that acts like an SB3 algorithm or policy."""
+
+    def predict(
+        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = False
+    ) -> tuple[Any, Any]:
+        """Actions, (n, action_dim), and the next recurrent state, for n observations."""
+
+
+@dataclass(frozen=True)
+class EpisodeStatistics:
+    """What happened in n episodes; each array is (n,) float64.
+
+    :param dense_returns: sums of ``info["dense_reward"]`` (of the reward, where the environment does not report it)
+    :param sparse_returns: sums of the reward
+    :param successes: 1 where ``info["is_success"]`` was true at the end, NaN where the environment does not report it
+    :param lengths: steps
+    """
+
+    dense_returns: np.ndarray
+    sparse_returns: np.ndarray
+    successes: np.ndarray
+    lengths: np.ndarray
+
+    def summary(self) -> dict[str, float | None]:
+        """Means and standard deviations over the episodes; ``success_rate`` is None where it is not reported."""
+        success_rate = float(self.successes.mean())
+        return {
+            "dense_return": float(self.dense_returns.mean()),
+            "dense_return_std": float(self.dense_returns.std()),
+            "sparse_return": float(self.sparse_returns.mean()),
+            "sparse_return_std": float(self.sparse_returns.std()),
+            "success_rate": None if np.isnan(success_rate) else success_rate,
+            "episode_length": float(self.lengths.mean()),
+        }
+
+
+def play_episodes(model: Predictor, envs: Sequence[gym.Env[Any, Any]], n_episodes: int, seed: int) -> EpisodeStatistics:
+    """Play whole episodes with the deterministic policy, carrying its recurrent state.
+
+    Episode i starts from ``reset(seed=seed + i)``, so that two calls with one seed start from the same states. The
+    environments are stepped side by side, each playing at most one episode at a time, so that the policy is asked once
+    for all of them and short episodes are not counted more often than long ones.
+
+    :param model: the policy
+    :param envs: at least one environment; as many episodes are played at a time
+    :param n_episodes: how many episodes
+    :param seed: seed of the first episode
+    :return: returns, successes and lengths, in the order of the seeds
+    :raises ValueError: when ``n_episodes`` is less than 1 or there is no environment
+    """
+    if n_episodes < 1 or not envs:
+        raise ValueError(f"expected at least one episode and one environment, found {n_episodes} and {len(envs)}")
+    rows = []
+    for first in range(0, n_episodes, len(envs)):
+        n_playing = min(len(envs), n_episodes - first)
+        rows += _play_side_by_side(model, envs[:n_playing], seed + first)
+    return EpisodeStatistics(*np.array(rows, dtype=np.float64).T)
+
+
+def _play_side_by_side(model: Predictor, envs: Sequence[gym.Env[Any, Any]], seed: int) -> list[list[float]]:
+    """One episode in each environment: [dense return, sparse return, success, length] of each."""
+    observations = [env.reset(seed=seed + i)[0] for i, env in enumerate(envs)]
+    rows = [[0.0, 0.0, float("nan"), 0.0] for _ in envs]
+    playing = np.ones(len(envs), dtype=bool)
+    episode_start = np.ones(len(envs), dtype=bool)
+    state = None
+    while playing.any():
+        actions, state = model.predict(_stack(observations), state=state, episode_start=episode_start, deterministic=True)
+        episode_start = np.zeros(len(envs), dtype=bool)
+        for i in np.flatnonzero(playing):
+            observations[i], reward, terminated, truncated, info = envs[i].step(actions[i])
+            rows[i][0] += float(info.get("dense_reward", reward))
+            rows[i][1] += float(reward)
+            rows[i][2] = float(info.get("is_success", np.nan))
+            rows[i][3] += 1
+            playing[i] = not (terminated or truncated)
+    return rows
+
+
+def _stack(observations: list[Any]) -> Any:
+    """n observations as one batch: (n, ...), or a dictionary of such."""
+    if isinstance(observations[0], dict):
+        return {key: np.stack([observation[key] for observation in observations]) for key in observations[0]}
+    return np.stack(observations)
+
+
+class EvaluationCallback(BaseCallback):
+    """Evaluates before the first step, then every ``eval_freq`` steps, and once more at the end.
+
+    Each evaluation starts its episodes from the same seeds, appends a row to ``evaluations.csv`` and saves
+    ``model.zip`` (written under another name and renamed, so that a stopped run leaves a whole one).
+
+    :param envs: environments that only this callback uses, closed by whoever made them
+    :param folder: run folder
+    :param eval_freq: environment steps between two evaluations
+    :param eval_episodes: episodes in each evaluation
+    :param seed: seed of the first episode of each evaluation
+    :param report: given one line of text after each evaluation
+    """
+
+    def __init__(
+        self,
+        envs: Sequence[gym.Env[Any, Any]],
+        folder: Path,
+        eval_freq: int,
+        eval_episodes: int,
+        seed: int,
+        report: Callable[[str], None],
+    ) -> None:
+        super().__init__()
+        self.envs = envs
+        self.folder = folder
+        self.eval_freq = eval_freq
+        self.eval_episodes = eval_episodes
+        self.seed = seed
+        self.report = report
+        self.evaluation_seconds = 0.0
+        self.last_summary: dict[str, float | None] = {}
+        self._last_timesteps = -1
+        self._started = 0.0
+
+    def _on_training_start(self) -> None:
+        self._started = time.perf_counter()
+        with open(self.folder / "evaluations.csv", "w", newline="", encoding="utf-8") as file:
+            csv.writer(file).writerow(EVALUATION_COLUMNS)
+        self._evaluate()
+
+    def _on_step(self) -> bool:
+        # at the last step, the update that belongs to it is still to come
+        is_last = self.num_timesteps >= self.model._total_timesteps
+        if not is_last and self.num_timesteps - self._last_timesteps >= self.eval_freq:
+            self._evaluate()
+        return True
+
+    def _on_training_end(self) -> None:
+        if self._last_timesteps != self.num_timesteps:
+            self._evaluate()
+
+    def _evaluate(self) -> None:
+        started = time.perf_counter()
+        statistics = play_episodes(self.model, self.envs, self.eval_episodes, self.seed)
+        with atomic_write(self.folder / "model.zip") as file:
+            self.model.save(cast(BufferedIOBase, file))
+        now = time.perf_counter()
+        self.evaluation_seconds += now - started
+        self._last_timesteps = self.num_timesteps
+        self.last_summary = statistics.summary()
+        self._append_row({**self.last_summary, "timesteps": self.num_timesteps, "wall_seconds": round(now - self._started, 2)})
+        for name in ("dense_return", "sparse_return", "success_rate"):
+            if self.last_summary[name] is not None:
+                self.logger.record(f"eval/{name}", self.last_summary[name])
+        self.report(_evaluation_line(self.num_timesteps, self.last_summary))
+
+    def _append_row(self, values: dict[str, Any]) -> None:
+        with open(self.folder / "evaluations.csv", "a", newline="", encoding="utf-8") as file:
+            csv.writer(file).writerow([values[name] for name in EVALUATION_COLUMNS])
+
+
+def _evaluation_line(timesteps: int, summary: dict[str, float | None]) -> str:
+    success = summary["success_rate"]
+    return (
+        f"step {timesteps:>8}  dense return {summary['dense_return']:9.1f} ± {summary['dense_return_std']:<7.1f} "
+        f"sparse return {summary['sparse_return']:7.1f}  success {'n/a' if success is None else f'{success:.2f}'}"
+    )

@@ -1,0 +1,298 @@
+"""One training run and its folder, and the replay of a finished one."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.metadata
+import json
+import platform
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch as th
+import yaml
+from stable_baselines3.common.callbacks import ProgressBarCallback
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.logger import configure
+from stable_baselines3.common.noise import ActionNoise, NormalActionNoise, OrnsteinUhlenbeckActionNoise
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_actpc.common.demonstrations import Demonstrations
+from sb3_actpc.common.files import atomic_write
+from sb3_actpc.training.config import RunConfig, RunPlan, load_algorithm, resolve_run
+from sb3_actpc.training.evaluation import EvaluationCallback, play_episodes
+from sb3_actpc.training.report import plot_learning_curve
+
+# the evaluation's episodes start from other states than the training's
+EVALUATION_SEED_OFFSET = 1_000_000
+MAX_EVALUATION_ENVS = 10
+_RECORDED_PACKAGES = ("sb3-actpc", "stable-baselines3", "torch", "gymnasium", "mujoco", "numpy")
+
+
+def train_run(config: RunConfig, report: Callable[[str], None] = lambda line: None) -> dict[str, Any]:
+    """Train one agent; its folder then holds the model, the settings, the evaluations, the plot and the result.
+
+    Works with any SB3 off-policy algorithm of ``ALGORITHMS``. Sets the number of torch threads of the process.
+
+    :param config: what to train
+    :param report: given a line of text when the run starts and after each evaluation
+    :return: the content of ``result.json``: the last evaluation's means, the demonstrators' mean dense return (or
+        None), training steps per second (evaluations left out), seconds, versions, the folder
+    :raises FileNotFoundError: when the preset or the demonstrations do not exist
+    :raises ValueError: when a setting is unknown or has a wrong value
+    :raises gymnasium.error.Error: when the environment is unknown
+    """
+    check_env_id(config.env)
+    plan = resolve_run(config)
+    th.set_num_threads(config.threads)
+    eval_envs = make_eval_envs(config.env, plan.env_kwargs, config.eval_episodes)
+    train_env = make_vec_env(config.env, n_envs=plan.n_envs, seed=config.seed, env_kwargs=plan.env_kwargs)
+    try:
+        return _train(config, plan, train_env, eval_envs, report)
+    finally:
+        train_env.close()
+        for env in eval_envs:
+            env.close()
+
+
+def evaluate_run(folder: Path, n_episodes: int = 10, seed: int = 0) -> dict[str, Any]:
+    """Play episodes with the policy of a run. Its ``model.zip`` is unpickled: open only runs that you trust.
+
+    :param folder: run folder
+    :param n_episodes: how many episodes
+    :param seed: seed of the first episode
+    :return: means and standard deviations over the episodes, and what identifies the run
+    :raises FileNotFoundError: when the folder is not that of a run
+    :raises ValueError: when its files are damaged
+    :raises gymnasium.error.Error: when the environment is unknown
+    """
+    if n_episodes < 1:
+        raise ValueError(f"episodes must be at least 1, found {n_episodes}")
+    record, model = load_run(folder)
+    envs = make_eval_envs(record["env"], record["env_kwargs"], n_episodes)
+    try:
+        statistics = play_episodes(model, envs, n_episodes, seed)
+    finally:
+        for env in envs:
+            env.close()
+    return {
+        **statistics.summary(),
+        "env": record["env"],
+        "algo": record["algo"],
+        "seed": record["seed"],
+        "eval_episodes": n_episodes,
+        "demonstrators_return": record.get("demonstrators_return"),
+    }
+
+
+def load_run(folder: Path) -> tuple[dict[str, Any], OffPolicyAlgorithm]:
+    """The recorded settings and the model of a run. The model is unpickled: open only runs that you trust.
+
+    :param folder: run folder
+    :return: the content of ``config.yml``, and the model on the CPU
+    :raises FileNotFoundError: when the folder, ``config.yml`` or ``model.zip`` does not exist
+    :raises ValueError: when one of the two cannot be read
+    """
+    for name in ("config.yml", "model.zip"):
+        if not (folder / name).is_file():
+            raise FileNotFoundError(f"no run in {folder}: {name} is missing")
+    try:
+        record = yaml.safe_load((folder / "config.yml").read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ValueError(f"{folder / 'config.yml'}: not a YAML file") from error
+    if not isinstance(record, dict) or not {"env", "env_kwargs", "algo", "seed"} <= record.keys():
+        raise ValueError(f"{folder / 'config.yml'}: expected the settings of a run (env, env_kwargs, algo, seed)")
+    return record, load_algorithm(record["algo"]).load(folder / "model.zip", device="cpu")
+
+
+def make_env(env_id: str, env_kwargs: Mapping[str, Any], render_mode: str | None = None) -> gym.Env[Any, Any]:
+    """Make an environment, this package's tasks included.
+
+    :param env_id: Gymnasium id
+    :param env_kwargs: its keywords
+    :param render_mode: Gymnasium's render mode, or None
+    :return: the environment
+    :raises gymnasium.error.Error: when the id is unknown
+    :raises ValueError: when it does not take the keywords
+    """
+    register_tasks()
+    options = dict(env_kwargs) if render_mode is None else {**env_kwargs, "render_mode": render_mode}
+    try:
+        return gym.make(env_id, **options)
+    except TypeError as error:
+        raise ValueError(f"{env_id}: {error}") from error
+
+
+def make_eval_envs(env_id: str, env_kwargs: Mapping[str, Any], n_episodes: int) -> list[gym.Env[Any, Any]]:
+    """As many environments as episodes are played side by side.
+
+    :param env_id: Gymnasium id
+    :param env_kwargs: its keywords
+    :param n_episodes: how many episodes will be played
+    :return: at most ``MAX_EVALUATION_ENVS`` environments
+    """
+    return [make_env(env_id, env_kwargs) for _ in range(min(n_episodes, MAX_EVALUATION_ENVS))]
+
+
+def register_tasks() -> None:
+    """Register this package's tasks with Gymnasium (again does no harm)."""
+    from sb3_actpc.envs import register_envs
+
+    register_envs()
+
+
+def check_env_id(env_id: str) -> None:
+    """Check that an environment is registered; ids with a module (``module:Name-v0``) are left to ``gymnasium.make``.
+
+    :param env_id: Gymnasium id
+    :raises gymnasium.error.Error: when it is unknown
+    """
+    register_tasks()
+    if ":" not in env_id:
+        gym.spec(env_id)
+
+
+def run_folder(config: RunConfig) -> Path:
+    """The folder of a run: new, or left by a run that did not finish.
+
+    :param config: the user's choices
+    :return: ``config.output``, or ``runs/<env>/<algo>_<preset>_seed<seed>`` with ``_2``, ``_3``, … when it holds a result
+    :raises ValueError: when ``config.output`` holds a finished run
+    """
+    if config.output is not None:
+        if (Path(config.output) / "result.json").exists():
+            raise ValueError(f"{config.output} already holds a finished run: choose another folder")
+        return Path(config.output)
+    base = Path("runs") / config.env.replace(":", "_") / f"{config.algo}_{config.preset_name}_seed{config.seed}"
+    folder, number = base, 1
+    while (folder / "result.json").exists():
+        number += 1
+        folder = base.with_name(f"{base.name}_{number}")
+    return folder
+
+
+def demonstrators_return(path: Path | None) -> float | None:
+    """Mean dense return of the demonstrated episodes.
+
+    :param path: demonstrations file, or None
+    :return: the mean, or None when there is no file or it does not hold dense rewards
+    :raises ValueError: when the file is not valid
+    """
+    returns = None if path is None else Demonstrations.load(path).dense_returns
+    return None if returns is None else float(returns.mean())
+
+
+def build_model(plan: RunPlan, config: RunConfig, env: VecEnv) -> OffPolicyAlgorithm:
+    """Make the agent.
+
+    :param plan: the resolved settings
+    :param config: the user's choices
+    :param env: training environment
+    :return: the agent, not trained
+    :raises ValueError: when a setting has a wrong value
+    """
+    kwargs = dict(plan.algorithm_kwargs)
+    if plan.uses_demonstrations:
+        kwargs["demonstrations"] = plan.demonstrations
+    if plan.noise is not None:
+        kwargs["action_noise"] = _action_noise(*plan.noise, size=int(np.prod(env.action_space.shape or (1,))))
+    try:
+        return plan.algorithm(plan.policy, env, seed=config.seed, device=config.device, **kwargs)
+    except (TypeError, AssertionError) as error:
+        # SB3 checks some settings by assertion
+        raise ValueError(f"{plan.algorithm.__name__}: {error}") from error
+
+
+def _train(
+    config: RunConfig,
+    plan: RunPlan,
+    train_env: VecEnv,
+    eval_envs: list[gym.Env[Any, Any]],
+    report: Callable[[str], None],
+) -> dict[str, Any]:
+    reference = demonstrators_return(plan.demonstrations)
+    model = build_model(plan, config, train_env)
+    folder = run_folder(config)
+    folder.mkdir(parents=True, exist_ok=True)
+    _write_config(folder, config, plan, reference)
+    model.set_logger(configure(str(folder), ["csv"]))
+    callback = EvaluationCallback(
+        eval_envs, folder, plan.eval_freq, config.eval_episodes, config.seed + EVALUATION_SEED_OFFSET, report
+    )
+    report(f"{config.env}: {config.algo}, {plan.n_timesteps} steps, into {folder}")
+    started = time.perf_counter()
+    _learn(model, plan.n_timesteps, callback, config.progress)
+    seconds = time.perf_counter() - started
+    result = {
+        **callback.last_summary,
+        "env": config.env,
+        "algo": config.algo,
+        "preset": config.preset_name,
+        "seed": config.seed,
+        "timesteps": model.num_timesteps,
+        "eval_episodes": config.eval_episodes,
+        "demonstrators_return": reference,
+        "steps_per_second": model.num_timesteps / max(seconds - callback.evaluation_seconds, 1e-9),
+        "wall_seconds": seconds,
+        "evaluation_seconds": callback.evaluation_seconds,
+        "versions": _versions(),
+        "folder": str(folder),
+    }
+    plot_learning_curve(folder / "evaluations.csv", folder / "learning_curve.png", f"{config.env}, {config.algo}", reference)
+    with atomic_write(folder / "result.json", "w") as file:
+        json.dump(result, file, indent=2)
+    return result
+
+
+def _learn(model: OffPolicyAlgorithm, n_timesteps: int, callback: EvaluationCallback, progress: bool) -> None:
+    if not progress:
+        model.learn(n_timesteps, callback=callback)
+        return
+    # what progress_bar=True does, but closed when training stops early
+    bar = ProgressBarCallback()
+    try:
+        model.learn(n_timesteps, callback=[callback, bar])
+    finally:
+        if hasattr(bar, "pbar"):
+            bar.pbar.close()
+
+
+def _write_config(folder: Path, config: RunConfig, plan: RunPlan, reference: float | None) -> None:
+    record = {
+        **dataclasses.asdict(config),
+        "preset": config.preset_name,
+        "policy": plan.policy,
+        "n_timesteps": plan.n_timesteps,
+        "n_envs": plan.n_envs,
+        "eval_freq": plan.eval_freq,
+        "env_kwargs": plan.env_kwargs,
+        "noise": None if plan.noise is None else list(plan.noise),
+        "settings": {key: list(value) if isinstance(value, tuple) else value for key, value in plan.algorithm_kwargs.items()},
+        "demonstrations": None if plan.demonstrations is None else str(plan.demonstrations),
+        "demonstrators_return": reference,
+        "versions": _versions(),
+    }
+    with atomic_write(folder / "config.yml", "w") as file:
+        yaml.safe_dump(record, file, sort_keys=False)
+
+
+def _action_noise(noise_type: str, noise_std: float, size: int) -> ActionNoise:
+    mean, sigma = np.zeros(size), noise_std * np.ones(size)
+    if noise_type == "normal":
+        return NormalActionNoise(mean, sigma)
+    return OrnsteinUhlenbeckActionNoise(mean, sigma)
+
+
+def _versions() -> dict[str, str]:
+    versions = {"python": platform.python_version()}
+    for name in _RECORDED_PACKAGES:
+        try:
+            versions[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:  # a source checkout that is not installed
+            versions[name] = "unknown"
+    return versions

@@ -1,0 +1,132 @@
+"""A video of one episode, where the machine can render."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+GL_BACKENDS = ("egl", "osmesa")
+VIDEO_SUFFIXES = (".mp4", ".gif")
+# of one episode; software rendering takes a twentieth of a second for each
+MAX_FRAMES = 300
+# in a process of its own: a broken graphics driver may end the process
+_PROBE = "import mujoco; context = mujoco.GLContext(64, 64); context.make_current(); context.free()"
+
+
+class RenderingUnavailable(RuntimeError):
+    """This machine, or this environment, cannot render; the message says why."""
+
+
+def choose_gl_backend() -> str | None:
+    """Find a way for MuJoCo to render without a window and select it for this process (environment variables).
+
+    Call it before MuJoCo is imported. What ``MUJOCO_GL`` names is tried first; it is unset when nothing works, since
+    MuJoCo cannot be imported with a name that does not work.
+
+    :return: the name, or None when nothing works
+    """
+    chosen = os.environ.get("MUJOCO_GL", "")
+    for backend in dict.fromkeys(filter(None, (chosen, *GL_BACKENDS))):
+        variables = {"MUJOCO_GL": backend}
+        if backend in GL_BACKENDS:
+            variables["PYOPENGL_PLATFORM"] = backend
+        if _probe(variables):
+            os.environ.update(variables)
+            return backend
+    os.environ.pop("MUJOCO_GL", None)
+    return None
+
+
+def check_video_path(path: Path) -> None:
+    """Check that a video can have this name.
+
+    :param path: file to write
+    :raises ValueError: when the suffix is neither ``.mp4`` nor ``.gif``
+    """
+    if path.suffix.lower() not in VIDEO_SUFFIXES:
+        raise ValueError(f"the video must end in {' or '.join(VIDEO_SUFFIXES)}, found {str(path)!r}")
+
+
+def record_video(model: Any, env_id: str, env_kwargs: dict[str, Any], path: Path, seed: int) -> int:
+    """Write a video of the first ``MAX_FRAMES`` steps of an episode with the deterministic policy.
+
+    :param model: SB3 algorithm or policy
+    :param env_id: Gymnasium id
+    :param env_kwargs: keywords of the environment
+    :param path: file to write, ``.mp4`` or ``.gif``
+    :param seed: seed of the episode
+    :return: number of frames, each (height, width, 3) uint8
+    :raises RenderingUnavailable: when rendering does not work here
+    :raises ValueError: when the path has another suffix
+    """
+    check_video_path(path)
+    frames, frames_per_second = _render_episode(model, env_id, env_kwargs, seed)
+    import imageio.v2 as imageio
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if path.suffix.lower() == ".gif":
+        # viewers slow down a GIF with delays below 20 ms
+        stride = max(1, round(frames_per_second / 25))
+        imageio.mimsave(path, frames[::stride], duration=1000 * stride / frames_per_second, loop=0)
+    else:
+        imageio.mimsave(path, frames, fps=frames_per_second, macro_block_size=2)
+    return len(frames)
+
+
+def _render_episode(model: Any, env_id: str, env_kwargs: dict[str, Any], seed: int) -> tuple[list[Any], float]:
+    import gymnasium as gym
+    from mujoco import FatalError
+
+    from sb3_actpc.training.run import make_env
+
+    env = None
+    try:
+        env = make_env(env_id, env_kwargs, render_mode="rgb_array")
+        frames = _play(model, env, seed)
+        return frames, float(env.metadata.get("render_fps", 30))
+    except (FatalError, gym.error.Error, ImportError, OSError, RuntimeError, AttributeError, NotImplementedError) as error:
+        raise RenderingUnavailable(f"{type(error).__name__}: {error}") from error
+    finally:
+        if env is not None:
+            env.close()
+
+
+def _play(model: Any, env: Any, seed: int) -> list[np.ndarray]:
+    observation, _ = env.reset(seed=seed)
+    frames = [_frame(env)]
+    state, episode_start, finished = None, np.ones(1, dtype=bool), False
+    while not finished and len(frames) < MAX_FRAMES:
+        action, state = model.predict(_batch(observation), state=state, episode_start=episode_start, deterministic=True)
+        observation, _, terminated, truncated, _ = env.step(action[0])
+        episode_start = np.zeros(1, dtype=bool)
+        finished = terminated or truncated
+        frames.append(_frame(env))
+    return frames
+
+
+def _frame(env: Any) -> np.ndarray:
+    frame = env.render()
+    if not isinstance(frame, np.ndarray):
+        raise NotImplementedError(f"the environment renders {type(frame).__name__}, not an image")
+    return frame
+
+
+def _batch(observation: Any) -> Any:
+    """One observation as a batch of one: (1, ...), or a dictionary of such."""
+    if isinstance(observation, dict):
+        return {key: np.asarray(value)[None] for key, value in observation.items()}
+    return np.asarray(observation)[None]
+
+
+def _probe(variables: dict[str, str]) -> bool:
+    command = [sys.executable, "-c", _PROBE]
+    try:
+        process = subprocess.run(command, env={**os.environ, **variables}, capture_output=True, timeout=60, check=False)
+    except subprocess.TimeoutExpired:
+        return False
+    return process.returncode == 0

@@ -1,0 +1,111 @@
+"""Synapses: the optimiser gets minus the change, error synapses align, bounds bind."""
+
+import pytest
+import torch as th
+
+from sb3_actpc.ngc import NGCCircuit
+from tests.ngc import oracle
+
+
+def teacher_batch(n=128):
+    x = th.randn(n, 8)
+    return x, th.stack([th.sin(x[:, 0]) + x[:, 1], x[:, 2] * x[:, 3], th.tanh(x.sum(1))], dim=1)
+
+
+def train(circuit, optimizer, n_updates, batch=teacher_batch):
+    for _ in range(n_updates):
+        circuit.apply_changes(circuit.hebbian_update(circuit.settle(*batch())), optimizer)
+
+
+def test_plain_sgd_adds_the_change():
+    circuit = NGCCircuit(8, 3, (16, 16))
+    optimizer = th.optim.SGD(circuit.parameter_groups(0.1))
+    before = [p.clone() for p in (*circuit.weights, *circuit.biases)]
+    error_synapses = [p.clone() for p in circuit.feedback_weights]
+    changes = circuit.hebbian_update(circuit.settle(*teacher_batch()))
+    circuit.apply_changes(changes, optimizer)
+    for old, new, change in zip(before, (*circuit.weights, *circuit.biases), changes.tensors(), strict=True):
+        assert change.abs().max() > 0 and th.allclose(new, old + 0.1 * change, atol=1e-7)
+    for old, new, change in zip(error_synapses, circuit.feedback_weights, changes.weights[1:], strict=True):
+        assert th.allclose(new, old + 0.1 * circuit.feedback_rate * change, atol=1e-7)
+
+
+@pytest.mark.parametrize("settling", ["iterative", "scheduled"])
+def test_a_circuit_learns_a_function(settling):
+    circuit = NGCCircuit(8, 3, (64, 64), settling=settling)
+    optimizer = th.optim.Adam(circuit.parameter_groups(1e-3))
+    x, target = teacher_batch(1024)
+    start = (target - circuit.project(x)).square().mean()
+    train(circuit, optimizer, 1500)
+    assert (target - circuit.project(x)).square().mean() < 0.2 * start
+
+
+def test_learned_error_synapses_align_with_the_transposed_weights():
+    circuit = NGCCircuit(8, 3, (64, 64))
+    optimizer = th.optim.Adam(circuit.parameter_groups(3e-3))
+    pairs = list(zip(circuit.feedback_weights, list(circuit.weights)[1:], strict=True))
+    start = [oracle.cosine(e, w) for e, w in pairs]
+    assert max(map(abs, start)) < 0.2
+    train(circuit, optimizer, 4000)
+    end = [oracle.cosine(e, w) for e, w in pairs]
+    print(f"cosine of E with W^T: {start} -> {end}")
+    assert min(end) > 0.5
+
+
+def test_halving_gamma_e_halves_the_movement_of_the_error_synapses_under_adam():
+    moved = []
+    for feedback_rate in (0.8, 0.4):
+        th.manual_seed(0)
+        circuit = NGCCircuit(8, 3, (32, 32), feedback_rate=feedback_rate)
+        optimizer = th.optim.Adam(circuit.parameter_groups(1e-3))
+        before = [p.clone() for p in circuit.feedback_weights]
+        train(circuit, optimizer, 1)
+        moved.append(sum(float((p - b).norm()) for p, b in zip(circuit.feedback_weights, before, strict=True)))
+    assert moved[1] == pytest.approx(0.5 * moved[0], rel=1e-3)
+
+
+def test_soft_bound_keeps_every_synapse_inside_under_adam():
+    circuit = NGCCircuit(8, 3, (32, 32), synaptic_scaling="soft_bound", weight_bound=0.4)
+    optimizer = th.optim.Adam(circuit.parameter_groups(0.02))
+    train(circuit, optimizer, 200)
+    largest = max(float(p.abs().max()) for p in (*circuit.weights, *circuit.feedback_weights))
+    assert 0.3 < largest <= 0.4
+
+
+def test_column_norm_bound_binds_under_adam():
+    circuit = NGCCircuit(8, 3, (32, 32), synaptic_scaling="column_norm", weight_bound=1.0)
+    optimizer = th.optim.Adam(circuit.parameter_groups(0.02))
+    train(circuit, optimizer, 100)
+    norms = th.cat([p.norm(dim=0) for p in (*circuit.weights, *circuit.feedback_weights)])
+    assert norms.max() <= 1.0 + 1e-5 and (norms > 1.0 - 1e-4).float().mean() > 0.3
+
+
+def test_without_scaling_the_same_training_passes_the_bounds():
+    circuit = NGCCircuit(8, 3, (32, 32))
+    optimizer = th.optim.Adam(circuit.parameter_groups(0.02))
+    train(circuit, optimizer, 200)
+    assert max(float(p.abs().max()) for p in circuit.weights) > 0.4
+
+
+def test_auto_rates_follow_the_spectral_norms():
+    circuit = NGCCircuit(8, 3, (32, 32), feedback="tied", dynamics="state")
+    norms = [float(th.linalg.matrix_norm(w, 2)) for w in list(circuit.weights)[1:]]
+    for rate, norm in zip(circuit.rates.tolist(), norms, strict=True):
+        assert rate == pytest.approx(min(0.3, 1 / (1 + norm**2)), rel=0.02)
+    before = circuit.rates.clone()
+    for weights in circuit.weights:
+        weights.mul_(10.0)
+    circuit.update_settling_rates(20)
+    assert (circuit.rates < 0.2 * before).all()
+
+
+def test_working_memory_changes_its_own_synapses_and_the_output():
+    circuit = NGCCircuit(8, 3, (16, 16), n_memory=6)
+    optimizer = th.optim.SGD(circuit.parameter_groups(0.1))
+    (x, target), memory = teacher_batch(), th.randn(128, 6)
+    before = [m.clone() for m in circuit.memory_weights]
+    circuit.apply_changes(circuit.hebbian_update(circuit.settle(x, target, memory)), optimizer)
+    assert all((m - b).norm() > 1e-4 for m, b in zip(circuit.memory_weights, before, strict=True))
+    assert not th.allclose(circuit.project(x, memory), circuit.project(x, 2 * memory))
+    circuit.memory_weight = 0.0
+    assert th.equal(circuit.project(x, memory), circuit.project(x, 2 * memory))

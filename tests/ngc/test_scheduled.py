@@ -1,0 +1,78 @@
+"""Scheduled settling is, numerically, the gradient of the output's loss; coupled, the deterministic policy gradient."""
+
+import pytest
+import torch as th
+
+from sb3_actpc.ngc import NGCCircuit, settle_coupled
+from tests.ngc import oracle
+
+
+@pytest.mark.parametrize("hidden", [(16,), (16, 12), (16, 12, 9, 14)], ids=["depth 2", "depth 3", "depth 5"])
+@pytest.mark.parametrize("output_activation", ["identity", "tanh"])
+@pytest.mark.parametrize("activation", ["relu6", "tanh"])
+def test_scheduled_changes_equal_backprop(hidden, output_activation, activation):
+    circuit = NGCCircuit(
+        6, 3, hidden, activation=activation, output_activation=output_activation, settling="scheduled", n_memory=5
+    )
+    x, target, memory = th.randn(32, 6), th.randn(32, 3), th.randn(32, 5)
+    weights, biases = oracle.synapses(circuit)
+    memory_weights = [m.detach().clone().requires_grad_() for m in circuit.memory_weights]
+    phi = oracle.FUNCTIONS[activation]
+    h = x
+    for layer, (w, b, m) in enumerate(zip(weights, biases, memory_weights, strict=True)):
+        h = (h if layer == 0 else phi(h)) @ w.t() + b + memory @ m.t()
+    (0.5 * (target - oracle.FUNCTIONS[output_activation](h)).square().sum() / len(x)).backward()
+    changes = circuit.hebbian_update(circuit.settle(x, target, memory))
+    for change, synapse in zip(changes.tensors(), [*weights, *biases, *memory_weights], strict=True):
+        assert synapse.grad.abs().max() > 1e-4
+        assert th.allclose(change, -synapse.grad, atol=1e-5)
+
+
+def policy_gradient(actor: NGCCircuit, critic: NGCCircuit, x: th.Tensor) -> list[th.Tensor]:
+    """∂ mean_a Q(x, μ(x)) by the actor's weights and biases, by autograd."""
+    weights, biases = oracle.synapses(actor)
+    action = oracle.forward(actor, weights, biases, x)
+    value = oracle.forward(critic, *oracle.synapses(critic, False), th.cat([x, action], dim=1))
+    value.mean(1).mean().backward()
+    return [p.grad for p in [*weights, *biases]]
+
+
+def make_pair(hidden=(64, 64), n_actions=6, **keywords) -> tuple[NGCCircuit, NGCCircuit, th.Tensor]:
+    actor = NGCCircuit(17, n_actions, hidden, output_activation="tanh", **keywords)
+    critic = NGCCircuit(17 + n_actions, n_actions, hidden, n_feedback_inputs=n_actions, **keywords)
+    return actor, critic, th.randn(64, 17)
+
+
+@pytest.mark.parametrize("hidden", [(), (32,), (32, 32), (32, 24, 16)])
+def test_the_coupled_pair_under_scheduled_is_the_policy_gradient(hidden):
+    actor, critic, x = make_pair(hidden, settling="scheduled")
+    before = [p.clone() for p in critic.state_dict().values()]
+    changes = actor.hebbian_update(settle_coupled(actor, critic, x).actor)
+    for change, gradient in zip(changes.tensors(), policy_gradient(actor, critic, x), strict=True):
+        assert th.allclose(change, gradient, atol=1e-6)
+    assert all(th.equal(a, b) for a, b in zip(before, critic.state_dict().values(), strict=True))
+
+
+def test_the_coupled_pair_tends_to_the_policy_gradient_as_it_settles_and_the_nudge_shrinks():
+    actor, critic, x = (m.double() for m in make_pair(feedback="tied", n_settling_steps=200))
+    changes = actor.hebbian_update(settle_coupled(actor, critic, x, nudge=1e-7).actor)
+    for change, gradient in zip(changes.tensors(), policy_gradient(actor, critic, x), strict=True):
+        assert th.allclose(change, gradient, rtol=1e-4, atol=1e-8)
+
+
+def test_the_actor_change_raises_the_action_values():
+    """The paper prints -1/A for the clamped error; with changes that are added that would lower Q."""
+    for keywords in ({"settling": "scheduled"}, {"feedback": "tied"}):
+        actor, critic, x = make_pair(**keywords)
+        optimizer = th.optim.SGD(actor.parameter_groups(0.5))
+        before = settle_coupled(actor, critic, x)
+        actor.apply_changes(actor.hebbian_update(before.actor), optimizer)
+        assert settle_coupled(actor, critic, x).action_values.mean() > before.action_values.mean() + 1e-4
+
+
+def test_a_pair_that_does_not_fit_is_named():
+    actor, critic, x = make_pair()
+    with pytest.raises(ValueError, match="n_feedback_inputs=0"):
+        settle_coupled(actor, NGCCircuit(23, 6), x)
+    with pytest.raises(ValueError, match="must agree"):
+        settle_coupled(make_pair(settling="scheduled")[0], critic, x)

@@ -1,0 +1,190 @@
+"""Settling: what moves, where it comes to rest, and what stays put. Expectations from the energy, by autograd or algebra."""
+
+import pytest
+import torch as th
+
+from sb3_actpc.ngc import ACTIVATIONS, NGCCircuit
+from tests.ngc import oracle
+
+ITERATIVE = {"feedback": "tied", "n_settling_steps": 1}
+
+
+def make(hidden=(12, 9), dtype=th.float64, **keywords) -> tuple[NGCCircuit, th.Tensor, th.Tensor]:
+    circuit = NGCCircuit(5, 3, hidden, **keywords).to(dtype)
+    return circuit, th.randn(7, 5, dtype=dtype), 0.5 * th.randn(7, 3, dtype=dtype)
+
+
+@pytest.mark.parametrize("activation", sorted(ACTIVATIONS))
+@pytest.mark.parametrize("output_activation", ["identity", "tanh"])
+def test_one_step_of_eq_1_is_minus_the_gradient_of_the_energy(activation, output_activation):
+    """Settle k and k + 1 steps: every hidden state must have moved by β times minus ∂F/∂z, at a state with errors."""
+    rate = 0.05
+    circuit, x, target = make(
+        activation=activation, output_activation=output_activation, dynamics="state", settling_rate=rate, **ITERATIVE
+    )
+    circuit.n_settling_steps = 6
+    before = circuit.settle(x, target)
+    latents = [z.clone().requires_grad_() for z in before.latents[:-1]]
+    circuit.n_settling_steps = 7
+    after = circuit.settle(x, target)
+    oracle.energy(circuit, *oracle.synapses(circuit), latents, target).backward()
+    for old, new in zip(latents[1:], after.latents[1:-1], strict=True):
+        assert old.grad.abs().max() > 1e-4
+        assert th.allclose(new - old, -rate * old.grad, atol=1e-12)
+
+
+@pytest.mark.parametrize("output_activation", ["identity", "tanh"])
+@pytest.mark.parametrize("dynamics", ["error", "state"])
+def test_hebbian_change_is_minus_the_gradient_by_the_weights_at_the_settled_state(output_activation, dynamics):
+    circuit, x, target = make(output_activation=output_activation, dynamics=dynamics, settling_rate=0.1, **ITERATIVE)
+    circuit.n_settling_steps = 10
+    state = circuit.settle(x, target)
+    weights, biases = oracle.synapses(circuit)
+    (oracle.energy(circuit, weights, biases, state.latents[:-1], target) / len(x)).backward()
+    changes = circuit.hebbian_update(state)
+    for change, synapse in zip([*changes.weights, *changes.biases], [*weights, *biases], strict=True):
+        assert th.allclose(change, -synapse.grad, atol=1e-12)
+    for change, feedback in zip(changes.weights, changes.feedback, strict=True):
+        assert th.equal(change.t(), feedback)
+
+
+def test_error_dynamics_integrates_the_right_hand_side_of_eq_1():
+    """One step of the error neurons is β times minus ∂F/∂z too; the states then ride on the new predictions."""
+    rate = 0.05
+    circuit, x, target = make(activation="tanh", settling_rate=rate, **ITERATIVE)
+    circuit.n_settling_steps = 6
+    before = circuit.settle(x, target)
+    latents = [z.clone().requires_grad_() for z in before.latents[:-1]]
+    circuit.n_settling_steps = 7
+    after = circuit.settle(x, target)
+    oracle.energy(circuit, *oracle.synapses(circuit), latents, target).backward()
+    for layer in range(2):
+        assert th.allclose(after.errors[layer] - before.errors[layer], -rate * latents[layer + 1].grad, atol=1e-12)
+
+
+@pytest.mark.parametrize("leak", [0.0, 0.1])
+def test_both_dynamics_rest_at_the_same_fixed_point(leak):
+    states = []
+    circuit, x, target = make(activation="tanh", settling_rate=0.1, leak=leak, **ITERATIVE)
+    circuit.n_settling_steps = 5000
+    for dynamics in ("error", "state"):
+        circuit.dynamics = dynamics
+        states.append(circuit.settle(x, target))
+    for one, other in zip(states[0].latents, states[1].latents, strict=True):
+        assert th.allclose(one, other, atol=1e-8)
+    assert float(circuit.residual(states[0])) < 1e-8
+
+
+@pytest.mark.parametrize("dynamics", ["error", "state"])
+@pytest.mark.parametrize("hidden", [(8,), (8, 6), (8, 6, 7)])
+def test_a_linear_circuit_settles_to_the_solution_of_its_linear_system(dynamics, hidden):
+    """Stationarity of the quadratic energy, (I + W_below^T W_below) z = z̄ + W_below^T (z_below - b), solved at once."""
+    circuit, x, target = make(hidden=hidden, activation="identity", dynamics=dynamics, **ITERATIVE)
+    circuit.n_settling_steps = 4000
+    sizes, n = list(hidden), len(x)
+    weights, biases = list(circuit.weights), list(circuit.biases)
+    offsets = [sum(sizes[:i]) for i in range(len(sizes) + 1)]
+    matrix, right = th.eye(offsets[-1], dtype=x.dtype), th.zeros(n, offsets[-1], dtype=x.dtype)
+    for layer in range(len(sizes)):
+        block = slice(offsets[layer], offsets[layer + 1])
+        below_w, below_b = weights[layer + 1], biases[layer + 1]
+        matrix[block, block] += below_w.t() @ below_w
+        right[:, block] += biases[layer] + (x @ weights[0].t() if layer == 0 else 0.0) - below_b @ below_w
+        if layer + 1 < len(sizes):
+            lower = slice(offsets[layer + 1], offsets[layer + 2])
+            matrix[block, lower], matrix[lower, block] = -below_w.t(), -below_w
+        else:
+            right[:, block] += target @ below_w
+    solution = th.linalg.solve(matrix, right.t()).t()
+    state = circuit.settle(x, target)
+    assert th.allclose(th.cat(state.latents[1:-1], dim=1), solution, atol=1e-8)
+
+
+@pytest.mark.parametrize("dynamics", ["error", "state"])
+def test_energy_never_rises_while_settling(dynamics):
+    circuit, _, _ = make(hidden=(64, 64), dynamics=dynamics, **ITERATIVE)
+    x, target = th.randn(256, 5, dtype=th.float64), 0.5 * th.randn(256, 3, dtype=th.float64)
+    energies = []
+    for steps in range(1, 11):
+        circuit.n_settling_steps = steps
+        energies.append(float(circuit.energy(circuit.settle(x, target)).mean()))
+    start = oracle.energy(circuit, *oracle.synapses(circuit, False), _projected(circuit, x), target) / len(x)
+    assert all(new < old for old, new in zip([float(start), *energies], energies, strict=False))
+
+
+def _projected(circuit, x):
+    latents, phi = [x], oracle.FUNCTIONS[circuit.activation.name]
+    for layer in range(circuit.n_hidden):
+        latents.append((x if layer == 0 else phi(latents[-1])) @ circuit.weights[layer].t() + circuit.biases[layer])
+    return latents
+
+
+@pytest.mark.parametrize("settling", ["iterative", "scheduled"])
+def test_clamped_layers_and_synapses_stay_bit_identical(settling):
+    circuit, x, target = make(settling=settling)
+    held = [x.clone(), target.clone(), *[p.clone() for p in circuit.state_dict().values()]]
+    state = circuit.settle(x, target)
+    assert th.equal(state.latents[0], held[0]) and th.equal(state.latents[-1], held[1])
+    for now, then in zip([x, target, *circuit.state_dict().values()], held, strict=True):
+        assert th.equal(now, then)
+
+
+def test_leak_and_derivative_free_change_where_a_circuit_rests():
+    circuit, x, target = make(feedback="tied", settling_rate=0.1, n_settling_steps=50)
+    reference = circuit.settle(x, target).latents[1]
+    circuit.leak = 0.5
+    assert circuit.settle(x, target).latents[1].norm() < reference.norm()
+    circuit.leak, circuit.derivative_free = 0.0, True
+    assert not th.allclose(circuit.settle(x, target).latents[1], reference)
+
+
+def test_project_is_the_feed_forward_pass():
+    circuit, x, _ = make(output_activation="tanh")
+    assert th.allclose(circuit.project(x), oracle.forward(circuit, *oracle.synapses(circuit, False), x))
+
+
+@pytest.mark.parametrize("dtype", [th.float32, th.float64])
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.skipif("not th.cuda.is_available()"))])
+def test_dtype_and_device_are_kept(dtype, device):
+    circuit, x, target = make(dtype=dtype, n_memory=4)
+    circuit, x, target = circuit.to(device), x.to(device), target.to(device)
+    state = circuit.settle(x, target, th.randn(7, 4, dtype=dtype, device=device))
+    for tensor in [*state.latents, *state.errors, *circuit.hebbian_update(state).tensors()]:
+        assert tensor.dtype == dtype and tensor.device.type == device
+
+
+def test_circuits_without_hidden_layers_work():
+    circuit, x, target = make(hidden=())
+    state = circuit.settle(x, target)
+    assert th.allclose(state.errors[0], target - circuit.project(x))
+
+
+@pytest.mark.parametrize(
+    ("keywords", "named"),
+    [
+        ({"activation": "gelu"}, "gelu"),
+        ({"settling": "fast"}, "fast"),
+        ({"settling_rate": 0.0}, "settling_rate"),
+        ({"settling_rate": "fast"}, "settling_rate"),
+        ({"n_settling_steps": 0}, "n_settling_steps"),
+        ({"hidden": (0,)}, "hidden"),
+        ({"leak": -1.0}, "leak"),
+        ({"synaptic_scaling": "l2"}, "l2"),
+        ({"settling": "scheduled", "feedback": "learned"}, "feedback='learned' conflicts"),
+        ({"settling": "scheduled", "leak": 0.1}, "leak=0.1 conflicts"),
+        ({"settling": "scheduled", "settling_rate": 0.5}, "settling_rate=0.5 conflicts"),
+        ({"settling": "scheduled", "feedback_scale": 0.5}, "feedback_scale=0.5 conflicts"),
+        ({"settling": "scheduled", "derivative_free": True}, "derivative_free=True conflicts"),
+    ],
+)
+def test_a_wrong_keyword_is_named(keywords, named):
+    with pytest.raises(ValueError, match=named):
+        NGCCircuit(5, 3, **{"hidden": (4,), **keywords})
+
+
+def test_a_missing_or_unwanted_memory_is_named():
+    circuit, x, target = make(n_memory=4)
+    with pytest.raises(ValueError, match="n_memory=4 but was given no memory"):
+        circuit.settle(x, target)
+    with pytest.raises(ValueError, match="n_memory=0 but was given a memory of size 4"):
+        make()[0].settle(x, target, th.zeros(7, 4, dtype=x.dtype))

@@ -1,0 +1,298 @@
+"""The sparse MuJoCo tasks pay what they say, and are otherwise their base tasks."""
+
+import pickle
+import warnings
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env as gymnasium_check_env
+from stable_baselines3.common.env_checker import check_env as sb3_check_env
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import SubprocVecEnv
+
+from sb3_actpc.envs import SPARSE_MUJOCO_IDS, dense_env_id, register_envs
+
+pytestmark = pytest.mark.filterwarnings("ignore:.*out of date.*", "ignore:.*infinity.*")
+
+REACHER_IDS = [env_id for env_id in SPARSE_MUJOCO_IDS if "Reacher" in env_id]
+LOCOMOTION_IDS = [env_id for env_id in SPARSE_MUJOCO_IDS if "Reacher" not in env_id]
+FALLING_IDS = [env_id for env_id in LOCOMOTION_IDS if "Hopper" in env_id or "Walker2d" in env_id]
+DISTANCES = {"HalfCheetah": 20.0, "Hopper": 2.0, "Walker2d": 2.0, "Swimmer": 1.0}
+VELOCITIES = {"HalfCheetah": 3.5, "Hopper": 1.0, "Walker2d": 1.0, "Swimmer": 0.3}
+OBSERVATION_SIZES = {
+    "Reacher-v5": 10,
+    "Reacher-v4": 11,
+    "HalfCheetah-v5": 17,
+    "HalfCheetah-v4": 17,
+    "Walker2d-v5": 17,
+    "Walker2d-v4": 17,
+    "Hopper-v5": 11,
+    "Hopper-v4": 11,
+    "Swimmer-v5": 8,
+    "Swimmer-v4": 8,
+}
+
+
+def task_of(env_id: str) -> str:
+    return dense_env_id(env_id).split("-")[0]
+
+
+def still_step(env: gym.Env) -> tuple[float, bool, dict]:
+    """Reward, termination and info of a step without any torque."""
+    _, reward, terminated, _, info = env.step(np.zeros(env.action_space.shape, dtype=np.float32))
+    return float(reward), terminated, info
+
+
+def shift_x(env: gym.Env, shift: float, velocity: float = 0.0) -> None:
+    """Move the body along x without its clock, and set its forward velocity."""
+    simulator = env.unwrapped
+    qpos, qvel = simulator.data.qpos.copy(), np.zeros_like(simulator.data.qvel)
+    qpos[0] += shift
+    qvel[0] = velocity
+    simulator.set_state(qpos, qvel)
+
+
+def place_target(env: gym.Env, distance: float) -> None:
+    """Put a motionless Reacher's target at a distance from its fingertip."""
+    simulator = env.unwrapped
+    qpos = simulator.data.qpos.copy()
+    qpos[2:4] = simulator.get_body_com("fingertip")[:2] + np.array([0.0, distance])
+    simulator.set_state(qpos, np.zeros_like(simulator.data.qvel))
+
+
+@pytest.mark.parametrize("env_id", SPARSE_MUJOCO_IDS)
+def test_both_checkers_accept_the_task(env_id: str) -> None:
+    env = gym.make(env_id)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        gymnasium_check_env(env.unwrapped, skip_render_check=True)
+        sb3_check_env(env)
+    env.close()
+
+
+@pytest.mark.parametrize("env_id", SPARSE_MUJOCO_IDS)
+def test_spaces_and_time_limit_are_the_base_tasks(env_id: str) -> None:
+    env, base = gym.make(env_id), gym.make(dense_env_id(env_id))
+    assert env.observation_space.shape == (OBSERVATION_SIZES[dense_env_id(env_id)],)
+    assert env.observation_space == base.observation_space
+    assert env.action_space == base.action_space
+    assert env.spec is not None and base.spec is not None
+    assert env.spec.max_episode_steps == base.spec.max_episode_steps
+    env.close()
+    base.close()
+
+
+@pytest.mark.parametrize("env_id", SPARSE_MUJOCO_IDS)
+def test_dense_reward_and_observations_equal_the_base_tasks_step_for_step(env_id: str) -> None:
+    env, base = gym.make(env_id), gym.make(dense_env_id(env_id))
+    observation, _ = env.reset(seed=3)
+    base_observation, _ = base.reset(seed=3)
+    np.testing.assert_array_equal(observation, base_observation)
+    env.action_space.seed(3)
+    for _ in range(120):
+        action = env.action_space.sample()
+        observation, reward, terminated, truncated, info = env.step(action)
+        base_observation, base_reward, base_terminated, base_truncated, _ = base.step(action)
+        np.testing.assert_array_equal(observation, base_observation)
+        assert info["dense_reward"] == base_reward
+        assert (terminated, truncated) == (base_terminated, base_truncated)
+        assert reward in (0.0, 1.0)
+        assert type(info["is_success"]) is bool
+        if terminated or truncated:
+            np.testing.assert_array_equal(env.reset(seed=4)[0], base.reset(seed=4)[0])
+    env.close()
+    base.close()
+
+
+@pytest.mark.parametrize("env_id", REACHER_IDS)
+def test_reacher_is_paid_within_6_cm_of_the_target_only(env_id: str) -> None:
+    env = gym.make(env_id)
+    env.reset(seed=0)
+    for distance, expected in ((0.05, 1.0), (0.07, 0.0), (0.01, 1.0), (0.2, 0.0)):
+        place_target(env, distance)
+        reward, _, info = still_step(env)
+        assert reward == expected, distance
+        assert info["is_success"] is bool(expected), distance
+    env.close()
+
+
+@pytest.mark.parametrize("env_id", REACHER_IDS)
+def test_reacher_keywords_set_the_reward_of_a_miss_and_the_distance(env_id: str) -> None:
+    env = gym.make(env_id, miss_reward=-1.0, threshold=0.02)
+    env.reset(seed=0)
+    for distance, expected in ((0.05, -1.0), (0.01, 1.0)):
+        place_target(env, distance)
+        reward, _, info = still_step(env)
+        assert reward == expected
+        assert info["is_success"] is (expected == 1.0)
+    env.close()
+
+
+@pytest.mark.parametrize("env_id", LOCOMOTION_IDS)
+def test_displacement_is_paid_on_every_step_beyond_the_threshold(env_id: str) -> None:
+    distance = DISTANCES[task_of(env_id)]
+    env = gym.make(env_id)
+    env.reset(seed=0)
+    shift_x(env, distance - 0.2)
+    reward, _, info = still_step(env)
+    assert (reward, info["is_success"]) == (0.0, False)
+    shift_x(env, 0.4)
+    for _ in range(3):
+        reward, _, info = still_step(env)
+        assert (reward, info["is_success"]) == (1.0, True)
+    shift_x(env, -distance)
+    reward, _, info = still_step(env)
+    assert (reward, info["is_success"]) == (0.0, True), "success stays passed in this episode"
+    env.close()
+
+
+@pytest.mark.parametrize("env_id", LOCOMOTION_IDS)
+def test_displacement_is_measured_from_each_resets_own_x(env_id: str) -> None:
+    distance = DISTANCES[task_of(env_id)]
+    env = gym.make(env_id)
+    env.reset(seed=0)
+    shift_x(env, distance + 0.2)
+    still_step(env)
+    env.reset(seed=1)
+    reward, _, info = still_step(env)
+    assert (reward, info["is_success"]) == (0.0, False)
+    shift_x(env, distance + 0.2 - (env.unwrapped.data.qpos[0] - env.unwrapped._start_x))
+    assert still_step(env)[0] == 1.0
+    env.close()
+
+
+@pytest.mark.parametrize("env_id", LOCOMOTION_IDS)
+def test_forward_is_paid_above_the_velocity_and_success_is_still_the_distance(env_id: str) -> None:
+    task = task_of(env_id)
+    env = gym.make(env_id, condition="forward")
+    env.reset(seed=0)
+    for velocity in (0.0, -5.0, 8.0):
+        shift_x(env, 0.0, velocity)
+        reward, _, info = still_step(env)
+        assert reward == float(info["x_velocity"] > VELOCITIES[task]) == float(velocity > 0.0)
+        assert info["is_success"] is False
+    shift_x(env, DISTANCES[task] + 0.5, 0.0)
+    reward, _, info = still_step(env)
+    assert reward == 0.0
+    assert info["is_success"] is True
+    env.close()
+
+
+@pytest.mark.parametrize("env_id", LOCOMOTION_IDS)
+def test_threshold_moves_the_paying_condition(env_id: str) -> None:
+    env = gym.make(env_id, threshold=0.5)
+    env.reset(seed=0)
+    shift_x(env, 0.7)
+    reward, _, info = still_step(env)
+    assert (reward, info["is_success"]) == (1.0, True)
+    env.close()
+
+    env = gym.make(env_id, condition="forward", threshold=100.0)
+    env.reset(seed=0)
+    shift_x(env, DISTANCES[task_of(env_id)] + 0.5, 8.0)
+    reward, _, info = still_step(env)
+    assert (reward, info["is_success"]) == (0.0, True), "the velocity threshold leaves the distance of success alone"
+    env.close()
+
+
+@pytest.mark.parametrize("env_id", FALLING_IDS)
+def test_a_fall_terminates_unless_the_base_keyword_says_otherwise(env_id: str) -> None:
+    for kwargs, expected in (({}, True), ({"terminate_when_unhealthy": False}, False)):
+        env = gym.make(env_id, **kwargs)
+        env.reset(seed=0)
+        simulator = env.unwrapped
+        qpos = simulator.data.qpos.copy()
+        qpos[1] = 0.3
+        simulator.set_state(qpos, simulator.data.qvel.copy())
+        reward, terminated, _ = still_step(env)
+        assert terminated is expected
+        assert reward == 0.0
+        env.close()
+
+
+@pytest.mark.parametrize("env_id", ["SparseReacher-v5", "SparseHalfCheetah-v4"])
+def test_the_time_limit_is_a_truncation(env_id: str) -> None:
+    env = gym.make(env_id)
+    env.reset(seed=0)
+    assert env.spec is not None and env.spec.max_episode_steps is not None
+    for step in range(env.spec.max_episode_steps):
+        _, _, terminated, truncated, _ = env.step(np.zeros(env.action_space.shape, dtype=np.float32))
+        assert not terminated
+        assert truncated is (step == env.spec.max_episode_steps - 1)
+    env.close()
+
+
+@pytest.mark.parametrize("env_id", LOCOMOTION_IDS)
+def test_bad_locomotion_keywords_name_the_value_and_the_fix(env_id: str) -> None:
+    with pytest.raises(ValueError, match=r"condition='sideways'.*'displacement', 'forward'.*choose"):
+        gym.make(env_id, condition="sideways")
+    for condition in ("displacement", "forward"):
+        for threshold in (0.0, -1.0, float("nan"), float("inf"), "far", True):
+            with pytest.raises(ValueError, match=r"threshold=.* must be a positive finite number .* or None"):
+                gym.make(env_id, condition=condition, threshold=threshold)
+    with pytest.raises(ValueError, match=r"miss_reward=-1.0 is not allowed here.*leave it out"):
+        gym.make(env_id, miss_reward=-1.0)
+
+
+@pytest.mark.parametrize("env_id", REACHER_IDS)
+def test_bad_reacher_keywords_name_the_value_and_the_fix(env_id: str) -> None:
+    with pytest.raises(ValueError, match=r"condition='forward' is not allowed here.*leave it out"):
+        gym.make(env_id, condition="forward")
+    with pytest.raises(ValueError, match=r"threshold=-0.1 must be a positive"):
+        gym.make(env_id, threshold=-0.1)
+    for miss_reward in (1.0, float("-inf"), float("nan"), "no", False):
+        with pytest.raises(ValueError, match=r"miss_reward=.* must be a finite number below 1: give"):
+            gym.make(env_id, miss_reward=miss_reward)
+
+
+@pytest.mark.parametrize("env_id", SPARSE_MUJOCO_IDS)
+def test_a_pickled_task_keeps_its_keywords(env_id: str) -> None:
+    kwargs = {"miss_reward": -1.0} if env_id in REACHER_IDS else {"condition": "forward", "reset_noise_scale": 0.0}
+    env = gym.make(env_id, threshold=0.25, **kwargs)
+    copy = pickle.loads(pickle.dumps(env.unwrapped))
+    for name in ("threshold", "miss_reward") if env_id in REACHER_IDS else ("condition", "velocity", "_reset_noise_scale"):
+        assert getattr(copy, name) == getattr(env.unwrapped, name)
+    np.testing.assert_array_equal(copy.reset(seed=5)[0], env.reset(seed=5)[0])
+    env.close()
+
+
+def test_subprocesses_report_timeouts_and_success_to_sb3() -> None:
+    # the module before the colon is imported in the subprocess, so this needs no installed entry point
+    env_id, env_kwargs = "sb3_actpc.envs:SparseReacher-v5", {"miss_reward": -1.0}
+    env = make_vec_env(env_id, n_envs=2, seed=0, vec_env_cls=SubprocVecEnv, env_kwargs=env_kwargs)
+    env.reset()
+    for _ in range(50):
+        _, rewards, dones, infos = env.step(np.zeros((2, 2), dtype=np.float32))
+        assert set(rewards.tolist()) <= {-1.0, 1.0}
+    assert dones.all()
+    assert all(info["TimeLimit.truncated"] is True for info in infos)
+    assert [info["is_success"] for info in infos] == (rewards == 1.0).tolist()
+    env.close()
+
+
+def test_a_made_task_keeps_its_render_mode() -> None:
+    env = gym.make("SparseHopper-v5", render_mode="rgb_array", width=64, height=48)
+    env.reset(seed=0)
+    try:
+        image = env.render()
+    except Exception as error:  # the kind depends on which OpenGL library is missing
+        pytest.skip(f"no offscreen OpenGL here: {error}")
+    finally:
+        env.close()
+    assert isinstance(image, np.ndarray)
+    assert image.shape == (48, 64, 3)
+
+
+def test_registering_again_changes_nothing() -> None:
+    before = {env_id: gym.spec(env_id) for env_id in SPARSE_MUJOCO_IDS}
+    register_envs()
+    assert {env_id: gym.spec(env_id) for env_id in SPARSE_MUJOCO_IDS} == before
+
+
+def test_dense_env_id_names_the_base_task_or_lists_the_known_ids() -> None:
+    assert dense_env_id("SparseHopper-v5") == "Hopper-v5"
+    assert dense_env_id("SparseReacher-v4") == "Reacher-v4"
+    for unknown in ("Hopper-v5", "SparseAnt-v5", "SparseHopper-v3", ""):
+        with pytest.raises(ValueError, match=r"choose one of SparseReacher-v5, .*SparseSwimmer-v4"):
+            dense_env_id(unknown)

@@ -1,0 +1,139 @@
+"""Dependencies point one way: read from the source (nothing is imported but in the last tests)."""
+
+import ast
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).resolve().parents[1] / "sb3_actpc"
+# each is large, or an extra that may not be installed
+LAZY = ("minari", "rl_zoo3", "robosuite")
+
+
+@dataclass(frozen=True)
+class Import:
+    """One import statement: the module it stands in, what it names, and whether it runs on import of that module."""
+
+    module: str
+    target: str
+    is_lazy: bool
+
+
+def module_name(path: Path) -> str:
+    """``sb3_actpc/ngc/circuit.py`` -> ``sb3_actpc.ngc.circuit``."""
+    parts = path.relative_to(PACKAGE.parent).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def imports_of(path: Path) -> list[Import]:
+    """Every import statement of a file, with relative ones made absolute.
+
+    ``from a import b`` counts as ``a.b``, since b may be a module.
+    """
+    module = module_name(path)
+    package = module.split(".") if path.name == "__init__.py" else module.split(".")[:-1]
+    found: list[Import] = []
+
+    def visit(node: ast.AST, is_lazy: bool) -> None:
+        if isinstance(node, ast.Import):
+            found.extend(Import(module, alias.name, is_lazy) for alias in node.names)
+        if isinstance(node, ast.ImportFrom):
+            base = package[: len(package) - node.level + 1] if node.level else []
+            source = ".".join([*base, *([node.module] if node.module else [])])
+            found.extend(Import(module, f"{source}.{alias.name}", is_lazy) for alias in node.names)
+        is_function = isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda))
+        for child in ast.iter_child_nodes(node):
+            visit(child, is_lazy or is_function or is_type_checking(node))
+
+    visit(ast.parse(path.read_text(encoding="utf-8")), False)
+    return found
+
+
+def is_type_checking(node: ast.AST) -> bool:
+    """Whether the node is ``if TYPE_CHECKING:``."""
+    return isinstance(node, ast.If) and ast.unparse(node.test) in ("TYPE_CHECKING", "typing.TYPE_CHECKING")
+
+
+def is_within(target: str, package: str) -> bool:
+    """Whether a dotted name is a package or something in it."""
+    return target == package or target.startswith(f"{package}.")
+
+
+IMPORTS = [entry for path in sorted(PACKAGE.rglob("*.py")) for entry in imports_of(path)]
+
+
+def imports_in(package: str) -> list[Import]:
+    """The imports of all modules of a package."""
+    return [entry for entry in IMPORTS if is_within(entry.module, package)]
+
+
+def test_the_source_was_found() -> None:
+    assert len(IMPORTS) > 20
+
+
+def test_ngc_imports_torch_the_standard_library_and_itself_only() -> None:
+    allowed = {"torch", *sys.stdlib_module_names}
+    others = [
+        entry
+        for entry in imports_in("sb3_actpc.ngc")
+        if entry.target.split(".")[0] not in allowed and not is_within(entry.target, "sb3_actpc.ngc")
+    ]
+    assert others == []
+
+
+@pytest.mark.parametrize("forbidden", ["sb3_actpc.actpc", "sb3_actpc.training", "sb3_actpc.cli", "sb3_actpc.ActPC"])
+def test_common_does_not_import_what_is_built_on_it(forbidden: str) -> None:
+    assert [entry for entry in imports_in("sb3_actpc.common") if is_within(entry.target, forbidden)] == []
+
+
+@pytest.mark.parametrize("forbidden", ["torch", "stable_baselines3", "sb3_actpc.actpc", "sb3_actpc.ngc", "sb3_actpc.cli"])
+def test_envs_know_neither_torch_nor_the_agent(forbidden: str) -> None:
+    assert [entry for entry in imports_in("sb3_actpc.envs") if is_within(entry.target, forbidden)] == []
+
+
+@pytest.mark.parametrize("package", ["sb3_actpc.actpc", "sb3_actpc.ngc"])
+def test_the_agent_does_not_import_the_training_runs(package: str) -> None:
+    assert [entry for entry in imports_in(package) if is_within(entry.target, "sb3_actpc.training")] == []
+
+
+def test_nobody_imports_the_command_line() -> None:
+    importers = {entry.module for entry in IMPORTS if is_within(entry.target, "sb3_actpc.cli")}
+    assert {name for name in importers if not is_within(name, "sb3_actpc.cli")} == set()
+
+
+@pytest.mark.parametrize("package", LAZY)
+def test_extras_are_imported_inside_functions_only(package: str) -> None:
+    assert [entry for entry in IMPORTS if is_within(entry.target, package) and not entry.is_lazy] == []
+
+
+def loaded_after(statement: str) -> set[str]:
+    """Names of the modules that a new interpreter holds after a statement."""
+    code = f"{statement}; import sys; print(' '.join(sys.modules))"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=PACKAGE.parent, check=False)
+    assert result.returncode == 0, result.stderr
+    return set(result.stdout.split())
+
+
+def test_importing_the_package_leaves_the_extras_alone() -> None:
+    loaded = loaded_after("import sb3_actpc")
+    assert "sb3_actpc" in loaded
+    assert loaded.isdisjoint(LAZY)
+
+
+def test_the_agent_is_importable_from_the_package() -> None:
+    loaded = loaded_after("from sb3_actpc import ActPC; ActPC.__name__")
+    assert "sb3_actpc.actpc" in loaded
+    assert loaded.isdisjoint(LAZY)
+
+
+def test_importing_the_environments_loads_no_torch() -> None:
+    """Gymnasium imports them through the entry point while it is itself being imported."""
+    assert loaded_after("import sb3_actpc.envs").isdisjoint({"torch", "stable_baselines3", *LAZY})
+
+
+def test_building_the_command_line_loads_no_torch() -> None:
+    loaded = loaded_after("from sb3_actpc.cli import build_parser; build_parser()")
+    assert loaded.isdisjoint({"torch", "stable_baselines3", "matplotlib", *LAZY})
