@@ -71,9 +71,9 @@ class SilentTD3(TD3):
 
     received: Any = None
 
-    def __init__(self, *args: Any, demonstrations: Any = None, learning_starts: int = 100, gamma: float = 0.99, **kwargs: Any):
+    def __init__(self, policy: Any, env: Any, demonstrations: Any = None, **options: Any) -> None:
         SilentTD3.received = demonstrations
-        super().__init__(*args, learning_starts=learning_starts, gamma=gamma, **kwargs)
+        super().__init__(policy, env, **options)
 
 
 class StatefulPolicy:
@@ -98,7 +98,6 @@ def line_task(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         gym.register(ENV_ID, entry_point=f"{__name__}:LineEnv")
     monkeypatch.setitem(ALGORITHMS, "td3", "stable_baselines3:TD3")
     monkeypatch.setitem(ALGORITHMS, "silent", f"{__name__}:SilentTD3")
-    monkeypatch.setitem(sys.modules, __name__, sys.modules[__name__])
     monkeypatch.chdir(tmp_path)
     settings = {"n_timesteps": 60, "learning_starts": 20, "policy_kwargs": {"net_arch": [8]}}
     Path("small.yml").write_text(yaml.safe_dump({"default": settings}), encoding="utf-8")

@@ -11,6 +11,16 @@ import pytest
 PACKAGE = Path(__file__).resolve().parents[1] / "sb3_actpc"
 # each is large, or an extra that may not be installed
 LAZY = ("minari", "rl_zoo3", "robosuite")
+HEAVY = (
+    "torch",
+    "stable_baselines3",
+    "matplotlib",
+    "mujoco",
+    "sb3_actpc.actpc",
+    "sb3_actpc.experts",
+    "sb3_actpc.ngc",
+    "sb3_actpc.training",
+)
 
 
 @dataclass(frozen=True)
@@ -109,6 +119,13 @@ def test_extras_are_imported_inside_functions_only(package: str) -> None:
     assert [entry for entry in IMPORTS if is_within(entry.target, package) and not entry.is_lazy] == []
 
 
+@pytest.mark.parametrize("package", HEAVY)
+def test_the_command_line_imports_heavy_modules_inside_functions_only(package: str) -> None:
+    """``--help`` and mistyped arguments are answered at once."""
+    heavy = [entry for entry in imports_in("sb3_actpc.cli") if is_within(entry.target, package) and not entry.is_lazy]
+    assert heavy == []
+
+
 def loaded_after(statement: str) -> set[str]:
     """Names of the modules that a new interpreter holds after a statement."""
     code = f"{statement}; import sys; print(' '.join(sys.modules))"
@@ -127,13 +144,3 @@ def test_the_agent_is_importable_from_the_package() -> None:
     loaded = loaded_after("from sb3_actpc import ActPC; ActPC.__name__")
     assert "sb3_actpc.actpc" in loaded
     assert loaded.isdisjoint(LAZY)
-
-
-def test_importing_the_environments_loads_no_torch() -> None:
-    """Gymnasium imports them through the entry point while it is itself being imported."""
-    assert loaded_after("import sb3_actpc.envs").isdisjoint({"torch", "stable_baselines3", *LAZY})
-
-
-def test_building_the_command_line_loads_no_torch() -> None:
-    loaded = loaded_after("from sb3_actpc.cli import build_parser; build_parser()")
-    assert loaded.isdisjoint({"torch", "stable_baselines3", "matplotlib", *LAZY})

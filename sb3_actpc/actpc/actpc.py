@@ -1,13 +1,13 @@
 """ActPC: active predictive coding as a Stable-Baselines3 algorithm (Ororbia & Mali, arXiv 2209.09174, Algorithm 1)."""
 
 from collections.abc import Iterable
+from functools import reduce
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
-
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
@@ -16,14 +16,14 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 
 from sb3_actpc.actpc.diagnostics import Diagnostics
-from sb3_actpc.actpc.policies import ActPCPolicy, MlpPolicy, MultiInputPolicy
+from sb3_actpc.actpc.policies import ActPCActor, ActPCPolicy, Critics, MlpPolicy, MultiInputPolicy
 from sb3_actpc.actpc.signals import SIGNAL_ERRORS, make_normalizer, summed_squared_errors
 from sb3_actpc.common.buffers import _SignalReplay, combined_buffer_class
 from sb3_actpc.common.checks import check_choices, check_finite, check_numbers
 from sb3_actpc.common.demonstrations import Demonstrations, resolve
 from sb3_actpc.common.episodes import Episodes, map_observations, sample_union
 from sb3_actpc.common.type_aliases import ImitationSamples, TensorObservations
-from sb3_actpc.ngc import HebbianChanges, settle_coupled
+from sb3_actpc.ngc import HebbianChanges, NGCCircuit, settle_coupled
 
 SelfActPC = TypeVar("SelfActPC", bound="ActPC")
 
@@ -129,8 +129,14 @@ class ActPC(OffPolicyAlgorithm):
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": MlpPolicy, "MultiInputPolicy": MultiInputPolicy}
-    policy: ActPCPolicy  # type: ignore[assignment]
-    replay_buffer: _SignalReplay | None  # type: ignore[assignment]
+    policy: ActPCPolicy
+    replay_buffer: _SignalReplay | None
+    actor: ActPCActor
+    critic: Critics
+    critic_target: Critics
+    generator: NGCCircuit
+    prior: NGCCircuit
+    actor_target: NGCCircuit
 
     def __init__(
         self,
@@ -204,8 +210,10 @@ class ActPC(OffPolicyAlgorithm):
             at_least_0="prior_updates actor_warm_start refresh_weight self_imitation_size actor_pressure critic_warmup "
             "target_policy_noise target_noise_clip",
             at_least_1="n_critics target_update_interval memory_history",
-            fraction="demonstration_fraction nudge",
+            fraction="demonstration_fraction",
         )
+        if not 0.0 < nudge <= 1.0:
+            raise ValueError(f"nudge={nudge!r} must be above 0 and at most 1")
         super().__init__(
             policy,
             env,
@@ -305,7 +313,8 @@ class ActPC(OffPolicyAlgorithm):
             **{f"{name}_kwargs": getattr(self, f"{name}_kwargs") for name in ("actor", "critic", "generator", "prior")},
         }
         merged = {**own, **self.policy_kwargs}
-        merged["circuit_kwargs"] = {"settling": self.settling, **(self.circuit_kwargs or {}), **merged.get("circuit_kwargs", {})}
+        common = {"settling": self.settling, **(self.circuit_kwargs or {})}
+        merged["circuit_kwargs"] = {**common, **merged.get("circuit_kwargs", {})}
         return merged
 
     @property
@@ -398,11 +407,12 @@ class ActPC(OffPolicyAlgorithm):
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
     ) -> tuple[np.ndarray, np.ndarray]:
-        if self.num_timesteps < learning_starts:
-            unscaled = np.array([self.action_space.sample() for _ in range(n_envs)])
-        else:
+        warming_up = self.num_timesteps < learning_starts
+        if self.history or not warming_up:  # the working memory follows random actions too
             assert self._last_obs is not None
-            unscaled, _ = self.policy.predict(self._last_obs, self._rollout_state, self._rollout_starts)
+            unscaled, self._rollout_state = self.policy.predict(self._last_obs, self._rollout_state, self._rollout_starts)
+        if warming_up:
+            unscaled = np.array([self.action_space.sample() for _ in range(n_envs)])
         scaled = self.policy.scale_action(unscaled)
         check_finite("actor", "actions", scaled, self.num_timesteps)
         if action_noise is not None:
@@ -420,9 +430,6 @@ class ActPC(OffPolicyAlgorithm):
     ) -> None:
         map_observations(lambda array: check_finite("environment", "observations", array, self.num_timesteps), new_obs)
         check_finite("environment", "rewards", reward, self.num_timesteps)
-        if self.history:
-            assert self._last_obs is not None
-            _, self._rollout_state = self.policy.predict(self._last_obs, self._rollout_state, self._rollout_starts)
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
         self._rollout_starts = np.array(dones, dtype=bool)
         self._compute_newest_signals()
@@ -507,7 +514,8 @@ class ActPC(OffPolicyAlgorithm):
             self.gamma if replayed.discounts is None else replayed.discounts,
             len(features),
         )
-        self.diagnostics.follow(internal_reward=(rewards - weights[0] * replayed.rewards).mean, task_reward=replayed.rewards.mean)
+        internal = rewards - weights[0] * replayed.rewards
+        self.diagnostics.follow(internal_reward=internal.mean, task_reward=replayed.rewards.mean)
         return self._with_expert(batch, n_expert) if n_expert else batch
 
     def _update_actor(self, batch: Batch) -> None:
@@ -518,8 +526,7 @@ class ActPC(OffPolicyAlgorithm):
         if self.actor_pressure and self._n_updates > self.critic_warmup:
             rows = slice(self.policy.batch_size_of("actor", len(batch.features)))
             memory = None if batch.memory is None else batch.memory[rows]
-            critic = self.critic[0]
-            coupled = settle_coupled(self.actor.circuit, critic, batch.features[rows], memory, self.nudge)
+            coupled = settle_coupled(self.actor.circuit, self.critic.first(), batch.features[rows], memory, self.nudge)
             pressure = self.actor.circuit.hebbian_update(coupled.actor)
             weight = self.actor_pressure / coupled.action_values.abs().mean() if self.scale_pressure else self.actor_pressure
             changes = pressure.scale_(weight) if changes is None else changes.add_(pressure.scale_(weight))
@@ -547,9 +554,8 @@ class ActPC(OffPolicyAlgorithm):
                 noise = th.randn_like(next_actions) * self.target_policy_noise
                 next_actions = (next_actions + noise.clamp(-self.target_noise_clip, self.target_noise_clip)).clamp(-1.0, 1.0)
         inputs = th.cat([batch.next_features, next_actions], dim=1)
-        values = self.critic_target[0].project(inputs)
-        for other in self.critic_target[1:]:
-            values = th.minimum(values, other.project(inputs))
+        first, *others = (critic.project(inputs) for critic in self.critic_target)
+        values = reduce(th.minimum, others, first)
         return batch.rewards + (1.0 - batch.dones) * batch.discounts * values
 
     def _update_generator(self, batch: Batch) -> None:
@@ -664,9 +670,9 @@ class ActPC(OffPolicyAlgorithm):
             shape = next(iter(observations.values())).shape if isinstance(observations, dict) else observations.shape
             lead = shape[:batch_dims]
             flat = map_observations(lambda array: array.reshape(-1, *array.shape[batch_dims:]), observations)
-            normalized = self._vec_normalize_env.normalize_obs(flat)  # type: ignore[arg-type]
+            normalized = self._vec_normalize_env.normalize_obs(flat)
             observations = map_observations(lambda array: array.reshape(*lead, *array.shape[1:]), normalized)
-        return map_observations(lambda array: th.as_tensor(array, device=self.device), observations)  # type: ignore[return-value]
+        return map_observations(lambda array: th.as_tensor(array, device=self.device), observations)
 
     def _features(self, observations: TensorObservations) -> th.Tensor:
         """What the circuits see of a batch of observations, (B, n_features)."""
@@ -675,20 +681,22 @@ class ActPC(OffPolicyAlgorithm):
     def _memory(self, history: TensorObservations | None, mask: th.Tensor | None) -> th.Tensor | None:
         """m_t from the observations before each row, (B, n_memory); None without a working memory."""
         past = self._past_features(history, mask)
-        return None if past is None else self.actor.memory(past)  # type: ignore[misc]
+        return None if past is None or self.actor.memory is None else self.actor.memory(past)
 
     def _next_memory(
         self, history: TensorObservations | None, mask: th.Tensor | None, features: th.Tensor
     ) -> th.Tensor | None:
         """m_{t+1}: one step on, the present observation is the newest of the past."""
         past = self._past_features(history, mask)
-        return None if past is None else self.actor.memory(th.cat([past[:, 1:], features[:, None]], dim=1))  # type: ignore[misc]
+        if past is None or self.actor.memory is None:
+            return None
+        return self.actor.memory(th.cat([past[:, 1:], features[:, None]], dim=1))
 
     def _past_features(self, history: TensorObservations | None, mask: th.Tensor | None) -> th.Tensor | None:
         if history is None or mask is None:
             return None
         flat = map_observations(lambda tensor: tensor.flatten(0, 1), history)
-        return self._features(flat).view(*mask.shape, -1) * mask[:, :, None]  # type: ignore[arg-type]
+        return self._features(flat).view(*mask.shape, -1) * mask[:, :, None]
 
     # ------------------------------------------------------------------ logging, saving
 

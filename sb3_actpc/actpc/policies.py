@@ -2,6 +2,7 @@
 
 import copy
 import warnings
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,7 @@ class ObservationNormalizer(nn.Module):
 
     mean: th.Tensor
     scale: th.Tensor
+    clip: th.Tensor
 
     def __init__(self, n_features: int) -> None:
         super().__init__()
@@ -42,6 +44,17 @@ class ObservationNormalizer(nn.Module):
         """:param features: (..., n_features)
         :return: the same shape, normalised"""
         return th.clamp((features - self.mean) * self.scale, -self.clip, self.clip)
+
+
+class Critics(nn.ModuleList):
+    """One or more critic circuits."""
+
+    def __iter__(self) -> Iterator[NGCCircuit]:
+        return super().__iter__()
+
+    def first(self) -> NGCCircuit:
+        """The one the actor is coupled to."""
+        return next(iter(self))
 
 
 class ActPCActor(BasePolicy):
@@ -235,7 +248,7 @@ class ActPCPolicy(BasePolicy):
         )
         n_features, n_actions = extractor.features_dim, int(np.prod(self.action_space.shape))
         n_memory = self.actor.memory.size if self.actor.memory else 0
-        self.critic = nn.ModuleList(
+        self.critic = Critics(
             self._circuit("critic", n_features + n_actions, n_actions, n_feedback_inputs=n_actions)
             for _ in range(self.n_critics)
         )
@@ -249,7 +262,7 @@ class ActPCPolicy(BasePolicy):
     def named_circuits(self) -> list[tuple[str, NGCCircuit]]:
         """The circuits that learn, with their names: actor, critic.0, ..., generator, prior."""
         critics = [(f"critic.{index}", critic) for index, critic in enumerate(self.critic)]
-        return [("actor", self.actor.circuit), *critics, ("generator", self.generator), ("prior", self.prior)]  # type: ignore[list-item]
+        return [("actor", self.actor.circuit), *critics, ("generator", self.generator), ("prior", self.prior)]
 
     def _settings_of(self, name: str) -> dict[str, Any]:
         return dict(self.kwargs_of[name] or {})
@@ -268,7 +281,7 @@ class ActPCPolicy(BasePolicy):
         own = {k: v for k, v in self._settings_of(name).items() if k not in ("net_arch", "learning_rate", "batch_size")}
         return {**default, **self.circuit_kwargs, **own}
 
-    def _circuit(self, name: str, n_inputs: int, n_outputs: int, **extra: int) -> NGCCircuit:
+    def _circuit(self, name: str, n_inputs: int, n_outputs: int, **extra: Any) -> NGCCircuit:
         return NGCCircuit(n_inputs, n_outputs, self._net_arch_of(name), **self._circuit_kwargs_of(name), **extra)
 
     def _optimizer(self, name: str, circuit: NGCCircuit) -> th.optim.Optimizer:
@@ -329,5 +342,6 @@ MlpPolicy = ActPCPolicy
 class MultiInputPolicy(ActPCPolicy):
     """:class:`ActPCPolicy` for Dict observations; images go through SB3's convolutions with fixed random weights."""
 
-    def __init__(self, *args: Any, features_extractor_class: type[BaseFeaturesExtractor] = CombinedExtractor, **kwargs: Any):
-        super().__init__(*args, features_extractor_class=features_extractor_class, **kwargs)
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        kwargs.setdefault("features_extractor_class", CombinedExtractor)
+        super().__init__(*args, **kwargs)

@@ -64,7 +64,7 @@ class _SignalReplay(ReplayBuffer):
         assert self.self_imitation is not None
         action = action.reshape(self.n_envs, self.action_dim)
         for env, steps in enumerate(self._running):
-            row = map_observations(lambda array, i=env: np.array(array[i]), obs)
+            row = {key: np.array(value[env]) for key, value in obs.items()} if isinstance(obs, dict) else np.array(obs[env])
             steps.append((row, action[env].astype(np.float32), float(reward[env])))
             if done[env]:
                 first = steps[0][0]
@@ -138,8 +138,7 @@ class _SignalReplay(ReplayBuffer):
         return self._to_tensors(map_observations(lambda array: array[rows, envs], self.next_observations), env)
 
     def _to_tensors(self, observations: Observations, env: VecNormalize | None) -> TensorObservations:
-        normalized = self._normalize_obs(observations, env)  # type: ignore[arg-type]
-        return map_observations(self.to_torch, normalized)  # type: ignore[return-value]
+        return map_observations(self.to_torch, self._normalize_obs(observations, env))
 
     def _history_at(self, rows: np.ndarray, envs: np.ndarray, env: VecNormalize | None) -> dict[str, Any]:
         """The ``history`` observations before each row in its episode, oldest first, and which of them exist."""
@@ -157,7 +156,7 @@ class _SignalReplay(ReplayBuffer):
             lambda array: array[earlier, envs[:, None]].reshape(*shape, *array.shape[2:]), self.observations
         )
         past = map_observations(
-            lambda array: array.reshape(len(rows), self.history, *array.shape[1:]), self._to_tensors(flat, env)  # type: ignore[arg-type]
+            lambda array: array.reshape(len(rows), self.history, *array.shape[1:]), self._to_tensors(flat, env)
         )
         return {"history": past, "history_mask": self.to_torch(mask)}
 
@@ -200,11 +199,11 @@ class CombinedReplayBuffer(_SignalReplay):
     """ActPC's replay buffer for Box observations; see :class:`_SignalReplay`."""
 
 
-class CombinedDictReplayBuffer(_SignalReplay, DictReplayBuffer):
+class CombinedDictReplayBuffer(_SignalReplay, DictReplayBuffer):  # type: ignore[misc]
     """ActPC's replay buffer for Dict observations; see :class:`_SignalReplay`."""
 
 
-class CombinedHerReplayBuffer(_SignalReplay, HerReplayBuffer):
+class CombinedHerReplayBuffer(_SignalReplay, HerReplayBuffer):  # type: ignore[misc]
     """
     Hindsight experience replay with ActPC's signals: relabelling touches the task's reward and the goals alone.
 
@@ -227,6 +226,7 @@ class CombinedHerReplayBuffer(_SignalReplay, HerReplayBuffer):
         relabelled = np.flatnonzero(finished)[: int(self.her_ratio * finished.sum())]
         if not len(relabelled):
             return batch
+        assert isinstance(batch.observations, dict) and isinstance(batch.next_observations, dict)
         virtual = self._get_virtual_samples(rows[relabelled], envs[relabelled], env)
         index = th.as_tensor(relabelled, device=self.device)
         for key, value in virtual.observations.items():

@@ -1,7 +1,9 @@
 """Whole episodes worth imitating: the demonstrations, and the agent's own best (self-imitation)."""
 
 from collections import deque
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
@@ -10,8 +12,8 @@ from sb3_actpc.common.demonstrations import Demonstrations
 from sb3_actpc.common.type_aliases import ImitationSamples, Observations
 
 
-def map_observations(function, observations: Observations) -> Observations:  # type: ignore[no-untyped-def]
-    """Apply ``function`` to an array, or to every array of a dict."""
+def map_observations(function: Callable[[Any], Any], observations: Any) -> Any:
+    """Apply ``function`` to an array or tensor, or to every one of a dict."""
     if isinstance(observations, dict):
         return {key: function(value) for key, value in observations.items()}
     return function(observations)
@@ -133,13 +135,8 @@ class SelfImitationMemory:
         """All stored episodes laid end to end."""
         if self._joined is None:
             lengths = [len(episode) for episode in self._episodes]
-            first = self._episodes[0].observations
-            observations: Observations
-            if isinstance(first, dict):
-                observations = {key: np.concatenate([e.observations[key] for e in self._episodes]) for key in first}  # type: ignore[index, call-overload]
-            else:
-                observations = np.concatenate([e.observations for e in self._episodes])  # type: ignore[misc]
             starts = np.repeat(np.cumsum([0, *lengths[:-1]]), lengths)
+            observations = _concatenate([episode.observations for episode in self._episodes])
             self._joined = Episodes(observations, np.concatenate([e.actions for e in self._episodes]), starts)
         return self._joined
 
@@ -155,10 +152,11 @@ def sample_union(parts: list[Episodes], n: int, history: int = 0) -> ImitationSa
         start = int(end)
     if len(taken) == 1:
         return taken[0]
-    return ImitationSamples(*(None if column[0] is None else _concatenate(column) for column in zip(*taken, strict=True)))
+    columns: list[Any] = [None if column[0] is None else _concatenate(column) for column in zip(*taken, strict=True)]
+    return ImitationSamples(*columns)
 
 
-def _concatenate(arrays):  # type: ignore[no-untyped-def]
+def _concatenate(arrays: Sequence[Any]) -> Any:
     if isinstance(arrays[0], dict):
         return {key: np.concatenate([array[key] for array in arrays]) for key in arrays[0]}
     return np.concatenate(arrays)

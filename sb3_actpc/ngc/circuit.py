@@ -50,6 +50,9 @@ class NGCCircuit(nn.Module):
     :raises ValueError: when a keyword has a value that is not allowed, or conflicts with ``settling="scheduled"``
     """
 
+    rates: th.Tensor
+    optimizer: th.optim.Optimizer  # set by whoever trains the circuit; ``apply_changes`` takes any
+
     def __init__(
         self,
         n_inputs: int,
@@ -264,9 +267,9 @@ class NGCCircuit(nn.Module):
         targets = [*self.weights, *self.biases, *self.memory_weights]
         for parameter, gradient in zip(targets, th._foreach_neg(changes.tensors()), strict=True):
             parameter.grad = gradient
-        first = 0 if self.n_feedback_inputs else 1
+        above = list(self.weights)[0 if self.n_feedback_inputs else 1 :]
         # E^T is stored in the layout of W, so that its change is ΔW itself
-        for parameter, weights in zip(self.feedback_weights, list(self.weights)[first:], strict=len(self.feedback_weights) > 0):
+        for parameter, weights in zip(self.feedback_weights, above, strict=self.feedback == "learned"):
             assert weights.grad is not None
             parameter.grad = weights.grad[:, weights.shape[1] - parameter.shape[1] :].contiguous()
         optimizer.step()
@@ -317,11 +320,16 @@ def _check_choice(name: str, value: str, allowed: Sequence[str]) -> None:
 
 def _check_scheduled(**given: Any) -> None:
     """Scheduled settling implies these settings: say which explicit one conflicts."""
-    implied = {"feedback": "tied", "feedback_scale": 1.0, "leak": 0.0, "settling_rate": ("auto", 1.0), "derivative_free": False}
+    implied: dict[str, tuple[Any, ...]] = {
+        "feedback": ("tied",),
+        "feedback_scale": (1.0,),
+        "leak": (0.0,),
+        "settling_rate": ("auto", 1.0),
+        "derivative_free": (False,),
+    }
     for name, value in given.items():
-        allowed = implied[name] if isinstance(implied[name], tuple) else (implied[name],)
-        if value not in allowed:
+        if value not in implied[name]:
             raise ValueError(
-                f"{name}={value!r} conflicts with settling='scheduled', which implies {name}={allowed[0]!r}; "
+                f"{name}={value!r} conflicts with settling='scheduled', which implies {name}={implied[name][0]!r}; "
                 f"leave {name} out or use settling='iterative'"
             )

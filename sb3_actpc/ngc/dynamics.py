@@ -79,7 +79,7 @@ class SettlingChain:
         hidden = self.latents[1:]
         self.errors = [th.zeros_like(z) for z in hidden]
         self.feedback = [th.empty_like(z) for z in hidden]
-        self.first_prediction = hidden[0].clone() if hidden else None
+        self.first_prediction = hidden[0].clone() if hidden else self.output_prediction
 
     def clamp_output(self, target: th.Tensor) -> None:
         """Clamp the output layer to ``target`` (B, n_outputs): its error is target - g(z̄), now and after every step."""

@@ -77,4 +77,4 @@ def soft_bound_(new: th.Tensor, old: th.Tensor, bound: float) -> None:
 def bound_columns_(weights: th.Tensor, bound: float) -> None:
     """Shrink, in place, every column of ``weights`` (n_out, n_in) whose Euclidean norm passes ``bound`` to that norm."""
     norms = th.linalg.vector_norm(weights, dim=0, keepdim=True)
-    weights.mul_((bound / norms.clamp_min(bound)))
+    weights.mul_(bound / norms.clamp_min(bound))

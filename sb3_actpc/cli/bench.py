@@ -1,0 +1,159 @@
+"""``sb3-actpc bench``: what one update costs, as ratios to SB3's TD3 and to the matrix products alone."""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+
+TASK = "SparseHalfCheetah-v5"
+BATCH_SIZE = 256
+WIDTH = 256
+N_FILLED = 1000
+
+
+def add_parser(subparsers: Any) -> None:
+    """:param subparsers: what ``ArgumentParser.add_subparsers`` returned"""
+    parser = subparsers.add_parser("bench", help="time one update of ActPC against SB3's TD3")
+    parser.add_argument("--rounds", type=int, default=40, help="interleaved measurements of every entry")
+    parser.add_argument("--threads", type=int, default=None, help="torch threads (default: torch's own choice)")
+    parser.add_argument("--device", default="cpu", help="torch device")
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """
+    Measure and print.
+
+    :param args: the parsed command line
+    :return: the exit code
+    :raises ValueError: when a number is too small
+    """
+    import torch as th
+
+    if args.rounds < 1 or (args.threads is not None and args.threads < 1):
+        raise ValueError(f"--rounds {args.rounds} and --threads {args.threads} must be at least 1")
+    if args.threads is not None:
+        th.set_num_threads(args.threads)
+    entries: dict[str, Callable[[], object]] = {"SB3 TD3 train()": _stepper(_td3(args.device))}
+    for name, keywords in _settings().items():
+        entries[name] = _stepper(_actpc(keywords, args.device))
+    entries |= _settling(args.device)
+    times = _interleave(entries, args.rounds, synchronize=th.cuda.synchronize if args.device != "cpu" else lambda: None)
+    _print(times, th.get_num_threads(), args.device)
+    print(f"replay memory over SB3's, per HalfCheetah transition: {_memory_ratio():.2f}")
+    return 0
+
+
+def _settings() -> dict[str, dict[str, Any]]:
+    """The agents measured: the bare one, the shipped defaults and the paper's preset, with both schedules."""
+    from sb3_actpc.training.config import RunConfig, resolve_run
+
+    bare = {"circuit_kwargs": {"feedback": "tied"}, "n_critics": 1}
+    presets = {"shipped defaults": "actpc", "paper preset": "actpc_paper"}
+    plans = {label: resolve_run(RunConfig(env=TASK, preset=preset)) for label, preset in presets.items()}
+    with_data = {
+        label: {**plan.algorithm_kwargs, "demonstrations": plan.demonstrations} for label, plan in plans.items()
+    }
+    settings = {}
+    for label, keywords in (("bare", bare), *with_data.items()):
+        for settling in ("scheduled", "iterative"):
+            chosen = {**keywords, "settling": settling}
+            if settling == "scheduled":  # implies tied feedback
+                chosen["circuit_kwargs"] = {"activation": "relu6"}
+            elif label == "shipped defaults":
+                chosen["circuit_kwargs"] = {"feedback": "tied"}
+            settings[f"ActPC train(), {label}, {settling}"] = chosen
+    return settings
+
+
+def _td3(device: str) -> OffPolicyAlgorithm:
+    from stable_baselines3 import TD3
+
+    return TD3("MlpPolicy", TASK, policy_kwargs={"net_arch": [WIDTH, WIDTH]}, batch_size=BATCH_SIZE, **_common(device))
+
+
+def _actpc(keywords: dict[str, Any], device: str) -> OffPolicyAlgorithm:
+    from sb3_actpc import ActPC
+
+    quick = {"prior_updates": 1, "actor_warm_start": 0, "critic_warmup": 0, "batch_size": BATCH_SIZE}
+    return ActPC("MlpPolicy", TASK, **{**keywords, **quick, **_common(device)})
+
+
+def _common(device: str) -> dict[str, Any]:
+    return {"learning_starts": 10 * N_FILLED, "buffer_size": 10 * N_FILLED, "device": device, "seed": 0}
+
+
+def _stepper(model: OffPolicyAlgorithm) -> Callable[[], object]:
+    """Fill the buffer with random actions; one call is then two updates (TD3 moves its actor every other time)."""
+    from stable_baselines3.common.logger import configure
+
+    model.set_logger(configure(None, []))
+    model.learn(N_FILLED)
+    return lambda: model.train(gradient_steps=2, batch_size=BATCH_SIZE)
+
+
+def _settling(device: str) -> dict[str, Callable[[], object]]:
+    """One K = 10 settling of a tied circuit, and its matrix products alone."""
+    import torch as th
+
+    from sb3_actpc.ngc import NGCCircuit
+
+    circuit = NGCCircuit(23, 17, (WIDTH, WIDTH), feedback="tied").to(device)
+    x, target = th.randn(BATCH_SIZE, 23, device=device), th.randn(BATCH_SIZE, 17, device=device)
+    hidden, output = th.randn(BATCH_SIZE, WIDTH, device=device), th.randn(BATCH_SIZE, 17, device=device)
+    wide, narrow = circuit.weights[1], circuit.weights[2]
+    up, down = th.empty_like(hidden), th.empty_like(output)
+
+    def products() -> None:
+        for _ in range(circuit.n_settling_steps):
+            th.mm(hidden, wide.t(), out=up)
+            th.mm(hidden, narrow.t(), out=down)
+            th.mm(output, narrow, out=up)
+            th.mm(hidden, wide, out=up)
+
+    return {"matrix products of one settling": products, "one settling, K = 10": lambda: circuit.settle(x, target)}
+
+
+def _interleave(
+    entries: dict[str, Callable[[], object]], rounds: int, synchronize: Callable[[], object]
+) -> dict[str, list[float]]:
+    times: dict[str, list[float]] = {name: [] for name in entries}
+    for round_number in range(rounds + 3):
+        for name, entry in entries.items():
+            synchronize()
+            start = time.perf_counter()
+            entry()
+            synchronize()
+            if round_number >= 3:  # the first ones warm up
+                times[name].append(time.perf_counter() - start)
+    return times
+
+
+def _print(times: dict[str, list[float]], threads: int, device: str) -> None:
+    print(f"batch {BATCH_SIZE}, hidden [{WIDTH}, {WIDTH}], {device}, {threads} threads; medians of interleaved rounds")
+    reference, floor = times["SB3 TD3 train()"], times["matrix products of one settling"]
+    for name, own in times.items():
+        base, unit = (floor, "the products") if "settling" in name else (reference, "TD3")
+        ratio = statistics.median(a / b for a, b in zip(own, base, strict=True))
+        print(f"{name:46s} {ratio:6.2f} x {unit}")
+
+
+def _memory_ratio() -> float:
+    import numpy as np
+    from gymnasium import spaces
+    from stable_baselines3.common.buffers import ReplayBuffer
+
+    from sb3_actpc.common.buffers import CombinedReplayBuffer
+
+    pair = spaces.Box(-np.inf, np.inf, (17,), np.float64), spaces.Box(-1.0, 1.0, (6,), np.float32)
+    sizes = [
+        sum(value.nbytes for value in vars(kind(N_FILLED, *pair, device="cpu")).values() if isinstance(value, np.ndarray))
+        for kind in (CombinedReplayBuffer, ReplayBuffer)
+    ]
+    return sizes[0] / sizes[1]

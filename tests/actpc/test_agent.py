@@ -1,0 +1,485 @@
+"""The agent: every part of Algorithm 1 is wired, and does what the paper says it does."""
+
+import warnings
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3.common.env_checker import check_env
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+from sb3_actpc import ActPC, Demonstrations
+from tests.actpc.envs import CountingEnv
+
+SMALL = {
+    "policy_kwargs": {"net_arch": [16, 16]},
+    "settling": "scheduled",
+    "learning_starts": 10,
+    "batch_size": 16,
+    "seed": 0,
+    "device": "cpu",
+}
+
+
+def demonstrations(n_episodes=3, length=20, env_id="CountingEnv", seed=0) -> Demonstrations:
+    rng = np.random.default_rng(seed)
+    n = n_episodes * length
+    observations = rng.normal(size=(n, 3))
+    return Demonstrations(
+        observations=observations,
+        actions=2 * np.tanh(observations[:, :2] - observations[:, 1:]),
+        next_observations=observations + 0.1 * rng.normal(size=(n, 3)),
+        rewards=(np.arange(n) % length == length - 1).astype(float),
+        terminations=np.zeros(n, dtype=bool),
+        episode_starts=np.arange(0, n, length),
+        env_id=env_id,
+    )
+
+
+def make(env=None, n_envs=1, **keywords) -> ActPC:
+    env = env or DummyVecEnv([CountingEnv for _ in range(n_envs)])
+    return ActPC("MlpPolicy", env, **{**SMALL, "prior_updates": 5, **keywords})
+
+
+def weights_of(circuit) -> list[th.Tensor]:
+    return [p.clone() for p in circuit.parameters()]
+
+
+def differ(one, other) -> bool:
+    return any(not th.equal(a, b) for a, b in zip(one, other, strict=True))
+
+
+def test_the_tiny_environment_is_valid():
+    check_env(CountingEnv())
+
+
+# ---------------------------------------------------------------------- signals and reward
+
+
+def test_the_critic_target_is_the_weighted_sum_of_the_three_parts_plus_the_bootstrap():
+    model = make(demonstrations=demonstrations(), alpha_ext=0.7, alpha_ep=0.5, alpha_in=0.25, combined_replay=False)
+    model.learn(60)
+    np.random.seed(1)
+    replayed = model.replay_buffer.sample(32)
+    assert replayed.epistemic.abs().min() > 0 and replayed.instrumental.max() < 0 and replayed.rewards.max() > 0
+    np.random.seed(1)
+    batch = model._sample_batch(32)
+    parts = 0.7 * replayed.rewards + 0.5 * replayed.epistemic + 0.25 * replayed.instrumental
+    assert th.allclose(batch.rewards, parts)
+    next_inputs = th.cat([batch.next_features, model.actor_target.project(batch.next_features)], dim=1)
+    bootstrap = model.gamma * (1 - batch.dones) * model.critic_target[0].project(next_inputs)
+    assert th.allclose(model._critic_targets(batch), parts + bootstrap, atol=1e-6)
+    assert batch.dones.max() == 1.0  # terminal transitions were in the batch: their targets are the reward alone
+
+
+@pytest.mark.parametrize("name", ["alpha_ep", "alpha_in", "alpha_ext"])
+def test_each_part_of_the_reward_reaches_the_critic_and_the_actor(name):
+    """An earlier agent of this family computed the epistemic term and never used it."""
+    learned = []
+    for weight in (0.0, 2.0):
+        model = make(demonstrations=demonstrations(), **{"alpha_ep": 0.0, "alpha_in": 0.0, "alpha_ext": 0.0, name: weight})
+        model.learn(80)
+        learned.append((weights_of(model.critic[0]), weights_of(model.actor.circuit)))
+    assert differ(learned[0][0], learned[1][0]) and differ(learned[0][1], learned[1][1])
+
+
+def test_signals_are_the_summed_squared_errors_over_a_maximum_that_starts_at_one():
+    model = make(demonstrations=demonstrations(), learning_starts=1000)
+    model.learn(30)
+    buffer, raws = model.replay_buffer, []
+    for row in range(30):
+        o, a, n = (th.as_tensor(x[row]) for x in (buffer.observations, buffer.actions, buffer.next_observations))
+        generator = model.generator.settle(th.cat([o, a], dim=1), n)
+        prior = model.prior.settle(o, n)
+        raws.append([float(sum(e.square().sum() for e in s.errors)) for s in (generator, prior)])
+    expected = np.array(raws) / np.maximum(1.0, np.maximum.accumulate(raws, axis=0))
+    assert np.allclose(buffer.epistemic[:30, 0], expected[:, 0], rtol=1e-4)
+    assert np.allclose(buffer.instrumental[:30, 0], -expected[:, 1], rtol=1e-4)
+
+
+def test_output_errors_alone_give_smaller_signals():
+    signals = []
+    for which in ("all", "output"):
+        model = make(signal_errors=which, signal_normalizer="saturating", learning_starts=1000)
+        model.learn(20)
+        signals.append(model.replay_buffer.epistemic[:20].copy())
+    assert (signals[1] < signals[0]).all()
+
+
+@pytest.mark.parametrize("normalizer", ["max", "saturating", "quantile"])
+def test_every_normalizer_keeps_signals_in_their_range(normalizer):
+    model = make(demonstrations=demonstrations(), signal_normalizer=normalizer)
+    model.learn(60)
+    assert 0 < model.replay_buffer.epistemic[:60].max() <= 1 and -1 <= model.replay_buffer.instrumental[:60].min() < 0
+
+
+def test_without_demonstrations_the_task_reward_takes_the_role_of_the_prior():
+    assert make().reward_weights == (1.0, 1.0, 0.0)
+    assert make(demonstrations=demonstrations()).reward_weights == (0.0, 1.0, 1.0)
+
+
+# ---------------------------------------------------------------------- actor, critic, targets
+
+
+@pytest.mark.parametrize("settling", ["iterative", "scheduled"])
+def test_the_actor_update_changes_the_actor_and_leaves_the_critic_bit_identical(settling):
+    model = make(settling=settling)
+    model.learn(40)
+    batch = model._sample_batch(16)
+    critic, actor = [v.clone() for v in model.critic.state_dict().values()], weights_of(model.actor.circuit)
+    model._update_actor(batch)
+    assert not differ(critic, list(model.critic.state_dict().values())) and differ(actor, weights_of(model.actor.circuit))
+
+
+def test_refresh_pulls_the_actor_towards_the_demonstrations():
+    data = demonstrations()
+    distance = {}
+    for weight in (0.0, 1.0):
+        model = make(demonstrations=data, refresh_weight=weight, actor_pressure=0.0, self_imitation_size=0)
+        before = weights_of(model.actor.circuit)
+        model.learn(400)
+        actions = model.actor.circuit.project(th.as_tensor(data.observations))
+        distance[weight] = float((actions - th.as_tensor(data.actions / 2)).square().mean())
+        assert differ(before, weights_of(model.actor.circuit)) == (weight > 0)
+    assert distance[1.0] < 0.8 * distance[0.0]
+
+
+def test_the_refresh_change_is_added_with_its_weight_in_one_optimiser_step():
+    """With plain SGD the step is lr * (pressure + weight * refresh): linear in the weight."""
+    steps = []
+    for weight in (0.0, 1.0, 2.0):
+        policy_kwargs = {"net_arch": [16, 16], "optimizer_class": th.optim.SGD}
+        model = make(demonstrations=demonstrations(), refresh_weight=weight, policy_kwargs=policy_kwargs, learning_starts=100)
+        model.learn(50)
+        np.random.seed(3)
+        batch = model._sample_batch(16)
+        np.random.seed(4)
+        before = weights_of(model.actor.circuit)
+        model._n_updates = 1
+        model._update_actor(batch)
+        steps.append([new - old for new, old in zip(weights_of(model.actor.circuit), before, strict=True)])
+    for none, once, twice in zip(*steps, strict=True):
+        assert th.allclose(twice - none, 2 * (once - none), atol=1e-7)
+
+
+def test_critic_warmup_keeps_the_pressure_off_the_actor():
+    model = make(critic_warmup=20)
+    model.learn(10)
+    before = weights_of(model.actor.circuit)
+    model.train(20, 16)
+    assert not differ(before, weights_of(model.actor.circuit))
+    model.train(1, 16)
+    assert differ(before, weights_of(model.actor.circuit))
+
+
+def test_scaled_pressure_is_divided_by_the_mean_absolute_action_value():
+    steps = []
+    for scale in (False, True):
+        policy_kwargs = {"net_arch": [16, 16], "optimizer_class": th.optim.SGD}
+        model = make(scale_pressure=scale, policy_kwargs=policy_kwargs, self_imitation_size=0, learning_starts=100)
+        model.learn(50)
+        np.random.seed(3)
+        batch = model._sample_batch(16)
+        before = weights_of(model.actor.circuit)
+        inputs = th.cat([batch.features, model.actor.circuit.project(batch.features)], dim=1)
+        value = model.critic[0].project(inputs).abs().mean()
+        model._n_updates = 1
+        model._update_actor(batch)
+        steps.append((value, [new - old for new, old in zip(weights_of(model.actor.circuit), before, strict=True)]))
+    value = steps[1][0]
+    for plain, scaled in zip(steps[0][1], steps[1][1], strict=True):
+        assert th.allclose(plain, scaled * value, rtol=1e-2, atol=1e-7)
+
+
+def test_soft_targets_move_by_tau_and_hard_ones_every_c_transitions():
+    model = make(tau=0.25, learning_starts=1000)
+    model.learn(20)
+    with th.no_grad():
+        for p in model.critic.parameters():
+            p.add_(1.0)
+    before = weights_of(model.critic_target)
+    model._update_targets(0.25)
+    for old, new, source in zip(before, weights_of(model.critic_target), weights_of(model.critic), strict=True):
+        assert th.allclose(new, 0.75 * old + 0.25 * source, atol=1e-6)
+    model = make(target_update="hard", target_update_interval=25, learning_starts=10)
+    model.learn(49)  # the copy of step 25 is in the target, the updates since are not
+    assert differ(weights_of(model.critic_target), weights_of(model.critic))
+    before = weights_of(model.critic_target)
+    model.learn(1, reset_num_timesteps=False)  # step 50: copied before its update
+    assert differ(before, weights_of(model.critic_target))
+
+
+def test_the_smallest_of_the_critics_bootstraps():
+    model = make(n_critics=3)
+    model.learn(40)
+    batch = model._sample_batch(16)
+    inputs = th.cat([batch.next_features, model.actor_target.project(batch.next_features)], dim=1)
+    smallest = th.stack([critic.project(inputs) for critic in model.critic_target]).min(0).values
+    expected = batch.rewards + (1 - batch.dones) * model.gamma * smallest
+    assert th.allclose(model._critic_targets(batch), expected)
+
+
+def test_the_literal_bootstrap_values_the_action_taken():
+    model = make(bootstrap="literal")
+    model.learn(40)
+    batch = model._sample_batch(16)
+    values = model.critic_target[0].project(th.cat([batch.next_features, batch.actions], dim=1))
+    assert th.allclose(model._critic_targets(batch), batch.rewards + (1 - batch.dones) * model.gamma * values)
+
+
+def test_target_smoothing_is_bounded_noise():
+    model = make(target_policy_noise=0.2, target_noise_clip=0.0)
+    model.learn(40)
+    batch = model._sample_batch(16)
+    quiet = model._critic_targets(batch)
+    model.target_noise_clip = 0.5
+    assert not th.allclose(quiet, model._critic_targets(batch))
+
+
+def test_the_prior_learns_from_the_demonstrations_and_then_stands_still():
+    model = make(demonstrations=demonstrations(), prior_updates=100)
+    untrained = weights_of(model.prior)
+    model.pretrain()
+    trained = weights_of(model.prior)
+    model.learn(40)
+    assert differ(untrained, trained) and not differ(trained, weights_of(model.prior))
+
+
+def test_actor_warm_start_imitates_before_any_step():
+    data = demonstrations()
+    cold, warm = make(demonstrations=data), make(demonstrations=data, actor_warm_start=300)
+    errors = []
+    for model in (cold, warm):
+        model.pretrain()
+        actions = model.actor.circuit.project(th.as_tensor(data.observations))
+        errors.append(float((actions - th.as_tensor(data.actions / 2)).square().mean()))
+        assert not differ(weights_of(model.actor_target), weights_of(model.actor.circuit))
+    assert errors[1] < 0.8 * errors[0]
+
+
+def test_demonstrations_fill_their_share_of_the_critic_batch():
+    data = demonstrations()
+    model = make(demonstrations=data, demonstration_fraction=0.5, alpha_ext=1.0)
+    model.learn(40)
+    batch = model._sample_batch(16)
+    rows = {tuple(row) for row in data.observations.tolist()}
+    assert [tuple(row) in rows for row in batch.features.tolist()] == [False] * 8 + [True] * 8
+    assert batch.n_replayed == 8 and batch.rewards.shape == (16, 1)
+
+
+def test_fewer_demonstrations_can_be_used():
+    data = demonstrations(n_episodes=3, length=20)
+    assert len(make(demonstrations=data, n_demonstrations=2).expert) == 40
+    assert len(make(demonstrations=data, n_demonstration_transitions=7).expert) == 7
+
+
+def test_observations_are_normalised_by_the_demonstrations_and_do_not_drift():
+    data = demonstrations()
+    model = make(demonstrations=data, observation_normalization="demonstrations")
+    features = model._features(th.as_tensor(data.observations))
+    assert th.allclose(features.mean(0), th.zeros(3), atol=1e-5) and th.allclose(features.std(0), th.ones(3), atol=1e-4)
+    model.learn(60)
+    assert th.equal(features, model._features(th.as_tensor(data.observations)))
+
+
+# ---------------------------------------------------------------------- working memory
+
+
+@pytest.mark.parametrize("dict_observations", [False, True])
+@pytest.mark.parametrize("n_envs", [1, 2])
+def test_rebuilt_memory_equals_the_one_at_collection_across_episode_ends_and_ring_wrap(n_envs, dict_observations, monkeypatch):
+    lengths = [(5 + i, 9, 3, 12) for i in range(n_envs)]
+    env = DummyVecEnv([lambda n=n: CountingEnv(lengths=n, dict_observations=dict_observations) for n in lengths])
+    policy = "MultiInputPolicy" if dict_observations else "MlpPolicy"
+    keywords = {**SMALL, "learning_starts": 1000, "buffer_size": 30 * n_envs}
+    model = ActPC(policy, env, **keywords, working_memory=True, memory_history=4)
+    seen = []
+    predict = type(model.actor).predict
+
+    def recording(self, observation, state=None, episode_start=None, deterministic=False):
+        shape = (n_envs, 4, self.features_extractor.features_dim)
+        past = np.zeros(shape, np.float32) if state is None else state[0].copy()
+        past[np.asarray(episode_start, dtype=bool)] = 0.0
+        seen.append(past)
+        return predict(self, observation, state, episode_start, deterministic)
+
+    monkeypatch.setattr(type(model.actor), "predict", recording)
+    steps = 77  # wraps a ring of 30 rows twice
+    model.learn(steps * n_envs)
+    buffer = model.replay_buffer
+    assert buffer.full and len(seen) == steps
+    for age in range(30 - 4):  # the oldest rows have lost their predecessors and are never sampled
+        row = (buffer.newest - age) % 30
+        rows, envs = np.full(n_envs, row), np.arange(n_envs)
+        rebuilt = buffer._history_at(rows, envs, None)
+        past = model._past_features(rebuilt["history"], rebuilt["history_mask"])
+        assert np.allclose(past.numpy(), seen[steps - 1 - age], atol=1e-6)
+    drawn = {int(r) for _ in range(50) for r in buffer._draw(16)[0]}
+    lost = {(buffer.pos + k) % 30 for k in range(4)}
+    assert drawn == set(range(30)) - lost
+
+
+def test_a_bare_predict_acts_with_an_empty_memory_and_warns_once():
+    model = make(working_memory=True)
+    obs = np.ones(3, np.float32)
+    with pytest.warns(UserWarning, match="working memory"):
+        first, state = model.predict(obs)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        again, _ = model.predict(obs)
+        carried, _ = model.predict(obs, state=state, episode_start=np.array([False]))
+        fresh, _ = model.predict(obs, state=state, episode_start=np.array([True]))
+    assert np.array_equal(first, again) and np.array_equal(first, fresh) and not np.array_equal(first, carried)
+
+
+def test_evaluate_policy_carries_the_memory():
+    model = make(working_memory=True)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        evaluate_policy(model, DummyVecEnv([CountingEnv]), n_eval_episodes=2, warn=False)
+
+
+# ---------------------------------------------------------------------- safety
+
+
+@pytest.mark.parametrize("settling", ["iterative", "scheduled"])
+def test_learning_never_backpropagates(settling, monkeypatch):
+    def refuse(*args, **keywords):
+        raise AssertionError("autograd was used")
+
+    for owner, name in ((th.Tensor, "backward"), (th.autograd, "backward"), (th.autograd, "grad")):
+        monkeypatch.setattr(owner, name, refuse)
+    model = make(
+        n_envs=2,
+        settling=settling,
+        demonstrations=demonstrations(),
+        demonstration_fraction=0.25,
+        actor_warm_start=3,
+        observation_normalization="demonstrations",
+        alpha_ext=1.0,
+        n_critics=2,
+        target_policy_noise=0.2,
+        scale_pressure=True,
+        working_memory=True,
+        action_noise=NormalActionNoise(np.zeros(2), 0.1 * np.ones(2)),
+        circuit_kwargs={"synaptic_scaling": "column_norm", "weight_bound": 2.0},
+    )
+    assert not any(p.requires_grad for p in model.policy.parameters())
+    before = weights_of(model.policy)
+    model.learn(60)
+    assert differ(before, weights_of(model.policy))
+    assert not any(p.requires_grad for p in model.policy.parameters())
+
+
+@pytest.mark.parametrize("circuit", ["actor", "critic.0", "generator", "prior"])
+def test_a_synapse_that_is_not_finite_is_named_with_its_circuit_and_step(circuit):
+    model = make(demonstrations=demonstrations())
+    model.learn(40)
+    dict(model.policy.named_circuits())[circuit].weights[0][0, 0] = float("nan")
+    with pytest.raises(ValueError, match=rf"{circuit}: synapses are not finite at step 40"):
+        model.train(100, 16)
+
+
+@pytest.mark.parametrize("field", ["observations", "rewards"])
+def test_an_environment_that_is_not_finite_is_named_with_its_step(field):
+    class Broken(CountingEnv):
+        def step(self, action):
+            obs, reward, *rest = super().step(action)
+            if self.episode == 2:
+                obs, reward = (obs * np.nan, reward) if field == "observations" else (obs, np.inf)
+            return obs, reward, *rest
+
+    with pytest.raises(ValueError, match=rf"environment: {field} are not finite at step 15"):
+        make(DummyVecEnv([Broken])).learn(100)
+
+
+def test_discrete_actions_and_images_get_one_clear_line():
+    with pytest.raises(AssertionError, match="only supports"):
+        ActPC("MlpPolicy", "CartPole-v1")
+    space = gym.spaces.Box(0, 255, (36, 36, 3), np.uint8)
+
+    class Images(CountingEnv):
+        def __init__(self):
+            super().__init__()
+            self.observation_space = space
+
+        def _observation(self):
+            return np.zeros((36, 36, 3), np.uint8)
+
+    with pytest.raises(ValueError, match="are images: ActPC learns no convolutions"):
+        ActPC("MlpPolicy", Images())
+
+
+@pytest.mark.parametrize(
+    ("keywords", "named"),
+    [
+        ({"bootstrap": "both"}, "bootstrap='both'"),
+        ({"signal_normalizer": "mean"}, "signal_normalizer='mean'"),
+        ({"target_update": "never"}, "target_update='never'"),
+        ({"demonstration_fraction": 1.5}, "demonstration_fraction=1.5"),
+        ({"refresh_weight": -1.0}, "refresh_weight=-1.0"),
+        ({"n_critics": 0}, "n_critics=0"),
+        ({"nudge": 0.0}, "nudge=0.0"),
+        ({"actor_warm_start": 10}, "need demonstrations="),
+        ({"settling": "fast"}, "settling='fast'"),
+        ({"circuit_kwargs": {"activation": "gelu"}}, "activation='gelu'"),
+    ],
+)
+def test_a_wrong_keyword_is_named(keywords, named):
+    with pytest.raises(ValueError, match=named):
+        make(**keywords)
+
+
+def test_demonstrations_of_another_task_are_refused():
+    with pytest.raises(ValueError, match="actions"):
+        ActPC("MlpPolicy", "Pendulum-v1", demonstrations=demonstrations(env_id="Pendulum-v1"))
+    with pytest.raises(ValueError, match="env_id"):
+        ActPC("MlpPolicy", "Pendulum-v1", demonstrations=demonstrations())
+
+
+# ---------------------------------------------------------------------- saving, determinism
+
+
+@pytest.mark.parametrize("keywords", [{"settling": "iterative"}, {"n_envs": 1}, {"working_memory": True, "n_critics": 2}])
+def test_save_and_load_predict_the_same_and_training_goes_on(keywords, tmp_path):
+    model = make(demonstrations=demonstrations(), **keywords).learn(40)
+    model.save(tmp_path / "agent")
+    model.save_replay_buffer(tmp_path / "replay")
+    loaded = ActPC.load(tmp_path / "agent", env=DummyVecEnv([CountingEnv]))
+    obs = np.random.default_rng(0).normal(size=(5, 3)).astype(np.float32)
+    state = model.predict(obs, episode_start=np.ones(5))[1]
+    assert np.array_equal(model.predict(obs, state)[0], loaded.predict(obs, state)[0])
+    assert loaded.reward_weights == model.reward_weights and loaded.pretrained
+    loaded.load_replay_buffer(tmp_path / "replay")
+    loaded.learn(20, reset_num_timesteps=False)
+    assert loaded.num_timesteps == 60 and loaded._n_updates > model._n_updates
+
+
+@pytest.mark.parametrize("settling", ["iterative", "scheduled"])
+def test_two_seeded_runs_are_bit_identical(settling):
+    runs = [make(settling=settling, demonstrations=demonstrations(), alpha_ext=1.0).learn(80) for _ in range(2)]
+    assert not differ(weights_of(runs[0].policy), weights_of(runs[1].policy))
+
+
+def test_learning_rates_of_circuits_and_error_synapses_follow_the_schedule():
+    model = make(settling="iterative", learning_rate=lambda left: 1e-3 * left, actor_kwargs={"learning_rate": 5e-3})
+    model.learn(30)
+    model._current_progress_remaining = 0.5
+    model.train(1, 16)
+    actor, critic = ([g["lr"] for g in c.optimizer.param_groups] for _, c in model.policy.named_circuits()[:2])
+    assert actor == pytest.approx([2.5e-3, 0.9 * 2.5e-3]) and critic == pytest.approx([0.5e-3, 0.45e-3])
+
+
+def test_vec_normalize_relabels_the_task_reward_alone():
+    env = VecNormalize(DummyVecEnv([CountingEnv]))
+    model = make(env, demonstrations=demonstrations(), demonstration_fraction=0.25, alpha_ext=1.0, working_memory=True)
+    model.learn(60)
+    np.random.seed(0)
+    raw = model.replay_buffer.sample(32)
+    np.random.seed(0)
+    normalised = model.replay_buffer.sample(32, env=env)
+    assert th.equal(raw.epistemic, normalised.epistemic) and th.equal(raw.instrumental, normalised.instrumental)
+    assert not th.equal(raw.rewards, normalised.rewards)

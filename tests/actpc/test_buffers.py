@@ -1,0 +1,144 @@
+"""Replay: combined experience replay, signals kept apart, self-imitation, n-step sums, memory."""
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
+
+from sb3_actpc.common.buffers import CombinedReplayBuffer, combined_buffer_class
+from sb3_actpc.common.episodes import Episodes, SelfImitationMemory, sample_union
+
+SPACES = (spaces.Box(-1, 1, (2,), np.float64), spaces.Box(-1, 1, (1,), np.float32))
+
+
+def fill(buffer, steps, n_envs, done_every=7, rng=None):
+    rng = rng or np.random.default_rng(0)
+    for step in range(steps):
+        obs = np.full((n_envs, 2), step) + np.arange(n_envs)[:, None] / 10
+        done = np.array([(step + env) % done_every == done_every - 1 for env in range(n_envs)])
+        infos = [{"TimeLimit.truncated": bool(d and rng.random() < 0.5)} for d in done]
+        buffer.add(obs, obs + 1, rng.uniform(-1, 1, (n_envs, 1)), rng.normal(size=n_envs), done, infos)
+
+
+@pytest.mark.parametrize("steps", [3, 49, 50, 61])
+@pytest.mark.parametrize("n_envs", [1, 3])
+def test_every_batch_holds_the_newest_transition_of_every_environment(n_envs, steps):
+    buffer = CombinedReplayBuffer(50 * n_envs, *SPACES, n_envs=n_envs, device="cpu")
+    fill(buffer, steps, n_envs)
+    for _ in range(5):
+        batch = buffer.sample(8)
+        expected = np.full((n_envs, 2), steps - 1) + np.arange(n_envs)[:, None] / 10
+        assert np.allclose(batch.observations[:n_envs].numpy(), expected)
+        assert len(batch.observations) == 8
+
+
+def test_without_combined_replay_the_newest_is_not_singled_out():
+    buffer = CombinedReplayBuffer(1000, *SPACES, combined=False, device="cpu")
+    fill(buffer, 1000, 1)
+    assert np.mean([float(buffer.sample(1).observations[0, 0]) == 999 for _ in range(200)]) < 0.1
+
+
+def test_sampling_is_uniform():
+    buffer = CombinedReplayBuffer(20, *SPACES, combined=False, device="cpu")
+    fill(buffer, 33, 1)
+    seen = np.concatenate([buffer.sample(100).observations[:, 0].numpy() for _ in range(100)]).round().astype(int)
+    counts = np.bincount(seen)[13:]
+    assert len(counts) == 20 and counts.min() > 400 and counts.max() < 600
+
+
+@pytest.mark.parametrize("n_envs", [1, 2])
+@pytest.mark.parametrize("steps", [30, 75])
+def test_n_step_sums_equal_sb3s(n_envs, steps):
+    ours = CombinedReplayBuffer(40 * n_envs, *SPACES, n_envs=n_envs, n_steps=3, gamma=0.9, device="cpu")
+    theirs = NStepReplayBuffer(40 * n_envs, *SPACES, n_envs=n_envs, n_steps=3, gamma=0.9, device="cpu")
+    for buffer in (ours, theirs):
+        fill(buffer, steps, n_envs, rng=np.random.default_rng(1))
+    rows = np.arange(min(steps, 40))
+    for env in range(n_envs):
+        one = ours._gather(rows, np.full(len(rows), env), None)
+        np.random.seed(0)
+        original, np.random.randint = np.random.randint, lambda *a, size, e=env, **k: np.full(size, e)
+        try:
+            other = theirs._get_samples(rows)
+        finally:
+            np.random.randint = original
+        for field in ("observations", "actions", "next_observations", "dones", "rewards", "discounts"):
+            assert np.allclose(getattr(one, field), getattr(other, field), atol=1e-6), field
+
+
+def test_signals_are_summed_over_the_n_step_window_like_rewards():
+    buffer = CombinedReplayBuffer(40, *SPACES, n_steps=3, gamma=0.9, device="cpu")
+    for step in range(12):
+        fill(buffer, 1, 1, done_every=100)
+        buffer.set_newest_signals(np.array([step]), np.array([-step]))
+    batch = buffer._gather(np.array([2, 10]), np.zeros(2, int), None)
+    assert np.allclose(batch.epistemic.ravel(), [2 + 0.9 * 3 + 0.81 * 4, 10 + 0.9 * 11])
+    assert np.allclose(batch.instrumental, -batch.epistemic)
+
+
+def test_memory_stays_near_sb3s():
+    """A million HalfCheetah transitions take at most 1.2 times SB3's memory (counted at a hundredth of the size)."""
+    pair = spaces.Box(-np.inf, np.inf, (17,), np.float64), spaces.Box(-1, 1, (6,), np.float32)
+    size = [
+        sum(value.nbytes for value in vars(kind(10_000, *pair, device="cpu")).values() if isinstance(value, np.ndarray))
+        for kind in (CombinedReplayBuffer, ReplayBuffer)
+    ]
+    assert size[0] <= 1.2 * size[1]
+
+
+def test_an_unknown_buffer_class_is_named():
+    class Mine(ReplayBuffer):
+        pass
+
+    with pytest.raises(ValueError, match="Mine does not keep"):
+        combined_buffer_class(Mine, SPACES[0])
+
+
+# ---------------------------------------------------------------------- self-imitation
+
+
+def offer(memory, length, episode_return):
+    return memory.offer(np.full((length, 2), episode_return), np.zeros((length, 1)), episode_return)
+
+
+def test_an_episode_enters_when_its_return_is_positive_and_at_least_the_best():
+    memory = SelfImitationMemory(100)
+    assert not offer(memory, 5, 0.0)
+    assert not offer(memory, 5, -1.0)
+    assert offer(memory, 5, 2.0)
+    assert not offer(memory, 5, 1.0)
+    assert offer(memory, 5, 2.0)
+    assert offer(memory, 5, 3.0)
+    assert list(memory.returns) == [2.0, 2.0, 3.0] and memory.best_return == 3.0 and len(memory) == 15
+
+
+def test_the_oldest_episodes_leave_when_the_memory_is_full():
+    memory = SelfImitationMemory(12)
+    for episode_return in (1.0, 2.0, 3.0):
+        offer(memory, 5, episode_return)
+    assert list(memory.returns) == [2.0, 3.0]
+    assert set(memory.episodes.observations[:, 0]) == {2.0, 3.0}
+    assert not offer(memory, 13, 9.0)
+
+
+def test_the_replay_buffer_offers_whole_episodes_of_every_environment():
+    buffer = CombinedReplayBuffer(100, *SPACES, n_envs=2, self_imitation_size=50, device="cpu")
+    for step in range(6):
+        done = np.array([step == 5, step == 3])
+        obs = np.full((2, 2), step) + np.array([[0.0], [0.5]])
+        buffer.add(obs, obs, np.zeros((2, 1)), np.array([0.0, float(step == 3)]), done, [{}, {}])
+    episodes = buffer.self_imitation.episodes
+    assert np.array_equal(episodes.observations[:, 0], [0.5, 1.5, 2.5, 3.5]) and len(buffer.self_imitation) == 4
+
+
+def test_the_union_is_drawn_uniformly():
+    parts = [Episodes(np.full((n, 1), value), np.zeros((n, 1)), np.zeros(n, int)) for n, value in ((30, 0.0), (10, 1.0))]
+    share = np.mean([sample_union(parts, 100).observations.mean() for _ in range(200)])
+    assert share == pytest.approx(0.25, abs=0.02)
+
+
+def test_episode_history_stops_at_the_start_of_the_episode():
+    episodes = Episodes(np.arange(6.0)[:, None], np.zeros((6, 1)), np.array([0, 0, 0, 3, 3, 3]))
+    rows = episodes.take(np.array([1, 4, 3]), history=2)
+    assert np.array_equal(rows.history_mask, [[0, 1], [0, 1], [0, 0]])
+    assert np.array_equal(rows.history[0, 1], [0.0]) and np.array_equal(rows.history[1, 1], [3.0])

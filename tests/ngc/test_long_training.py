@@ -1,0 +1,104 @@
+"""What 20,000 updates do to a circuit: settling must stay stable and the coupled pair must keep its direction (slow)."""
+
+from itertools import pairwise
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+
+from sb3_actpc.ngc import NGCCircuit, settle_coupled
+from tests.ngc import oracle
+
+N_UPDATES = 20_000
+ADAM = {"fused": True}
+
+
+@pytest.fixture(scope="module")
+def transitions() -> dict[str, th.Tensor]:
+    """10,000 unnormalised HalfCheetah transitions under smooth random actions; velocities reach ±20."""
+    env, rng = gym.make("HalfCheetah-v5"), np.random.default_rng(0)
+    rows: dict[str, list] = {"o": [], "a": [], "r": [], "n": []}
+    observation, _ = env.reset(seed=0)
+    action = np.zeros(6)
+    for _ in range(10_000):
+        action = 0.8 * action + 0.5 * rng.normal(size=6)
+        clipped = np.clip(action, -1, 1).astype(np.float32)
+        following, reward, _, over, _ = env.step(clipped)
+        for key, value in zip("oarn", (observation, clipped, [reward], following), strict=True):
+            rows[key].append(value)
+        observation = env.reset()[0] if over else following
+    return {key: th.as_tensor(np.array(values), dtype=th.float32) for key, values in rows.items()}
+
+
+def batch_of(transitions, n=256):
+    index = th.randint(0, len(transitions["o"]), (n,))
+    return (transitions[key][index] for key in "oarn")
+
+
+def energies_while_settling(circuit, x, target):
+    steps = circuit.n_settling_steps
+    energies = []
+    for k in range(1, steps + 1):
+        circuit.n_settling_steps = k
+        energies.append(float(circuit.energy(circuit.settle(x, target)).mean()))
+    circuit.n_settling_steps = steps
+    return energies
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("dynamics", ["error", "state"])
+def test_energy_still_falls_after_20k_updates_on_unnormalised_transitions(transitions, dynamics):
+    """A fixed rate of 0.1, fine at the start, blows up here (checked at the end)."""
+    circuit = NGCCircuit(23, 17, feedback="tied", dynamics=dynamics)
+    optimizer = th.optim.Adam(circuit.parameter_groups(4e-4), **ADAM)
+    for update in range(N_UPDATES + 1):
+        o, a, _, n = batch_of(transitions)
+        x = th.cat([o, a], dim=1)
+        if update % 5000 == 0:
+            start = float(0.5 * (n - circuit.project(x)).square().sum(1).mean())
+            energies = [start, *energies_while_settling(circuit, x, n)]
+            norms = [round(float(th.linalg.matrix_norm(w, 2)), 1) for w in circuit.weights]
+            print(f"{update} updates: rates {circuit.rates.tolist()}, ||W|| {norms}")
+            print(f"    energy {energies[0]:.3f} -> {energies[-1]:.3f}")
+            assert all(new <= old for old, new in pairwise(energies))
+        circuit.apply_changes(circuit.hebbian_update(circuit.settle(x, n)), optimizer)
+    assert energies[-1] < 0.8 * energies[0]
+    circuit._keep_rates = False
+    circuit.rates.fill_(0.1)
+    blown = energies_while_settling(circuit, x, n)
+    print(f"at the fixed rate 0.1: {energies[0]:.3f} -> {blown[-1]:.3f}")
+    assert blown[-1] > energies[-1]
+
+
+def policy_gradient(actor, critic, x):
+    weights, biases = oracle.synapses(actor)
+    action = oracle.forward(actor, weights, biases, x)
+    oracle.forward(critic, *oracle.synapses(critic, False), th.cat([x, action], dim=1)).mean(1).mean().backward()
+    return [w.grad for w in weights]
+
+
+def alignment(actor, critic, x):
+    changes = actor.hebbian_update(settle_coupled(actor, critic, x).actor).weights
+    gradients = policy_gradient(actor, critic, x)
+    cosines = [oracle.cosine(c, g) for c, g in zip(changes, gradients, strict=True)]
+    return cosines, [float(c.norm() / g.norm()) for c, g in zip(changes, gradients, strict=True)]
+
+
+@pytest.mark.slow
+def test_the_coupled_pair_follows_the_policy_gradient_at_the_start_and_after_20k_updates(transitions):
+    """Default iterative settings (tied feedback): cosine at least 0.9 in every layer at the start, 0.7 at the end."""
+    actor = NGCCircuit(17, 6, output_activation="tanh", feedback="tied")
+    critic = NGCCircuit(23, 6, feedback="tied", n_feedback_inputs=6)
+    optimizers = [th.optim.Adam(circuit.parameter_groups(4e-4), **ADAM) for circuit in (actor, critic)]
+    for update in range(N_UPDATES + 1):
+        o, a, r, n = batch_of(transitions)
+        if update % 5000 == 0:
+            cosines, ratios = alignment(actor, critic, o)
+            print(f"{update} updates: cosine {np.round(cosines, 3)}, norm ratio {np.round(ratios, 3)}")
+            assert min(cosines) > (0.9 if update == 0 else 0.7)
+        changes = actor.hebbian_update(settle_coupled(actor, critic, o).actor)
+        actor.apply_changes(changes, optimizers[0])
+        target = r + 0.9 * critic.project(th.cat([n, actor.project(n)], dim=1))
+        state = critic.settle(th.cat([o, a], dim=1), target)
+        critic.apply_changes(critic.hebbian_update(state), optimizers[1])
