@@ -3,7 +3,7 @@
 from collections.abc import Iterable
 from functools import reduce
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch as th
@@ -16,13 +16,14 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 
 from sb3_actpc.actpc.diagnostics import Diagnostics
+from sb3_actpc.actpc.expert import Expert
+from sb3_actpc.actpc.inputs import Batch, CircuitInputs
 from sb3_actpc.actpc.policies import ActPCActor, ActPCPolicy, Critics, MlpPolicy, MultiInputPolicy
 from sb3_actpc.actpc.signals import SIGNAL_ERRORS, make_normalizer, summed_squared_errors
 from sb3_actpc.common.buffers import _SignalReplay, combined_buffer_class
 from sb3_actpc.common.checks import check_choices, check_finite, check_numbers
 from sb3_actpc.common.demonstrations import Demonstrations, resolve
 from sb3_actpc.common.episodes import Episodes, map_observations, sample_union
-from sb3_actpc.common.type_aliases import ImitationSamples, TensorObservations
 from sb3_actpc.ngc import HebbianChanges, NGCCircuit, settle_coupled
 
 SelfActPC = TypeVar("SelfActPC", bound="ActPC")
@@ -31,32 +32,6 @@ BOOTSTRAPS = ("joint", "literal")
 TARGET_UPDATES = ("polyak", "hard")
 OBSERVATION_NORMALIZATIONS = ("none", "demonstrations")
 EXPERT_SIGNALS_INTERVAL = 1000  # updates between two evaluations of the demonstrations' signals
-
-
-class Batch(NamedTuple):
-    """
-    Transitions as the circuits see them, B rows, the newest first, demonstrations (if mixed in) last.
-
-    :param features: normalised observations, (B, n_features)
-    :param actions: (B, A), in [-1, 1]
-    :param next_features: (B, n_features)
-    :param memory: m_t, (B, n_memory), or None
-    :param next_memory: m_{t+1}, (B, n_memory), or None
-    :param rewards: the combined reward r_t, (B, 1)
-    :param dones: (B, 1)
-    :param discounts: (B, 1), or the number γ
-    :param n_replayed: how many rows come from the replay buffer
-    """
-
-    features: th.Tensor
-    actions: th.Tensor
-    next_features: th.Tensor
-    memory: th.Tensor | None
-    next_memory: th.Tensor | None
-    rewards: th.Tensor
-    dones: th.Tensor
-    discounts: th.Tensor | float
-    n_replayed: int
 
 
 class ActPC(OffPolicyAlgorithm):
@@ -332,7 +307,7 @@ class ActPC(OffPolicyAlgorithm):
 
     def _setup_demonstrations(self) -> None:
         """Check the demonstrations against the environment, cut them, and derive what follows from having them."""
-        self.expert: Episodes | None = None
+        self.expert: Expert | None = None
         if self.demonstrations is None:
             if self.demonstration_fraction or self.actor_warm_start or self.observation_normalization == "demonstrations":
                 raise ValueError(
@@ -343,12 +318,15 @@ class ActPC(OffPolicyAlgorithm):
         demonstrations = resolve(self.demonstrations).select(self.n_demonstrations, self.n_demonstration_transitions)
         demonstrations.check(self.observation_space, self.action_space, self._env_id())
         assert isinstance(self.action_space, spaces.Box)
-        self.expert = Episodes.from_demonstrations(demonstrations, self.observation_space, self.action_space)
-        self._expert_transitions = demonstrations
+        self.expert = Expert(demonstrations, self.observation_space, self.action_space, self.history)
         if self.observation_normalization == "demonstrations" and not self.pretrained:
-            features = self._features(self._to_tensors(self.expert.observations))
-            self.actor.normalizer.fit(features)
-        self._expert_signals = np.zeros((2, len(self.expert)), dtype=np.float32)
+            observations = self.inputs.observations(self.expert.episodes.observations)
+            self.actor.normalizer.fit(self.inputs.features(observations))
+
+    @property
+    def inputs(self) -> CircuitInputs:
+        """Turns observations into what the circuits see."""
+        return CircuitInputs(self.actor, self._vec_normalize_env)
 
     def _env_id(self) -> str | None:
         if self.env is None or not self.env.has_attr("spec"):
@@ -389,7 +367,7 @@ class ActPC(OffPolicyAlgorithm):
         """Train the prior (and, if asked for, the actor) on the demonstrations, once; ``learn`` calls this."""
         if self.pretrained or self.expert is None:
             return
-        for _ in range(self.prior_updates):
+        for _ in range(self.prior_updates if self.alpha_in else 0):  # without a weight the prior has no role
             self._update_prior(self.policy.batch_size_of("prior", self.batch_size))
         for _ in range(self.actor_warm_start):
             self.actor.circuit.apply_changes(self._refresh_changes(), self.actor.circuit.optimizer)
@@ -397,9 +375,9 @@ class ActPC(OffPolicyAlgorithm):
         self.pretrained = True
 
     def _update_prior(self, batch_size: int) -> None:
-        rows = np.random.randint(0, len(self._expert_transitions), size=batch_size)
-        features, _, next_features, memory, _ = self._expert_rows(rows)
-        state = self.prior.settle(features, next_features, memory)
+        assert self.expert is not None
+        batch = self.expert.sample(batch_size, self.inputs, self.reward_weights, self.gamma)
+        state = self.prior.settle(batch.features, batch.next_features, batch.memory)
         self.prior.apply_changes(self.prior.hebbian_update(state), self.prior.optimizer)
 
     # ------------------------------------------------------------------ collecting
@@ -441,8 +419,8 @@ class ActPC(OffPolicyAlgorithm):
             return
         assert self.replay_buffer is not None
         newest = self.replay_buffer.newest_transitions(self._vec_normalize_env)
-        features, next_features = self._features(newest.observations), self._features(newest.next_observations)
-        memory = self._memory(newest.history, newest.history_mask)
+        features, next_features = map(self.inputs.features, (newest.observations, newest.next_observations))
+        memory, _ = self.inputs.memories(newest.history, newest.history_mask, features)
         raw_ep, raw_in = self._raw_signals(features, newest.actions, next_features, memory)
         epistemic = self.epistemic_normalizer(raw_ep) if alpha_ep else raw_ep
         instrumental = -self.instrumental_normalizer(raw_in) if alpha_in else raw_in
@@ -499,24 +477,27 @@ class ActPC(OffPolicyAlgorithm):
         assert self.replay_buffer is not None
         n_expert = round(self.demonstration_fraction * batch_size) if self.expert is not None else 0
         replayed = self.replay_buffer.sample(batch_size - n_expert, env=self._vec_normalize_env)
-        features = self._features(replayed.observations)
-        weights = self.reward_weights
-        rewards = weights[0] * replayed.rewards + weights[1] * replayed.epistemic + weights[2] * replayed.instrumental
-        memory = self._memory(replayed.history, replayed.history_mask)
-        batch = Batch(
-            features,
-            replayed.actions,
-            self._features(replayed.next_observations),
-            memory,
-            self._next_memory(replayed.history, replayed.history_mask, features),
-            rewards,
-            replayed.dones,
-            self.gamma if replayed.discounts is None else replayed.discounts,
-            len(features),
-        )
-        internal = rewards - weights[0] * replayed.rewards
+        inputs, weights = self.inputs, self.reward_weights
+        features = inputs.features(replayed.observations)
+        memory, next_memory = inputs.memories(replayed.history, replayed.history_mask, features)
+        internal = weights[1] * replayed.epistemic + weights[2] * replayed.instrumental
         self.diagnostics.follow(internal_reward=internal.mean, task_reward=replayed.rewards.mean)
-        return self._with_expert(batch, n_expert) if n_expert else batch
+        batch = Batch(
+            features=features,
+            actions=replayed.actions,
+            next_features=inputs.features(replayed.next_observations),
+            memory=memory,
+            next_memory=next_memory,
+            rewards=weights[0] * replayed.rewards + internal,
+            dones=replayed.dones,
+            discounts=th.full_like(replayed.dones, self.gamma) if replayed.discounts is None else replayed.discounts,
+        )
+        if not n_expert or self.expert is None:
+            return batch
+        if self._n_updates % EXPERT_SIGNALS_INTERVAL == 1 and any(weights[1:]):
+            normalizers = self.epistemic_normalizer, self.instrumental_normalizer
+            self.expert.refresh_signals(self._raw_signals, inputs, *normalizers)
+        return batch.join(self.expert.sample(n_expert, inputs, weights, self.gamma))
 
     def _update_actor(self, batch: Batch) -> None:
         """Motor-action circuit: pressure of the critic (line 17) plus refresh (line 23), in one step of the optimiser."""
@@ -562,7 +543,8 @@ class ActPC(OffPolicyAlgorithm):
         """World model: settle on the next observation (line 21). Without weight in the reward it has no role."""
         if not self.alpha_ep:
             return
-        rows = slice(min(batch.n_replayed, self.policy.batch_size_of("generator", batch.n_replayed)))
+        n_replayed = len(batch.features) - round(self.demonstration_fraction * len(batch.features))
+        rows = slice(min(n_replayed, self.policy.batch_size_of("generator", n_replayed)))
         inputs = th.cat([batch.features[rows], batch.actions[rows]], dim=1)
         state = self.generator.settle(inputs, batch.next_features[rows], None if batch.memory is None else batch.memory[rows])
         self.generator.apply_changes(self.generator.hebbian_update(state), self.generator.optimizer)
@@ -589,114 +571,19 @@ class ActPC(OffPolicyAlgorithm):
         assert self.replay_buffer is not None
         memory = self.replay_buffer.self_imitation
         own = [memory.episodes] if memory is not None and len(memory) else []
-        return own if self.expert is None else [self.expert, *own]
+        return own if self.expert is None else [self.expert.episodes, *own]
 
     def _refresh_changes(self) -> HebbianChanges:
         """Settle the actor on imitated actions."""
-        samples: ImitationSamples = sample_union(
-            self._imitated(), self.policy.batch_size_of("actor", self.batch_size), self.history
-        )
-        features = self._features(self._to_tensors(samples.observations))
-        mask = None if samples.history_mask is None else self._tensor(samples.history_mask)
-        memory = self._memory(None if samples.history is None else self._to_tensors(samples.history, batch_dims=2), mask)
-        state = self.actor.circuit.settle(features, self._tensor(samples.actions), memory)
+        inputs, n = self.inputs, self.policy.batch_size_of("actor", self.batch_size)
+        samples = sample_union(self._imitated(), n, self.history)
+        features = inputs.features(inputs.observations(samples.observations))
+        history = None if samples.history is None else inputs.observations(samples.history, batch_dims=2)
+        mask = None if samples.history_mask is None else inputs.tensor(samples.history_mask)
+        memory, _ = inputs.memories(history, mask, features)
+        state = self.actor.circuit.settle(features, inputs.tensor(samples.actions), memory)
         self.diagnostics.settled("actor", state)
         return self.actor.circuit.hebbian_update(state)
-
-    def _expert_rows(
-        self, rows: np.ndarray
-    ) -> tuple[th.Tensor, th.Tensor, th.Tensor, th.Tensor | None, th.Tensor | None]:
-        """Demonstrated transitions as the circuits see them: features, actions, next features, memory, next memory."""
-        assert self.expert is not None
-        samples = self.expert.take(rows, self.history)
-        features = self._features(self._to_tensors(samples.observations))
-        following = Episodes.from_next_observations(self._expert_transitions, rows, self.observation_space)
-        history = None if samples.history is None else self._to_tensors(samples.history, batch_dims=2)
-        mask = None if samples.history_mask is None else self._tensor(samples.history_mask)
-        return (
-            features,
-            self._tensor(samples.actions),
-            self._features(self._to_tensors(following)),
-            self._memory(history, mask),
-            self._next_memory(history, mask, features),
-        )
-
-    def _with_expert(self, batch: Batch, n: int) -> Batch:
-        """Add ``n`` demonstrated transitions, with their signals as last computed, to the batch."""
-        if self._n_updates % EXPERT_SIGNALS_INTERVAL == 1:
-            self._refresh_expert_signals()
-        rows = np.random.randint(0, len(self._expert_transitions), size=n)
-        features, actions, next_features, memory, next_memory = self._expert_rows(rows)
-        weights, source = self.reward_weights, self._expert_transitions
-        task = source.rewards[rows]
-        if self._vec_normalize_env is not None:
-            task = self._vec_normalize_env.normalize_reward(task)
-        rewards = weights[0] * task + weights[1] * self._expert_signals[0, rows] + weights[2] * self._expert_signals[1, rows]
-        discounts = batch.discounts
-        if isinstance(discounts, th.Tensor):
-            discounts = th.cat([discounts, discounts.new_full((n, 1), self.gamma)])
-        return Batch(
-            th.cat([batch.features, features]),
-            th.cat([batch.actions, actions]),
-            th.cat([batch.next_features, next_features]),
-            None if batch.memory is None or memory is None else th.cat([batch.memory, memory]),
-            None if batch.next_memory is None or next_memory is None else th.cat([batch.next_memory, next_memory]),
-            th.cat([batch.rewards, self._tensor(rewards)[:, None]]),
-            th.cat([batch.dones, self._tensor(source.terminations[rows].astype(np.float32))[:, None]]),
-            discounts,
-            batch.n_replayed,
-        )
-
-    def _refresh_expert_signals(self) -> None:
-        """Signals of all demonstrated transitions under the present generator (the normalisers do not move)."""
-        _, alpha_ep, alpha_in = self.reward_weights
-        if not (alpha_ep or alpha_in):
-            return
-        for start in range(0, len(self._expert_transitions), 1024):
-            rows = np.arange(start, min(start + 1024, len(self._expert_transitions)))
-            features, actions, next_features, memory, _ = self._expert_rows(rows)
-            raw_ep, raw_in = self._raw_signals(features, actions, next_features, memory)
-            self._expert_signals[0, rows] = self.epistemic_normalizer.rescale(raw_ep) if alpha_ep else 0.0
-            self._expert_signals[1, rows] = -self.instrumental_normalizer.rescale(raw_in) if alpha_in else 0.0
-
-    # ------------------------------------------------------------------ tensors
-
-    def _tensor(self, array: np.ndarray) -> th.Tensor:
-        return th.as_tensor(array, dtype=th.float32, device=self.device)
-
-    def _to_tensors(self, observations: Any, batch_dims: int = 1) -> TensorObservations:
-        """Observations of episodes (numpy, as the environment gave them), normalised like the replay buffer's."""
-        if self._vec_normalize_env is not None:
-            shape = next(iter(observations.values())).shape if isinstance(observations, dict) else observations.shape
-            lead = shape[:batch_dims]
-            flat = map_observations(lambda array: array.reshape(-1, *array.shape[batch_dims:]), observations)
-            normalized = self._vec_normalize_env.normalize_obs(flat)
-            observations = map_observations(lambda array: array.reshape(*lead, *array.shape[1:]), normalized)
-        return map_observations(lambda array: th.as_tensor(array, device=self.device), observations)
-
-    def _features(self, observations: TensorObservations) -> th.Tensor:
-        """What the circuits see of a batch of observations, (B, n_features)."""
-        return self.actor.features(observations)
-
-    def _memory(self, history: TensorObservations | None, mask: th.Tensor | None) -> th.Tensor | None:
-        """m_t from the observations before each row, (B, n_memory); None without a working memory."""
-        past = self._past_features(history, mask)
-        return None if past is None or self.actor.memory is None else self.actor.memory(past)
-
-    def _next_memory(
-        self, history: TensorObservations | None, mask: th.Tensor | None, features: th.Tensor
-    ) -> th.Tensor | None:
-        """m_{t+1}: one step on, the present observation is the newest of the past."""
-        past = self._past_features(history, mask)
-        if past is None or self.actor.memory is None:
-            return None
-        return self.actor.memory(th.cat([past[:, 1:], features[:, None]], dim=1))
-
-    def _past_features(self, history: TensorObservations | None, mask: th.Tensor | None) -> th.Tensor | None:
-        if history is None or mask is None:
-            return None
-        flat = map_observations(lambda tensor: tensor.flatten(0, 1), history)
-        return self._features(flat).view(*mask.shape, -1) * mask[:, :, None]
 
     # ------------------------------------------------------------------ logging, saving
 
@@ -723,7 +610,7 @@ class ActPC(OffPolicyAlgorithm):
 
     def _excluded_save_params(self) -> list[str]:
         aliases = ["actor", "critic", "generator", "prior", "actor_target", "critic_target"]
-        derived = ["expert", "_expert_transitions", "_expert_signals", "diagnostics"]
+        derived = ["expert", "diagnostics"]
         return [*super()._excluded_save_params(), *aliases, *derived]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:

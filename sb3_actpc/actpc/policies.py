@@ -50,7 +50,7 @@ class Critics(nn.ModuleList):
     """One or more critic circuits."""
 
     def __iter__(self) -> Iterator[NGCCircuit]:
-        return super().__iter__()
+        return super().__iter__()  # type: ignore[return-value]
 
     def first(self) -> NGCCircuit:
         """The one the actor is coupled to."""
@@ -293,7 +293,7 @@ class ActPCPolicy(BasePolicy):
         kwargs = dict(self.optimizer_kwargs)
         if self.optimizer_class is th.optim.Adam:
             kwargs.setdefault("fused", True)  # one kernel for all synapses
-        return self.optimizer_class(groups, **kwargs)  # type: ignore[call-arg]
+        return self.optimizer_class(groups, **kwargs)
 
     def batch_size_of(self, name: str, default: int) -> int:
         """Batch size of a circuit: its own ``batch_size`` or the agent's."""

@@ -68,11 +68,6 @@ class Episodes:
             starts=np.repeat(bounds[:, 0], bounds[:, 1] - bounds[:, 0]),
         )
 
-    @staticmethod
-    def from_next_observations(demonstrations: Demonstrations, rows: np.ndarray, space: spaces.Space) -> Observations:
-        """The observations that followed the given ``rows``, in the shape of the ``space``."""
-        return split_observations(space, demonstrations.next_observations[rows])
-
     def take(self, indices: np.ndarray, history: int = 0) -> ImitationSamples:
         """
         :param indices: (B,) rows

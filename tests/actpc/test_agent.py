@@ -267,7 +267,7 @@ def test_demonstrations_fill_their_share_of_the_critic_batch():
     batch = model._sample_batch(16)
     rows = {tuple(row) for row in data.observations.tolist()}
     assert [tuple(row) in rows for row in batch.features.tolist()] == [False] * 8 + [True] * 8
-    assert batch.n_replayed == 8 and batch.rewards.shape == (16, 1)
+    assert batch.rewards.shape == (16, 1)
 
 
 def test_fewer_demonstrations_can_be_used():
@@ -279,10 +279,10 @@ def test_fewer_demonstrations_can_be_used():
 def test_observations_are_normalised_by_the_demonstrations_and_do_not_drift():
     data = demonstrations()
     model = make(demonstrations=data, observation_normalization="demonstrations")
-    features = model._features(th.as_tensor(data.observations))
+    features = model.inputs.features(th.as_tensor(data.observations))
     assert th.allclose(features.mean(0), th.zeros(3), atol=1e-5) and th.allclose(features.std(0), th.ones(3), atol=1e-4)
     model.learn(60)
-    assert th.equal(features, model._features(th.as_tensor(data.observations)))
+    assert th.equal(features, model.inputs.features(th.as_tensor(data.observations)))
 
 
 # ---------------------------------------------------------------------- working memory
@@ -315,7 +315,7 @@ def test_rebuilt_memory_equals_the_one_at_collection_across_episode_ends_and_rin
         row = (buffer.newest - age) % 30
         rows, envs = np.full(n_envs, row), np.arange(n_envs)
         rebuilt = buffer._history_at(rows, envs, None)
-        past = model._past_features(rebuilt["history"], rebuilt["history_mask"])
+        past = model.inputs.past_features(rebuilt["history"], rebuilt["history_mask"])
         assert np.allclose(past.numpy(), seen[steps - 1 - age], atol=1e-6)
     drawn = {int(r) for _ in range(50) for r in buffer._draw(16)[0]}
     lost = {(buffer.pos + k) % 30 for k in range(4)}

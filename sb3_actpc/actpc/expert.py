@@ -1,0 +1,92 @@
+"""The demonstrations, as the agent uses them: imitated by the actor, predicted by the prior, mixed into the critic's batch."""
+
+from collections.abc import Callable
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+
+from sb3_actpc.actpc.inputs import Batch, CircuitInputs
+from sb3_actpc.actpc.signals import Normalizer
+from sb3_actpc.common.demonstrations import Demonstrations
+from sb3_actpc.common.episodes import Episodes, split_observations
+
+RawSignals = Callable[[th.Tensor, th.Tensor, th.Tensor, th.Tensor | None], tuple[np.ndarray, np.ndarray]]
+
+
+class Expert:
+    """
+    :param demonstrations: N transitions that fit the environment
+    :param observation_space: the environment's
+    :param action_space: the environment's
+    :param history: H observations in the working memory; 0 for none
+    """
+
+    def __init__(
+        self,
+        demonstrations: Demonstrations,
+        observation_space: spaces.Space,
+        action_space: spaces.Box,
+        history: int,
+    ) -> None:
+        self.demonstrations, self.history = demonstrations, history
+        self.episodes = Episodes.from_demonstrations(demonstrations, observation_space, action_space)
+        self.next_observations = Episodes(
+            split_observations(observation_space, demonstrations.next_observations),
+            self.episodes.actions,
+            self.episodes.starts,
+        )
+        self.epistemic, self.instrumental = np.zeros((2, len(demonstrations)), dtype=np.float32)
+
+    def __len__(self) -> int:
+        return len(self.demonstrations)
+
+    def sample(self, n: int, inputs: CircuitInputs, weights: tuple[float, float, float], gamma: float) -> Batch:
+        """``n`` transitions drawn uniformly; see :meth:`batch`."""
+        return self.batch(np.random.randint(0, len(self), size=n), inputs, weights, gamma)
+
+    def batch(self, rows: np.ndarray, inputs: CircuitInputs, weights: tuple[float, float, float], gamma: float) -> Batch:
+        """
+        :param rows: (B,) which transitions
+        :param inputs: turns observations into features
+        :param weights: (α_ext, α_ep, α_in)
+        :param gamma: discount
+        :return: the transitions as the circuits see them
+        """
+        samples = self.episodes.take(rows, self.history)
+        features = inputs.features(inputs.observations(samples.observations))
+        history = None if samples.history is None else inputs.observations(samples.history, batch_dims=2)
+        mask = None if samples.history_mask is None else inputs.tensor(samples.history_mask)
+        memory, next_memory = inputs.memories(history, mask, features)
+        task = self.demonstrations.rewards[rows]
+        if inputs.vec_normalize is not None:
+            task = inputs.vec_normalize.normalize_reward(task)
+        rewards = weights[0] * task + weights[1] * self.epistemic[rows] + weights[2] * self.instrumental[rows]
+        return Batch(
+            features=features,
+            actions=inputs.tensor(samples.actions),
+            next_features=inputs.features(inputs.observations(self.next_observations.take(rows).observations)),
+            memory=memory,
+            next_memory=next_memory,
+            rewards=inputs.tensor(rewards)[:, None],
+            dones=inputs.tensor(self.demonstrations.terminations[rows])[:, None],
+            discounts=features.new_full((len(rows), 1), gamma),
+        )
+
+    def refresh_signals(
+        self, raw_signals: RawSignals, inputs: CircuitInputs, epistemic: Normalizer, instrumental: Normalizer
+    ) -> None:
+        """
+        Signals of all transitions under the present generator and prior; the normalisers do not move.
+
+        :param raw_signals: summed squared errors of both circuits from (features, actions, next features, memory)
+        :param inputs: turns observations into features
+        :param epistemic: normaliser of the epistemic signal
+        :param instrumental: normaliser of the instrumental signal
+        """
+        for start in range(0, len(self), 1024):
+            rows = np.arange(start, min(start + 1024, len(self)))
+            batch = self.batch(rows, inputs, (0.0, 0.0, 0.0), 0.0)
+            raw_ep, raw_in = raw_signals(batch.features, batch.actions, batch.next_features, batch.memory)
+            self.epistemic[rows] = epistemic.rescale(raw_ep)
+            self.instrumental[rows] = -instrumental.rescale(raw_in)
