@@ -113,6 +113,12 @@ class ActPCActor(BasePolicy):
         )
         return data
 
+    def train(self, mode: bool = True) -> "ActPCActor":
+        """Only the extractor can tell training from acting: circuits have no such mode (SB3 asks at every step)."""
+        self.training = mode
+        self.features_extractor.train(mode)
+        return self
+
     def features(self, observations: PyTorchObs) -> th.Tensor:
         """:param observations: (B, *obs_shape) or a dict of such
         :return: (B, n_features), what every circuit sees of them"""
@@ -314,6 +320,12 @@ class ActPCPolicy(BasePolicy):
             **{f"{name}_kwargs": self.kwargs_of[name] for name in CIRCUITS},
         )
         return data
+
+    def train(self, mode: bool = True) -> "ActPCPolicy":
+        """See :meth:`ActPCActor.train`."""
+        self.training = mode
+        self.actor.train(mode)
+        return self
 
     def features(self, observations: PyTorchObs) -> th.Tensor:
         """What every circuit sees of the observations, (B, n_features)."""

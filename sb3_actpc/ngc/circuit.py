@@ -1,7 +1,7 @@
 """The neural generative coding (NGC) circuit: one stack of layers that predict, settle and learn by Hebbian changes."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch as th
 from torch import nn
@@ -13,6 +13,15 @@ from sb3_actpc.ngc.stability import power_iteration_, settling_rates
 
 SETTLINGS = ("iterative", "scheduled")
 FEEDBACKS = ("learned", "tied")
+
+
+class Synapses(NamedTuple):
+    """The parameters of a circuit as plain lists, in forward order."""
+
+    weights: list[th.Tensor]
+    biases: list[th.Tensor]
+    memory: list[th.Tensor]
+    feedback: list[th.Tensor]
 
 
 class NGCCircuit(nn.Module):
@@ -136,6 +145,8 @@ class NGCCircuit(nn.Module):
         )
         for parameter in self.parameters():
             parameter.requires_grad_(False)
+        # the same parameters as plain lists: indexing a ParameterList costs more than a small product
+        self.synapses = Synapses(*map(list, (self.weights, self.biases, self.memory_weights, self.feedback_weights)))
         self.register_buffer("rates", th.zeros(max(1, self.n_hidden)))
         self._keep_rates = self.settling == "iterative" and self.settling_rate == "auto" and self.n_hidden > 0
         if self._keep_rates:
@@ -160,10 +171,10 @@ class NGCCircuit(nn.Module):
             found = "no memory" if memory is None else f"a memory of size {memory.shape[1]}"
             raise ValueError(f"this circuit has n_memory={self.n_memory} but was given {found}")
         if memory is None:
-            return list(self.biases)
+            return self.synapses.biases
         return [
             th.addmm(bias, memory, weights.t(), alpha=self.memory_weight)
-            for bias, weights in zip(self.biases, self.memory_weights, strict=True)
+            for bias, weights in zip(self.synapses.biases, self.synapses.memory, strict=True)
         ]
 
     def feedback_matrix(self, layer: int) -> th.Tensor:
@@ -172,8 +183,9 @@ class NGCCircuit(nn.Module):
         ``n_feedback_inputs`` columns.
         """
         if self.feedback == "learned":
-            return self.feedback_weights[layer if self.n_feedback_inputs else layer - 1]
-        weights = self.weights[layer] if layer else self.weights[0][:, self.sizes[0] - self.n_feedback_inputs :]
+            return self.synapses.feedback[layer if self.n_feedback_inputs else layer - 1]
+        weights = self.synapses.weights[layer]
+        weights = weights if layer else weights[:, self.sizes[0] - self.n_feedback_inputs :]
         return weights if self.feedback_scale == 1.0 else self.feedback_scale * weights
 
     # ------------------------------------------------------------------ inference
@@ -187,10 +199,10 @@ class NGCCircuit(nn.Module):
         :return: (B, n_outputs)
         """
         biases = self.layer_biases(memory)
-        for weights, bias in zip(self.weights[:-1], biases[:-1], strict=True):
+        for weights, bias in zip(self.synapses.weights[:-1], biases[:-1], strict=True):
             latents = predict(x, weights, bias)
             x = self.activation.apply(latents, latents)
-        output = predict(x, self.weights[-1], biases[-1])
+        output = predict(x, self.synapses.weights[-1], biases[-1])
         return self.output_activation.apply(output, output)
 
     def settle(self, x: th.Tensor, target: th.Tensor, memory: th.Tensor | None = None) -> SettledState:
@@ -250,11 +262,11 @@ class NGCCircuit(nn.Module):
         Parameter groups for a ``torch.optim`` optimiser. The error synapses' rate is γ_e times the weights': an adaptive
         optimiser cancels a constant factor on the change itself. ``lr_scale`` tells a scheduler that ratio.
         """
-        forward = [*self.weights, *self.biases, *self.memory_weights]
+        forward = [*self.synapses.weights, *self.synapses.biases, *self.synapses.memory]
         groups: list[dict[str, Any]] = [{"params": forward, "lr": learning_rate, "lr_scale": 1.0}]
-        if len(self.feedback_weights):
+        if len(self.synapses.feedback):
             scale = self.feedback_rate
-            groups.append({"params": list(self.feedback_weights), "lr": learning_rate * scale, "lr_scale": scale})
+            groups.append({"params": self.synapses.feedback, "lr": learning_rate * scale, "lr_scale": scale})
         return groups
 
     def apply_changes(self, changes: HebbianChanges, optimizer: th.optim.Optimizer) -> None:
@@ -264,12 +276,12 @@ class NGCCircuit(nn.Module):
         The one place where a change becomes minus a gradient.
         """
         old = [parameter.clone() for parameter in self._scaled_synapses()] if self.synaptic_scaling == "soft_bound" else []
-        targets = [*self.weights, *self.biases, *self.memory_weights]
+        targets = [*self.synapses.weights, *self.synapses.biases, *self.synapses.memory]
         for parameter, gradient in zip(targets, th._foreach_neg(changes.tensors()), strict=True):
             parameter.grad = gradient
-        above = list(self.weights)[0 if self.n_feedback_inputs else 1 :]
+        above = self.synapses.weights[0 if self.n_feedback_inputs else 1 :]
         # E^T is stored in the layout of W, so that its change is ΔW itself
-        for parameter, weights in zip(self.feedback_weights, above, strict=self.feedback == "learned"):
+        for parameter, weights in zip(self.synapses.feedback, above, strict=self.feedback == "learned"):
             assert weights.grad is not None
             parameter.grad = weights.grad[:, weights.shape[1] - parameter.shape[1] :].contiguous()
         optimizer.step()
@@ -278,7 +290,7 @@ class NGCCircuit(nn.Module):
             self.update_settling_rates()
 
     def _scaled_synapses(self) -> list[th.Tensor]:
-        return [*self.weights, *self.feedback_weights]
+        return [*self.synapses.weights, *self.synapses.feedback]
 
     def _scale_synapses(self, old: list[th.Tensor]) -> None:
         if self.synaptic_scaling == "soft_bound":
@@ -292,7 +304,7 @@ class NGCCircuit(nn.Module):
 
     def _coupling_matrices(self) -> list[tuple[str, th.Tensor]]:
         """The matrices between hidden layers and output, with the names of their power-iteration vectors."""
-        named = [(f"singular_vector_{layer}", self.weights[layer]) for layer in range(1, self.n_hidden + 1)]
+        named = [(f"singular_vector_{layer}", self.synapses.weights[layer]) for layer in range(1, self.n_hidden + 1)]
         if self.feedback == "learned":
             named += [
                 (f"feedback_singular_vector_{layer}", self.feedback_matrix(layer)) for layer in range(1, self.n_hidden + 1)

@@ -62,11 +62,11 @@ class SettlingChain:
         self.biases = circuit.layer_biases(memory)
         self.latents: list[th.Tensor] = [x]
         self.activations: list[th.Tensor] = [x]
-        for weights, bias in zip(circuit.weights[:-1], self.biases[:-1], strict=True):
+        for weights, bias in zip(circuit.synapses.weights[:-1], self.biases[:-1], strict=True):
             latents = predict(self.activations[-1], weights, bias)
             self.latents.append(latents)
             self.activations.append(circuit.activation.apply(latents, th.empty_like(latents)))
-        self.output_prediction = predict(self.activations[-1], circuit.weights[-1], self.biases[-1])
+        self.output_prediction = predict(self.activations[-1], circuit.synapses.weights[-1], self.biases[-1])
         self.output = circuit.output_activation.apply(self.output_prediction, th.empty_like(self.output_prediction))
         self.n_hidden = len(self.latents) - 1
         self.lowest_reached = self.n_hidden + 1
@@ -135,13 +135,13 @@ class SettlingChain:
                 th.add(self.first_prediction, error, out=latents)
             elif circuit.dynamics == "error":
                 th.add(error, self.biases[layer - 1], out=latents)
-                latents.addmm_(self.activations[layer - 1], circuit.weights[layer - 1].t())
+                latents.addmm_(self.activations[layer - 1], circuit.synapses.weights[layer - 1].t())
             else:
                 th.sub(latents, self.biases[layer - 1], out=error)
-                error.addmm_(self.activations[layer - 1], circuit.weights[layer - 1].t(), alpha=-1.0)
+                error.addmm_(self.activations[layer - 1], circuit.synapses.weights[layer - 1].t(), alpha=-1.0)
             self.activations[layer] = circuit.activation.apply(latents, self.activations[layer])
         if output:
-            th.addmm(self.biases[-1], self.activations[-1], circuit.weights[-1].t(), out=self.output_prediction)
+            th.addmm(self.biases[-1], self.activations[-1], circuit.synapses.weights[-1].t(), out=self.output_prediction)
             self.output = circuit.output_activation.apply(self.output_prediction, self.output)
             if self.target is not None:
                 self._refresh_output_error()
