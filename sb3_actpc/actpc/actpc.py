@@ -18,7 +18,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from sb3_actpc.actpc.diagnostics import Diagnostics
 from sb3_actpc.actpc.expert import Expert
 from sb3_actpc.actpc.inputs import Batch, CircuitInputs
-from sb3_actpc.actpc.policies import ActPCActor, ActPCPolicy, Critics, MlpPolicy, MultiInputPolicy
+from sb3_actpc.actpc.policies import ActPCActor, ActPCPolicy, CnnPolicy, Critics, MlpPolicy, MultiInputPolicy
 from sb3_actpc.actpc.signals import SIGNAL_ERRORS, make_normalizer, summed_squared_errors
 from sb3_actpc.common.buffers import _SignalReplay, combined_buffer_class
 from sb3_actpc.common.checks import check_choices, check_finite, check_numbers
@@ -40,10 +40,11 @@ class ActPC(OffPolicyAlgorithm):
 
     The actor acts; the critic values its actions; the generator's surprise is an epistemic reward; the prior, learned from
     demonstrations and then frozen, gives an instrumental one. Paper: https://arxiv.org/abs/2209.09174. Defaults are the
-    paper's (its tables for HalfCheetah) except where a comment at the constructor says otherwise. Without demonstrations
+    paper's (its tables for HalfCheetah) except where a comment at the constructor says otherwise, and for the error synapses,
+    which are tied unless ``circuit_kwargs=dict(feedback="learned")`` asks for the paper's. Without demonstrations
     there is no prior, and the task's reward takes its role.
 
-    :param policy: "MlpPolicy", "MultiInputPolicy" or a class
+    :param policy: "MlpPolicy", "MultiInputPolicy", "CnnPolicy" (fixed random convolutions) or a class
     :param env: the environment, or its id
     :param learning_rate: of all circuits, or a schedule; circuits can have their own (``actor_kwargs`` and so on)
     :param buffer_size: transitions in the replay buffer
@@ -103,7 +104,11 @@ class ActPC(OffPolicyAlgorithm):
         demonstrations that do not fit the environment
     """
 
-    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": MlpPolicy, "MultiInputPolicy": MultiInputPolicy}
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
+        "MlpPolicy": MlpPolicy,
+        "CnnPolicy": CnnPolicy,
+        "MultiInputPolicy": MultiInputPolicy,
+    }
     policy: ActPCPolicy
     replay_buffer: _SignalReplay | None
     actor: ActPCActor
@@ -264,7 +269,7 @@ class ActPC(OffPolicyAlgorithm):
         if not np.all(np.isfinite([self.action_space.low, self.action_space.high])):  # type: ignore[attr-defined]
             raise ValueError(f"action_space={self.action_space} must have finite bounds; wrap the environment to rescale it")
         asked = self.replay_buffer_class, self.replay_buffer_kwargs, self.policy_kwargs, self.n_steps
-        self.replay_buffer_class = combined_buffer_class(self.replay_buffer_class, self.observation_space)
+        self.replay_buffer_class = combined_buffer_class(self.replay_buffer_class, self.observation_space, self.n_steps)
         self.replay_buffer_kwargs = {
             "combined": self.combined_replay,
             "history": self.history,
@@ -555,7 +560,9 @@ class ActPC(OffPolicyAlgorithm):
         for target, circuit in zip(
             [self.actor_target, *self.critic_target], [self.actor.circuit, *self.critic], strict=True
         ):
-            th._foreach_lerp_(list(target.parameters()), list(circuit.parameters()), tau)
+            for mine, theirs in zip(target.synapses, circuit.synapses, strict=True):
+                if mine:
+                    th._foreach_lerp_(mine, theirs, tau)
 
     def _on_step(self) -> None:
         """A hard copy of the targets every ``target_update_interval`` transitions."""

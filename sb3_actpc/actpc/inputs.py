@@ -52,7 +52,7 @@ class CircuitInputs:
 
     def tensor(self, array: np.ndarray) -> th.Tensor:
         """The array as float32 on the agent's device."""
-        return th.as_tensor(array, dtype=th.float32, device=self.actor.device)
+        return th.as_tensor(array, dtype=th.float32, device=self.actor.normalizer.mean.device)
 
     def observations(self, observations: Any, batch_dims: int = 1) -> TensorObservations:
         """
@@ -65,7 +65,7 @@ class CircuitInputs:
             flat = map_observations(lambda array: array.reshape(-1, *array.shape[batch_dims:]), observations)
             normalized = self.vec_normalize.normalize_obs(flat)
             observations = map_observations(lambda array: array.reshape(*lead, *array.shape[1:]), normalized)
-        return map_observations(lambda array: th.as_tensor(array, device=self.actor.device), observations)
+        return map_observations(lambda array: th.as_tensor(array, device=self.actor.normalizer.mean.device), observations)
 
     def features(self, observations: TensorObservations) -> th.Tensor:
         """(B, n_features) of a batch of observations."""

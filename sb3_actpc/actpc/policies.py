@@ -10,7 +10,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.preprocessing import is_image_space
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor, FlattenExtractor
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor, FlattenExtractor, NatureCNN
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
@@ -224,8 +224,8 @@ class ActPCPolicy(BasePolicy):
     ) -> None:
         if features_extractor_class is FlattenExtractor and is_image_space(observation_space):
             raise ValueError(
-                f"observations of shape {observation_space.shape} are images: ActPC learns no convolutions; pass a fixed "
-                "extractor as policy_kwargs=dict(features_extractor_class=...) or use vector observations"
+                f"observations of shape {observation_space.shape} are images: ActPC learns no convolutions; use "
+                "'CnnPolicy' (fixed random ones), policy_kwargs=dict(features_extractor_class=...) or vector observations"
             )
         super().__init__(
             observation_space,
@@ -349,6 +349,14 @@ class ActPCPolicy(BasePolicy):
 
 
 MlpPolicy = ActPCPolicy
+
+
+class CnnPolicy(ActPCPolicy):
+    """:class:`ActPCPolicy` for images, which go through SB3's convolutions with fixed random weights."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        kwargs.setdefault("features_extractor_class", NatureCNN)
+        super().__init__(*args, **kwargs)
 
 
 class MultiInputPolicy(ActPCPolicy):

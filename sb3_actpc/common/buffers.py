@@ -199,6 +199,10 @@ class CombinedReplayBuffer(_SignalReplay):
     """ActPC's replay buffer for Box observations; see :class:`_SignalReplay`."""
 
 
+class CombinedNStepReplayBuffer(_SignalReplay, NStepReplayBuffer):
+    """The same as SB3's n-step class: chosen for ``n_steps`` above 1."""
+
+
 class CombinedDictReplayBuffer(_SignalReplay, DictReplayBuffer):  # type: ignore[misc]
     """ActPC's replay buffer for Dict observations; see :class:`_SignalReplay`."""
 
@@ -236,20 +240,25 @@ class CombinedHerReplayBuffer(_SignalReplay, HerReplayBuffer):  # type: ignore[m
         return batch
 
 
-def combined_buffer_class(given: type[ReplayBuffer] | None, observation_space: spaces.Space) -> type[ReplayBuffer]:
+def combined_buffer_class(
+    given: type[ReplayBuffer] | None, observation_space: spaces.Space, n_steps: int = 1
+) -> type[ReplayBuffer]:
     """
     :param given: the class the user asked for, or None
     :param observation_space: Dict or not
+    :param n_steps: length of n-step returns
     :return: the ActPC buffer that does what ``given`` does
     :raises ValueError: for a class that does not keep ActPC's signals
     """
+    if given is None and isinstance(observation_space, spaces.Dict):
+        return CombinedDictReplayBuffer
     if given is None:
-        return CombinedDictReplayBuffer if isinstance(observation_space, spaces.Dict) else CombinedReplayBuffer
+        return CombinedNStepReplayBuffer if n_steps > 1 else CombinedReplayBuffer
     if issubclass(given, _SignalReplay):
         return given
     same: dict[type[ReplayBuffer], type[ReplayBuffer]] = {
         ReplayBuffer: CombinedReplayBuffer,
-        NStepReplayBuffer: CombinedReplayBuffer,
+        NStepReplayBuffer: CombinedNStepReplayBuffer,
         DictReplayBuffer: CombinedDictReplayBuffer,
         HerReplayBuffer: CombinedHerReplayBuffer,
     }

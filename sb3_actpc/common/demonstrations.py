@@ -22,6 +22,7 @@ from gymnasium import spaces
 from sb3_actpc.common.files import atomic_write
 
 FORMAT_VERSION = 1
+DATA_FOLDER = Path(__file__).resolve().parents[1] / "data"
 ACTION_TOLERANCE = 1e-4
 
 _STORED_FIELDS = (
@@ -471,6 +472,23 @@ def resolve(source: str | os.PathLike[str] | Demonstrations) -> Demonstrations:
     if isinstance(source, (str, os.PathLike)):
         return Demonstrations.load(source)
     raise ValueError(f"demonstrations must be a file path or a Demonstrations object, found {source!r}")
+
+
+def shipped_demonstrations(env_id: str) -> Path:
+    """The demonstrations file of a sparse task that comes with the package.
+
+    :param env_id: Gymnasium id, such as ``SparseHalfCheetah-v5``
+    :return: its path
+    :raises FileNotFoundError: when none is shipped; the message says how to collect them
+    """
+    name = re.sub(r"-v\d+$", "", env_id.rpartition(":")[2])
+    path = DATA_FOLDER / f"sparse_{name.removeprefix('Sparse').lower()}.npz"
+    if not path.is_file():
+        raise FileNotFoundError(
+            f"no demonstrations of {env_id} are shipped: collect them (sb3-actpc demos collect --env {env_id}) and pass "
+            "--demonstrations FILE, or train without (--demonstrations none)"
+        )
+    return path
 
 
 def _field_error(source: str, name: str, expected: str, found: str) -> ValueError:

@@ -45,8 +45,8 @@ class NGCCircuit(nn.Module):
         same fixed points, see :class:`~sb3_actpc.ngc.dynamics.SettlingChain`
     :param settling_rate: β, a number in (0, 1], or "auto": kept inside the stable range as the synapses grow
     :param leak: γ of eq. 1; 0 by default
-    :param feedback: "learned" (own error synapses E, started independently of W: the paper's and the default) or "tied"
-        (``feedback_scale`` W^T; the only choice, and the default, under "scheduled")
+    :param feedback: "tied" (``feedback_scale`` W^T) or "learned" (own error synapses E, started independently of W: the
+        paper's; they take some thousand updates to align with W^T, so that a fresh circuit learns little at first)
     :param feedback_scale: λ_e of tied error synapses
     :param feedback_rate: γ_e, learning rate of E over that of W (the paper: below 1)
     :param derivative_free: leave out φ' in the state update (appendix)
@@ -75,7 +75,7 @@ class NGCCircuit(nn.Module):
         dynamics: str = "error",
         settling_rate: float | str = "auto",
         leak: float = 0.0,
-        feedback: str | None = None,
+        feedback: str = "tied",  # the paper's is "learned"; see above
         feedback_scale: float = 1.0,
         feedback_rate: float = 0.9,
         derivative_free: bool = False,
@@ -89,7 +89,6 @@ class NGCCircuit(nn.Module):
         _check_choice("settling", settling, SETTLINGS)
         _check_choice("dynamics", dynamics, DYNAMICS)
         _check_choice("synaptic_scaling", synaptic_scaling, SYNAPTIC_SCALINGS)
-        feedback = feedback or ("tied" if settling == "scheduled" else "learned")
         _check_choice("feedback", feedback, FEEDBACKS)
         if min(n_inputs, n_outputs, *hidden) < 1 or n_settling_steps < 1 or n_memory < 0:
             raise ValueError(

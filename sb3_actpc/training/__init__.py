@@ -1,6 +1,6 @@
 """Training runs: settings, evaluation, records and replay. The commands are thin wrappers around this package."""
 
-from sb3_actpc.training.config import ALGORITHMS, RunConfig
+from sb3_actpc.training.config import ALGORITHMS, RunConfig, load_preset
 from sb3_actpc.training.evaluation import EpisodeStatistics, EvaluationCallback, play_episodes
 from sb3_actpc.training.run import evaluate_run, train_run
 
@@ -10,6 +10,7 @@ __all__ = [
     "EvaluationCallback",
     "RunConfig",
     "evaluate_run",
+    "load_preset",
     "play_episodes",
     "train_run",
 ]

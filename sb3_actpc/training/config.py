@@ -15,13 +15,14 @@ import torch as th
 import yaml
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
+from sb3_actpc.common.demonstrations import shipped_demonstrations
+
 # name on the command line -> "module:class", imported only when it is used
 ALGORITHMS = {"actpc": "sb3_actpc.actpc:ActPC"}
 
 PACKAGE_FOLDER = Path(__file__).resolve().parents[1]
 # inside an installed wheel, or beside the package in a source checkout
 HYPERPARAMS_FOLDERS = (PACKAGE_FOLDER / "hyperparams", PACKAGE_FOLDER.parent / "hyperparams")
-DATA_FOLDER = PACKAGE_FOLDER / "data"
 
 NOISE_TYPES = ("normal", "ornstein-uhlenbeck")
 # constructor keywords that have an option of their own
@@ -243,16 +244,7 @@ def find_demonstrations(env_id: str, choice: str) -> Path | None:
         if not Path(choice).is_file():
             raise FileNotFoundError(f"no demonstrations file at {choice}")
         return Path(choice)
-    name = re.sub(r"-v\d+$", "", env_id.rpartition(":")[2])
-    if not name.startswith("Sparse"):
-        return None
-    path = DATA_FOLDER / f"sparse_{name.removeprefix('Sparse').lower()}.npz"
-    if not path.is_file():
-        raise FileNotFoundError(
-            f"no demonstrations of {env_id} are shipped: collect them (sb3-actpc demos collect --env {env_id}) and pass "
-            "--demonstrations FILE, or train without (--demonstrations none)"
-        )
-    return path
+    return shipped_demonstrations(env_id) if env_id.rpartition(":")[2].startswith("Sparse") else None
 
 
 def _check_device(device: str) -> None:

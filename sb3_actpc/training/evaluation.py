@@ -12,6 +12,7 @@ from typing import Any, Protocol, cast
 
 import gymnasium as gym
 import numpy as np
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_actpc.common.files import atomic_write
@@ -115,7 +116,7 @@ def _stack(observations: list[Any]) -> Any:
 
 
 class EvaluationCallback(BaseCallback):
-    """Evaluates before the first step, then every ``eval_freq`` steps, and once more at the end.
+    """Evaluates the untrained agent (:meth:`begin`), then every ``eval_freq`` steps, and once more at the end.
 
     Each evaluation starts its episodes from the same seeds, appends a row to ``evaluations.csv`` and saves
     ``model.zip`` (written under another name and renamed, so that a stopped run leaves a whole one).
@@ -149,7 +150,12 @@ class EvaluationCallback(BaseCallback):
         self._last_timesteps = -1
         self._started = 0.0
 
-    def _on_training_start(self) -> None:
+    def begin(self, model: BaseAlgorithm) -> None:
+        """Evaluate before ``learn``, which may begin with demonstrations and not with steps.
+
+        :param model: the agent
+        """
+        self.model = model
         self._started = time.perf_counter()
         with open(self.folder / "evaluations.csv", "w", newline="", encoding="utf-8") as file:
             csv.writer(file).writerow(EVALUATION_COLUMNS)

@@ -226,6 +226,7 @@ def _train(
     )
     report(f"{config.env}: {config.algo}, {plan.n_timesteps} steps, into {folder}")
     started = time.perf_counter()
+    callback.begin(model)
     _learn(model, plan.n_timesteps, callback, config.progress)
     seconds = time.perf_counter() - started
     result = {

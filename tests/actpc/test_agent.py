@@ -365,7 +365,11 @@ def test_learning_never_backpropagates(settling, monkeypatch):
         scale_pressure=True,
         working_memory=True,
         action_noise=NormalActionNoise(np.zeros(2), 0.1 * np.ones(2)),
-        circuit_kwargs={"synaptic_scaling": "column_norm", "weight_bound": 2.0},
+        circuit_kwargs={
+            "synaptic_scaling": "column_norm",
+            "weight_bound": 2.0,
+            "feedback": "learned" if settling == "iterative" else "tied",
+        },
     )
     assert not any(p.requires_grad for p in model.policy.parameters())
     before = weights_of(model.policy)
@@ -465,7 +469,8 @@ def test_two_seeded_runs_are_bit_identical(settling):
 
 
 def test_learning_rates_of_circuits_and_error_synapses_follow_the_schedule():
-    model = make(settling="iterative", learning_rate=lambda left: 1e-3 * left, actor_kwargs={"learning_rate": 5e-3})
+    circuits = {"settling": "iterative", "circuit_kwargs": {"feedback": "learned"}, "actor_kwargs": {"learning_rate": 5e-3}}
+    model = make(learning_rate=lambda left: 1e-3 * left, **circuits)
     model.learn(30)
     model._current_progress_remaining = 0.5
     model.train(1, 16)

@@ -50,7 +50,7 @@ def energies_while_settling(circuit, x, target):
 @pytest.mark.parametrize("dynamics", ["error", "state"])
 def test_energy_still_falls_after_20k_updates_on_unnormalised_transitions(transitions, dynamics):
     """A fixed rate of 0.1, fine at the start, blows up here (checked at the end)."""
-    circuit = NGCCircuit(23, 17, feedback="tied", dynamics=dynamics)
+    circuit = NGCCircuit(23, 17, dynamics=dynamics)
     optimizer = th.optim.Adam(circuit.parameter_groups(4e-4), **ADAM)
     for update in range(N_UPDATES + 1):
         o, a, _, n = batch_of(transitions)
@@ -88,8 +88,8 @@ def alignment(actor, critic, x):
 @pytest.mark.slow
 def test_the_coupled_pair_follows_the_policy_gradient_at_the_start_and_after_20k_updates(transitions):
     """Default iterative settings (tied feedback): cosine at least 0.9 in every layer at the start, 0.7 at the end."""
-    actor = NGCCircuit(17, 6, output_activation="tanh", feedback="tied")
-    critic = NGCCircuit(23, 6, feedback="tied", n_feedback_inputs=6)
+    actor = NGCCircuit(17, 6, output_activation="tanh")
+    critic = NGCCircuit(23, 6, n_feedback_inputs=6)
     optimizers = [th.optim.Adam(circuit.parameter_groups(4e-4), **ADAM) for circuit in (actor, critic)]
     for update in range(N_UPDATES + 1):
         o, a, r, n = batch_of(transitions)

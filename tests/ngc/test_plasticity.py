@@ -18,7 +18,7 @@ def train(circuit, optimizer, n_updates, batch=teacher_batch):
 
 
 def test_plain_sgd_adds_the_change():
-    circuit = NGCCircuit(8, 3, (16, 16))
+    circuit = NGCCircuit(8, 3, (16, 16), feedback="learned")
     optimizer = th.optim.SGD(circuit.parameter_groups(0.1))
     before = [p.clone() for p in (*circuit.weights, *circuit.biases)]
     error_synapses = [p.clone() for p in circuit.feedback_weights]
@@ -30,9 +30,11 @@ def test_plain_sgd_adds_the_change():
         assert th.allclose(new, old + 0.1 * circuit.feedback_rate * change, atol=1e-7)
 
 
-@pytest.mark.parametrize("settling", ["iterative", "scheduled"])
-def test_a_circuit_learns_a_function(settling):
-    circuit = NGCCircuit(8, 3, (64, 64), settling=settling)
+@pytest.mark.parametrize(
+    ("settling", "feedback"), [("iterative", "learned"), ("iterative", "tied"), ("scheduled", "tied")]
+)
+def test_a_circuit_learns_a_function(settling, feedback):
+    circuit = NGCCircuit(8, 3, (64, 64), settling=settling, feedback=feedback)
     optimizer = th.optim.Adam(circuit.parameter_groups(1e-3))
     x, target = teacher_batch(1024)
     start = (target - circuit.project(x)).square().mean()
@@ -41,7 +43,7 @@ def test_a_circuit_learns_a_function(settling):
 
 
 def test_learned_error_synapses_align_with_the_transposed_weights():
-    circuit = NGCCircuit(8, 3, (64, 64))
+    circuit = NGCCircuit(8, 3, (64, 64), feedback="learned")
     optimizer = th.optim.Adam(circuit.parameter_groups(3e-3))
     pairs = list(zip(circuit.feedback_weights, list(circuit.weights)[1:], strict=True))
     start = [oracle.cosine(e, w) for e, w in pairs]
@@ -56,7 +58,7 @@ def test_halving_gamma_e_halves_the_movement_of_the_error_synapses_under_adam():
     moved = []
     for feedback_rate in (0.8, 0.4):
         th.manual_seed(0)
-        circuit = NGCCircuit(8, 3, (32, 32), feedback_rate=feedback_rate)
+        circuit = NGCCircuit(8, 3, (32, 32), feedback="learned", feedback_rate=feedback_rate)
         optimizer = th.optim.Adam(circuit.parameter_groups(1e-3))
         before = [p.clone() for p in circuit.feedback_weights]
         train(circuit, optimizer, 1)
@@ -65,7 +67,7 @@ def test_halving_gamma_e_halves_the_movement_of_the_error_synapses_under_adam():
 
 
 def test_soft_bound_keeps_every_synapse_inside_under_adam():
-    circuit = NGCCircuit(8, 3, (32, 32), synaptic_scaling="soft_bound", weight_bound=0.4)
+    circuit = NGCCircuit(8, 3, (32, 32), feedback="learned", synaptic_scaling="soft_bound", weight_bound=0.4)
     optimizer = th.optim.Adam(circuit.parameter_groups(0.02))
     train(circuit, optimizer, 200)
     largest = max(float(p.abs().max()) for p in (*circuit.weights, *circuit.feedback_weights))
@@ -73,7 +75,7 @@ def test_soft_bound_keeps_every_synapse_inside_under_adam():
 
 
 def test_column_norm_bound_binds_under_adam():
-    circuit = NGCCircuit(8, 3, (32, 32), synaptic_scaling="column_norm", weight_bound=1.0)
+    circuit = NGCCircuit(8, 3, (32, 32), feedback="learned", synaptic_scaling="column_norm", weight_bound=1.0)
     optimizer = th.optim.Adam(circuit.parameter_groups(0.02))
     train(circuit, optimizer, 100)
     norms = th.cat([p.norm(dim=0) for p in (*circuit.weights, *circuit.feedback_weights)])

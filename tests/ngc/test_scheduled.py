@@ -54,7 +54,7 @@ def test_the_coupled_pair_under_scheduled_is_the_policy_gradient(hidden):
 
 
 def test_the_coupled_pair_tends_to_the_policy_gradient_as_it_settles_and_the_nudge_shrinks():
-    actor, critic, x = (m.double() for m in make_pair(feedback="tied", n_settling_steps=200))
+    actor, critic, x = (m.double() for m in make_pair(n_settling_steps=200))
     changes = actor.hebbian_update(settle_coupled(actor, critic, x, nudge=1e-7).actor)
     for change, gradient in zip(changes.tensors(), policy_gradient(actor, critic, x), strict=True):
         assert th.allclose(change, gradient, rtol=1e-4, atol=1e-8)
@@ -62,7 +62,7 @@ def test_the_coupled_pair_tends_to_the_policy_gradient_as_it_settles_and_the_nud
 
 def test_the_actor_change_raises_the_action_values():
     """The paper prints -1/A for the clamped error; with changes that are added that would lower Q."""
-    for keywords in ({"settling": "scheduled"}, {"feedback": "tied"}):
+    for keywords in ({"settling": "scheduled"}, {}):
         actor, critic, x = make_pair(**keywords)
         optimizer = th.optim.SGD(actor.parameter_groups(0.5))
         before = settle_coupled(actor, critic, x)
