@@ -220,48 +220,43 @@ class ActPC(OffPolicyAlgorithm):
             supported_action_spaces=(spaces.Box,),
             support_multi_env=True,
         )
-        own = set(given) - {"self", "policy", "env", "policy_kwargs", "_init_setup_model", "__class__"}
-        for name in own - set(self.__dict__) | {"demonstrations"}:
-            setattr(self, name, given[name])
+        self.settling = settling
+        self.circuit_kwargs = circuit_kwargs
+        self.actor_kwargs = actor_kwargs
+        self.critic_kwargs = critic_kwargs
+        self.generator_kwargs = generator_kwargs
+        self.prior_kwargs = prior_kwargs
+        self.demonstrations = demonstrations
+        self.n_demonstrations = n_demonstrations
+        self.n_demonstration_transitions = n_demonstration_transitions
+        self.prior_updates = prior_updates
+        self.actor_warm_start = actor_warm_start
+        self.refresh_weight = refresh_weight
+        self.self_imitation_size = self_imitation_size
+        self.demonstration_fraction = demonstration_fraction
+        self.alpha_ep = alpha_ep
+        self.alpha_in = alpha_in
+        self.alpha_ext = alpha_ext
+        self.signal_errors = signal_errors
+        self.actor_pressure = actor_pressure
+        self.scale_pressure = scale_pressure
+        self.nudge = nudge
+        self.critic_warmup = critic_warmup
+        self.n_critics = n_critics
+        self.bootstrap = bootstrap
+        self.target_policy_noise = target_policy_noise
+        self.target_noise_clip = target_noise_clip
+        self.target_update = target_update
+        self.target_update_interval = target_update_interval
+        self.combined_replay = combined_replay
+        self.working_memory = working_memory
+        self.memory_history = memory_history
+        self.observation_normalization = observation_normalization
         self.epistemic_normalizer = make_normalizer(signal_normalizer)
         self.instrumental_normalizer = make_normalizer(signal_normalizer)
         self.pretrained = False
         if _init_setup_model:
             self._setup_model()
-
-    # The keywords stored above, for readers and type checkers
-    settling: str
-    circuit_kwargs: dict[str, Any] | None
-    actor_kwargs: dict[str, Any] | None
-    critic_kwargs: dict[str, Any] | None
-    generator_kwargs: dict[str, Any] | None
-    prior_kwargs: dict[str, Any] | None
-    demonstrations: Demonstrations | str | Path | None
-    n_demonstrations: int | None
-    n_demonstration_transitions: int | None
-    prior_updates: int
-    actor_warm_start: int
-    refresh_weight: float
-    self_imitation_size: int
-    demonstration_fraction: float
-    alpha_ep: float
-    alpha_in: float
-    alpha_ext: float | None
-    signal_errors: str
-    actor_pressure: float
-    scale_pressure: bool
-    nudge: float
-    critic_warmup: int
-    n_critics: int
-    bootstrap: str
-    target_policy_noise: float
-    target_noise_clip: float
-    target_update: str
-    target_update_interval: int
-    combined_replay: bool
-    working_memory: bool
-    memory_history: int
-    observation_normalization: str
 
     # ------------------------------------------------------------------ setting up
 
@@ -361,10 +356,12 @@ class ActPC(OffPolicyAlgorithm):
         tb_log_name: str = "run",
         progress_bar: bool = False,
     ) -> tuple[int, BaseCallback]:
-        result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
-        if reset_num_timesteps or not hasattr(self, "_rollout_state"):
+        if reset_num_timesteps or self._last_obs is None:  # SB3 resets the environments
             self._rollout_state: tuple[np.ndarray, ...] | None = None
             self._rollout_starts = np.ones(self.n_envs, dtype=bool)
+            if self.replay_buffer is not None:
+                self.replay_buffer.cut_running_episodes()
+        result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
         self.pretrain()
         return result
 
@@ -445,6 +442,7 @@ class ActPC(OffPolicyAlgorithm):
             epistemic = summed_squared_errors(state, self.signal_errors).cpu().numpy()
         if alpha_in:
             state = self.prior.settle(features, next_features, memory)
+            self.diagnostics.settled("prior", state)
             instrumental = summed_squared_errors(state, self.signal_errors).cpu().numpy()
         return epistemic, instrumental
 
@@ -508,15 +506,16 @@ class ActPC(OffPolicyAlgorithm):
         """Motor-action circuit: pressure of the critic (line 17) plus refresh (line 23), in one step of the optimiser."""
         changes = self._refresh_changes() if self.refresh_weight and self._imitated() else None
         if changes is not None:
-            changes.scale_(self.refresh_weight)
+            self.diagnostics.change_norms("refresh", changes.scale_(self.refresh_weight))
         if self.actor_pressure and self._n_updates > self.critic_warmup:
             rows = slice(self.policy.batch_size_of("actor", len(batch.features)))
             memory = None if batch.memory is None else batch.memory[rows]
             coupled = settle_coupled(self.actor.circuit, self.critic.first(), batch.features[rows], memory, self.nudge)
             pressure = self.actor.circuit.hebbian_update(coupled.actor)
             weight = self.actor_pressure / coupled.action_values.abs().mean() if self.scale_pressure else self.actor_pressure
-            changes = pressure.scale_(weight) if changes is None else changes.add_(pressure.scale_(weight))
             self.diagnostics.coupled(coupled, pressure, batch.features[rows], memory)
+            self.diagnostics.change_norms("pressure", pressure.scale_(weight))
+            changes = pressure if changes is None else changes.add_(pressure)
         if changes is not None:
             self.actor.circuit.apply_changes(changes, self.actor.circuit.optimizer)
 

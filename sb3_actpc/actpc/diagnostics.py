@@ -6,7 +6,7 @@ from typing import Any
 import torch as th
 
 from sb3_actpc.actpc.policies import ActPCPolicy
-from sb3_actpc.ngc import CoupledState, HebbianChanges, NGCCircuit, SettledState
+from sb3_actpc.ngc import CoupledState, HebbianChanges, NGCCircuit, SettledState, policy_gradient
 
 INTERVAL = 100  # updates between two measurements
 
@@ -56,13 +56,21 @@ class Diagnostics:
     def coupled(
         self, state: CoupledState, changes: HebbianChanges, features: th.Tensor, memory: th.Tensor | None
     ) -> None:
-        """Action-values, and per layer how the actor's pressure compares with the deterministic policy gradient."""
+        """Action-values, and per layer the cosine of the actor's change with the deterministic policy gradient."""
         if not self.active:
             return
         self.values["action_value"] = float(state.action_values.mean())
         self.values["action_saturation"] = float((state.actions.abs() > 0.97).float().mean())
-        for layer, change in enumerate(changes.weights):
-            self.values[f"actor_pressure_norm_{layer}"] = float(change.norm())
+        gradient = policy_gradient(self.circuits["actor"], self.circuits["critic.0"], features, memory)
+        for layer, (mine, exact) in enumerate(zip(changes.weights, gradient.weights, strict=True)):
+            cosine = th.nn.functional.cosine_similarity(mine.flatten(), exact.flatten(), dim=0)
+            self.values[f"actor_cosine_{layer}"] = float(cosine)
+
+    def change_norms(self, name: str, changes: HebbianChanges) -> None:
+        """Per layer, the norm of one of the two changes that are added up for the actor."""
+        if self.active:
+            for layer, change in enumerate(changes.weights):
+                self.values[f"actor_{name}_norm_{layer}"] = float(change.norm())
 
     def summary(self) -> dict[str, float]:
         """Everything measured last."""

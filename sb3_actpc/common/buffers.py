@@ -86,6 +86,13 @@ class _SignalReplay(ReplayBuffer):
         self.epistemic[self.newest] = epistemic
         self.instrumental[self.newest] = instrumental
 
+    def cut_running_episodes(self) -> None:
+        """The environments were reset in mid-episode: nothing bootstraps, sums or remembers across the cut."""
+        for env, steps in enumerate(self._running):
+            steps.clear()
+            if (self.full or self.pos > 0) and not self.dones[self.newest, env]:
+                self.dones[self.newest, env] = self.timeouts[self.newest, env] = 1.0  # as a time limit does
+
     def reset(self) -> None:
         super().reset()
         self._running = [[] for _ in range(self.n_envs)]
@@ -102,7 +109,13 @@ class _SignalReplay(ReplayBuffer):
         rows, envs = self._draw(batch_size - len(newest))
         rows = np.concatenate([np.full(len(newest), self.newest), rows])
         envs = np.concatenate([newest, envs])
-        return self._gather(rows, envs, env)
+        return self._relabel(self._gather(rows, envs, env), rows, envs, len(newest), env)
+
+    def _relabel(
+        self, batch: SignalReplaySamples, rows: np.ndarray, envs: np.ndarray, n_newest: int, env: VecNormalize | None
+    ) -> SignalReplaySamples:
+        """What a subclass does to the drawn transitions (all but the first ``n_newest``)."""
+        return batch
 
     def _draw(self, n: int) -> tuple[np.ndarray, np.ndarray]:
         """``n`` stored (row, environment) pairs, uniformly."""
@@ -224,10 +237,16 @@ class CombinedHerReplayBuffer(_SignalReplay, HerReplayBuffer):  # type: ignore[m
         rows, envs = np.unravel_index(np.random.choice(valid, size=n), self.ep_length.shape)
         return rows, envs
 
-    def _gather(self, rows: np.ndarray, envs: np.ndarray, env: VecNormalize | None) -> SignalReplaySamples:
-        batch = super()._gather(rows, envs, env)
-        finished = self.ep_length[rows, envs] > 0
-        relabelled = np.flatnonzero(finished)[: int(self.her_ratio * finished.sum())]
+    def cut_running_episodes(self) -> None:
+        for steps in self._running:
+            steps.clear()
+        if (self._current_ep_start != self.pos).any():
+            self.truncate_last_trajectory()
+
+    def _relabel(
+        self, batch: SignalReplaySamples, rows: np.ndarray, envs: np.ndarray, n_newest: int, env: VecNormalize | None
+    ) -> SignalReplaySamples:
+        relabelled = np.arange(n_newest, n_newest + int(self.her_ratio * (len(rows) - n_newest)))
         if not len(relabelled):
             return batch
         assert isinstance(batch.observations, dict) and isinstance(batch.next_observations, dict)

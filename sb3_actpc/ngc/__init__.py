@@ -2,9 +2,18 @@
 
 from sb3_actpc.ngc.activations import ACTIVATIONS
 from sb3_actpc.ngc.circuit import NGCCircuit
-from sb3_actpc.ngc.coupled import CoupledState, settle_coupled
+from sb3_actpc.ngc.coupled import CoupledState, policy_gradient, settle_coupled
 from sb3_actpc.ngc.dynamics import SettledState
 from sb3_actpc.ngc.memory import WorkingMemory
 from sb3_actpc.ngc.plasticity import HebbianChanges
 
-__all__ = ["ACTIVATIONS", "CoupledState", "HebbianChanges", "NGCCircuit", "SettledState", "WorkingMemory", "settle_coupled"]
+__all__ = [
+    "ACTIVATIONS",
+    "CoupledState",
+    "HebbianChanges",
+    "NGCCircuit",
+    "SettledState",
+    "WorkingMemory",
+    "policy_gradient",
+    "settle_coupled",
+]

@@ -176,16 +176,16 @@ class NGCCircuit(nn.Module):
             for bias, weights in zip(self.synapses.biases, self.synapses.memory, strict=True)
         ]
 
-    def feedback_matrix(self, layer: int) -> th.Tensor:
+    def feedback_matrix(self, layer: int, tied: bool = False) -> th.Tensor:
         """
         E^T of hidden layer ``layer`` (1 = first), shape (n_below, n_layer); layer 0 is the input's last
-        ``n_feedback_inputs`` columns.
+        ``n_feedback_inputs`` columns. With ``tied`` the weights themselves, whatever the circuit uses.
         """
-        if self.feedback == "learned":
+        if self.feedback == "learned" and not tied:
             return self.synapses.feedback[layer if self.n_feedback_inputs else layer - 1]
         weights = self.synapses.weights[layer]
         weights = weights if layer else weights[:, self.sizes[0] - self.n_feedback_inputs :]
-        return weights if self.feedback_scale == 1.0 else self.feedback_scale * weights
+        return weights if tied or self.feedback_scale == 1.0 else self.feedback_scale * weights
 
     # ------------------------------------------------------------------ inference
 

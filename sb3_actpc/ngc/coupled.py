@@ -6,6 +6,7 @@ import torch as th
 
 from sb3_actpc.ngc.circuit import NGCCircuit
 from sb3_actpc.ngc.dynamics import SettledState, SettlingChain
+from sb3_actpc.ngc.plasticity import HebbianChanges
 
 COUPLED_RATE = 0.5  # with its output error clamped the pair has no loop: any rate up to 1 is stable
 
@@ -57,9 +58,7 @@ def settle_coupled(
     scale = nudge if actor.settling == "iterative" else 1.0
     value.clamp_output_drive(_damped(value, th.full_like(value.output, scale / value.output.shape[1])))
     if actor.settling == "scheduled":
-        value.sweep()
-        _clamp_actor(motor, value)
-        motor.sweep()
+        _sweep_both(motor, value)
     else:
         _settle_both(motor, value)
         for error in [*motor.errors, motor.output_error]:
@@ -67,6 +66,28 @@ def settle_coupled(
         if motor.drive is not motor.output_error:
             motor.drive.div_(scale)
     return CoupledState(motor.state(), motor.output, value.output)
+
+
+def policy_gradient(
+    actor: NGCCircuit, critic: NGCCircuit, x: th.Tensor, memory: th.Tensor | None = None
+) -> HebbianChanges:
+    """
+    The deterministic policy gradient, by one backward sweep through W^T: what the coupled pair's change is compared with.
+
+    :param actor: as for :func:`settle_coupled`, and so are the others
+    :return: the ascent direction of the mean action-value, batch mean
+    """
+    motor = SettlingChain(actor, x, memory)
+    value = SettlingChain(critic, th.cat([x, motor.output], dim=1), None)
+    value.clamp_output_drive(_damped(value, th.full_like(value.output, 1.0 / value.output.shape[1])))
+    _sweep_both(motor, value, exact=True)
+    return actor.hebbian_update(motor.state())
+
+
+def _sweep_both(motor: SettlingChain, value: SettlingChain, exact: bool = False) -> None:
+    value.sweep(exact)
+    _clamp_actor(motor, value, exact)
+    motor.sweep(exact)
 
 
 def _settle_both(motor: SettlingChain, value: SettlingChain) -> None:
@@ -86,10 +107,10 @@ def _settle_both(motor: SettlingChain, value: SettlingChain) -> None:
     _clamp_actor(motor, value)
 
 
-def _clamp_actor(motor: SettlingChain, value: SettlingChain) -> None:
+def _clamp_actor(motor: SettlingChain, value: SettlingChain, exact: bool = False) -> None:
     """The actor's output error becomes d_a = E_a e of the critic's first layer (of its output, without hidden layers)."""
     below = value.errors[0] if value.n_hidden else value.drive
-    perturbation = below @ value.circuit.feedback_matrix(0)
+    perturbation = below @ value.circuit.feedback_matrix(0, tied=exact)
     motor.output_error = perturbation
     motor.drive = _damped(motor, perturbation)
 

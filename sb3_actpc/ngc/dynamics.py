@@ -100,12 +100,16 @@ class SettlingChain:
             self.drive.copy_(self.output_error)
             self.circuit.output_activation.damp(self.drive, self.output_prediction, self.output)
 
-    def feedback_to(self, layer: int) -> th.Tensor:
-        """(E_l e_{l+1}) ⊙ φ'(z_l), what the layer below tells hidden layer ``layer`` (1 = first) of its error, (B, n)."""
+    def feedback_to(self, layer: int, exact: bool = False) -> th.Tensor:
+        """
+        (E_l e_{l+1}) ⊙ φ'(z_l), what the layer below tells hidden layer ``layer`` (1 = first) of its error, (B, n).
+
+        With ``exact`` through W^T and with φ', whatever the circuit uses.
+        """
         circuit = self.circuit
         below = self.drive if layer == self.n_hidden else self.errors[layer]
-        signal = th.mm(below, circuit.feedback_matrix(layer), out=self.feedback[layer - 1])
-        if not circuit.derivative_free:
+        signal = th.mm(below, circuit.feedback_matrix(layer, tied=exact), out=self.feedback[layer - 1])
+        if exact or not circuit.derivative_free:
             circuit.activation.damp(signal, self.latents[layer], self.activations[layer])
         return signal
 
@@ -146,17 +150,17 @@ class SettlingChain:
             if self.target is not None:
                 self._refresh_output_error()
 
-    def sweep(self) -> None:
+    def sweep(self, exact: bool = False) -> None:
         """
         The scheduled shortcut: every layer's error is taken at the step when it first arrives, the states at projection.
 
         From ago109/active-neural-generative-coding, ``src/model/ngc.py``. With tied feedback this is, numerically, the
-        gradient of the output's loss.
+        gradient of the output's loss; with ``exact`` it is so for every circuit.
         """
         self.feedback = [th.empty_like(z) for z in self.latents[1:]]
         self.errors = self.feedback
         for layer in range(self.n_hidden, 0, -1):
-            self.feedback_to(layer)
+            self.feedback_to(layer, exact)
 
     def state(self) -> SettledState:
         """The state reached so far (tensors are handed over, not copied)."""

@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 import torch as th
 from stable_baselines3.common.env_checker import check_env
+from stable_baselines3.common.envs import BitFlippingEnv
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_actpc import ActPC, Demonstrations
 from tests.actpc.envs import CountingEnv
@@ -476,6 +478,38 @@ def test_learning_rates_of_circuits_and_error_synapses_follow_the_schedule():
     model.train(1, 16)
     actor, critic = ([g["lr"] for g in c.optimizer.param_groups] for _, c in model.policy.named_circuits()[:2])
     assert actor == pytest.approx([2.5e-3, 0.9 * 2.5e-3]) and critic == pytest.approx([0.5e-3, 0.45e-3])
+
+
+@pytest.mark.parametrize("n_envs", [1, 2])
+def test_hindsight_relabels_goals_and_rewards_of_drawn_transitions_but_neither_signals_nor_the_newest(n_envs):
+    env = DummyVecEnv([lambda: BitFlippingEnv(n_bits=6, continuous=True) for _ in range(n_envs)])
+    model = ActPC("MultiInputPolicy", env, **SMALL, replay_buffer_class=HerReplayBuffer, alpha_ep=0.5)
+    model.learning_starts = 40
+    model.learn(120)
+    buffer = model.replay_buffer
+    np.random.seed(0)
+    batch = buffer.sample(200)
+    np.random.seed(0)
+    rows, envs = buffer._draw(200 - n_envs)
+    raw = buffer._gather(
+        np.concatenate([np.full(n_envs, buffer.newest), rows]), np.concatenate([np.arange(n_envs), envs]), None
+    )
+    changed = (batch.observations["desired_goal"] != raw.observations["desired_goal"]).any(dim=1)
+    assert not changed[:n_envs].any() and 0.5 < changed.float().mean() < 0.9
+    assert th.equal(batch.epistemic, raw.epistemic) and th.equal(batch.actions, raw.actions)
+    achieved = (batch.next_observations["achieved_goal"] == batch.next_observations["desired_goal"]).all(dim=1)
+    assert th.equal(batch.rewards.squeeze(1), achieved.float() - 1.0)  # BitFlipping: 0 at the goal, else -1
+
+
+def test_a_second_learn_cuts_the_episode_it_interrupts():
+    model = make(working_memory=True, memory_history=3, learning_starts=1000)
+    model.learn(7)  # stops in the second episode, two steps in
+    assert model.replay_buffer.dones[6, 0] == 0
+    model.learn(2)  # resets the environment
+    assert model.replay_buffer.dones[6, 0] == 1 and model.replay_buffer.timeouts[6, 0] == 1
+    mask = model.replay_buffer._history_at(np.array([7, 8]), np.zeros(2, int), None)["history_mask"]
+    assert mask.tolist() == [[0, 0, 0], [0, 0, 1]]
+    assert len(model.replay_buffer._running[0]) == 2
 
 
 def test_vec_normalize_relabels_the_task_reward_alone():

@@ -3,7 +3,7 @@
 import pytest
 import torch as th
 
-from sb3_actpc.ngc import NGCCircuit, settle_coupled
+from sb3_actpc.ngc import NGCCircuit, policy_gradient, settle_coupled
 from tests.ngc import oracle
 
 
@@ -28,7 +28,7 @@ def test_scheduled_changes_equal_backprop(hidden, output_activation, activation)
         assert th.allclose(change, -synapse.grad, atol=1e-5)
 
 
-def policy_gradient(actor: NGCCircuit, critic: NGCCircuit, x: th.Tensor) -> list[th.Tensor]:
+def gradient_by_autograd(actor: NGCCircuit, critic: NGCCircuit, x: th.Tensor) -> list[th.Tensor]:
     """∂ mean_a Q(x, μ(x)) by the actor's weights and biases, by autograd."""
     weights, biases = oracle.synapses(actor)
     action = oracle.forward(actor, weights, biases, x)
@@ -48,7 +48,7 @@ def test_the_coupled_pair_under_scheduled_is_the_policy_gradient(hidden):
     actor, critic, x = make_pair(hidden, settling="scheduled")
     before = [p.clone() for p in critic.state_dict().values()]
     changes = actor.hebbian_update(settle_coupled(actor, critic, x).actor)
-    for change, gradient in zip(changes.tensors(), policy_gradient(actor, critic, x), strict=True):
+    for change, gradient in zip(changes.tensors(), gradient_by_autograd(actor, critic, x), strict=True):
         assert th.allclose(change, gradient, atol=1e-6)
     assert all(th.equal(a, b) for a, b in zip(before, critic.state_dict().values(), strict=True))
 
@@ -56,7 +56,7 @@ def test_the_coupled_pair_under_scheduled_is_the_policy_gradient(hidden):
 def test_the_coupled_pair_tends_to_the_policy_gradient_as_it_settles_and_the_nudge_shrinks():
     actor, critic, x = (m.double() for m in make_pair(n_settling_steps=200))
     changes = actor.hebbian_update(settle_coupled(actor, critic, x, nudge=1e-7).actor)
-    for change, gradient in zip(changes.tensors(), policy_gradient(actor, critic, x), strict=True):
+    for change, gradient in zip(changes.tensors(), gradient_by_autograd(actor, critic, x), strict=True):
         assert th.allclose(change, gradient, rtol=1e-4, atol=1e-8)
 
 
@@ -76,3 +76,19 @@ def test_a_pair_that_does_not_fit_is_named():
         settle_coupled(actor, NGCCircuit(23, 6), x)
     with pytest.raises(ValueError, match="must agree"):
         settle_coupled(make_pair(settling="scheduled")[0], critic, x)
+
+
+def test_policy_gradient_is_exact_whatever_the_feedback():
+    actor, critic, x = make_pair(feedback="learned", derivative_free=True)
+    exact = policy_gradient(actor, critic, x)
+    for change, gradient in zip(exact.tensors(), gradient_by_autograd(actor, critic, x), strict=True):
+        assert th.allclose(change, gradient, atol=1e-6)
+
+
+def test_the_coupled_pair_starts_along_the_policy_gradient_with_the_default_settings():
+    actor, critic, x = make_pair(hidden=(256, 256))
+    changes = actor.hebbian_update(settle_coupled(actor, critic, x).actor)
+    exact = policy_gradient(actor, critic, x)
+    pairs = list(zip(changes.weights, exact.weights, strict=True))
+    print("cosine", [oracle.cosine(c, g) for c, g in pairs], "ratio", [float(c.norm() / g.norm()) for c, g in pairs])
+    assert min(oracle.cosine(c, g) for c, g in pairs) > 0.9
