@@ -18,7 +18,7 @@ from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 from sb3_actpc.cli import main
 from sb3_actpc.common.demonstrations import Demonstrations
 from sb3_actpc.training import ALGORITHMS, RunConfig, play_episodes, train_run
-from sb3_actpc.training.config import find_demonstrations, load_preset, parse_assignments
+from sb3_actpc.training.config import find_demonstrations, load_preset, parse_assignments, parse_schedule
 from sb3_actpc.training.video import RenderingUnavailable, choose_gl_backend
 
 EPISODE_LENGTH = 10
@@ -177,6 +177,15 @@ def test_an_algorithm_with_a_keyword_for_demonstrations_is_given_them() -> None:
     assert SilentTD3.received == Path("demos.npz")
     train_run(RunConfig(ENV_ID, "silent", "plain.yml", demonstrations="none", progress=False, seed=1))
     assert SilentTD3.received is None
+
+
+def test_a_learning_rate_can_fall_linearly_to_zero() -> None:
+    schedule = parse_schedule("lin_4e-4")
+    assert callable(schedule) and [schedule(left) for left in (1.0, 0.5, 0.0)] == pytest.approx([4e-4, 2e-4, 0.0])
+    assert parse_schedule(1e-3) == 1e-3
+    for wrong in ("exp_1e-3", "fast", "lin_fast"):
+        with pytest.raises(ValueError, match="lin_<number>"):
+            parse_schedule(wrong)
 
 
 def test_evaluating_does_not_change_what_is_learned() -> None:

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from functools import reduce
+from os import PathLike
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
@@ -20,6 +21,7 @@ from sb3_actpc.actpc.expert import Expert
 from sb3_actpc.actpc.inputs import Batch, CircuitInputs
 from sb3_actpc.actpc.policies import ActPCActor, ActPCPolicy, CnnPolicy, Critics, MlpPolicy, MultiInputPolicy
 from sb3_actpc.actpc.signals import SIGNAL_ERRORS, make_normalizer, summed_squared_errors
+from sb3_actpc.checkpoints import load_checkpoint, load_weights, save_weights
 from sb3_actpc.common.buffers import _SignalReplay, combined_buffer_class
 from sb3_actpc.common.checks import check_choices, check_finite, check_numbers
 from sb3_actpc.common.demonstrations import Demonstrations, resolve
@@ -81,7 +83,8 @@ class ActPC(OffPolicyAlgorithm):
     :param signal_errors: the signals sum the squared errors of "all" layers (the paper) or of the "output" alone
     :param actor_pressure: weight of the critic's pressure on the actor; 0 leaves refresh alone (cloning)
     :param scale_pressure: divide the pressure by the batch's mean absolute action-value
-    :param nudge: scale of the critic's clamped error while actor and critic settle as one (1 is the paper's)
+    :param nudge: scale of the critic's clamped error while actor and critic settle as one (the paper's is 1); None for
+        1e-5, or 1 with ``dynamics="state"``
     :param critic_warmup: updates before the critic's pressure reaches the actor
     :param n_critics: critic circuits; with two or more the smallest target value bootstraps
     :param bootstrap: "joint" (target critic at the target actor's next action, the appendix) or "literal" (at the action
@@ -157,7 +160,7 @@ class ActPC(OffPolicyAlgorithm):
         signal_errors: str = "all",
         actor_pressure: float = 1.0,
         scale_pressure: bool = False,
-        nudge: float = 0.01,
+        nudge: float | None = None,
         critic_warmup: int = 0,
         n_critics: int = 1,
         bootstrap: str = "joint",
@@ -192,7 +195,7 @@ class ActPC(OffPolicyAlgorithm):
             at_least_1="n_critics target_update_interval memory_history",
             fraction="demonstration_fraction",
         )
-        if not 0.0 < nudge <= 1.0:
+        if nudge is not None and not 0.0 < nudge <= 1.0:
             raise ValueError(f"nudge={nudge!r} must be above 0 and at most 1")
         super().__init__(
             policy,
@@ -252,6 +255,7 @@ class ActPC(OffPolicyAlgorithm):
         self.working_memory = working_memory
         self.memory_history = memory_history
         self.observation_normalization = observation_normalization
+        self.signal_normalizer = signal_normalizer
         self.epistemic_normalizer = make_normalizer(signal_normalizer)
         self.instrumental_normalizer = make_normalizer(signal_normalizer)
         self.pretrained = False
@@ -613,6 +617,74 @@ class ActPC(OffPolicyAlgorithm):
         progress_bar: bool = False,
     ) -> SelfActPC:
         return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+
+    def checkpoint_state(self) -> dict[str, Any]:
+        """What a checkpoint (:mod:`sb3_actpc.checkpoints`) keeps beside SB3's state: plain values and arrays."""
+        expert = self.expert
+        return {
+            "pretrained": self.pretrained,
+            "rollout_state": self._rollout_state,
+            "rollout_starts": self._rollout_starts,
+            "normalizers": [dict(vars(self.epistemic_normalizer)), dict(vars(self.instrumental_normalizer))],
+            "expert_signals": None if expert is None else [expert.epistemic, expert.instrumental],
+            "diagnostics": dict(self.diagnostics.values),
+        }
+
+    def restore_checkpoint_state(self, state: dict[str, Any]) -> None:
+        """
+        :param state: what :meth:`checkpoint_state` returned
+        :raises ValueError: when it was taken with other demonstrations
+        """
+        signals = state["expert_signals"]
+        stored, present = (0 if signals is None else len(signals[0])), (0 if self.expert is None else len(self.expert))
+        if stored != present:
+            raise ValueError(
+                f"the checkpoint's agent has {stored} demonstrated transitions, this one {present}: pass the same "
+                "demonstrations="
+            )
+        if self.expert is not None:
+            self.expert.epistemic, self.expert.instrumental = signals
+        self.pretrained, self._rollout_state = state["pretrained"], state["rollout_state"]
+        self._rollout_starts = state["rollout_starts"]
+        normalizers = self.epistemic_normalizer, self.instrumental_normalizer
+        for normalizer, values in zip(normalizers, state["normalizers"], strict=True):
+            vars(normalizer).update(values)
+        self.diagnostics.values = dict(state["diagnostics"])
+
+    @classmethod
+    def load_checkpoint(cls: type[SelfActPC], path: str | PathLike[str], env: GymEnv | str, **keywords: Any) -> SelfActPC:
+        """
+        Go on from a checkpoint: see :func:`sb3_actpc.checkpoints.load_checkpoint` and ``continue_learning`` there.
+
+        :param path: a checkpoint, or the folder of several: the newest whole one is taken
+        :param env: an environment made as the stopped run's
+        :param keywords: constructor keywords that replace the stored ones, such as ``demonstrations``
+        """
+        return load_checkpoint(cls, path, env, **keywords)
+
+    def save_weights(self, path: str | PathLike[str]) -> Path:
+        """
+        Write weights and settings into a file that cannot run code: see :func:`sb3_actpc.checkpoints.save_weights`.
+
+        :param path: file to write; ``.safetensors`` is added where it is missing
+        :return: the file
+        """
+        return save_weights(self, path)
+
+    @classmethod
+    def from_weights(cls: type[SelfActPC], path: str | PathLike[str], env: GymEnv | str, **keywords: Any) -> SelfActPC:
+        """
+        An agent from a file of :meth:`save_weights`: see :func:`sb3_actpc.checkpoints.load_weights`.
+
+        :param path: the file
+        :param env: the environment, or its id
+        :param keywords: constructor keywords that replace the stored ones; ``demonstrations`` are not in the file
+        """
+        with_demonstrations = keywords.get("demonstrations") is not None
+        needing = () if with_demonstrations else ("observation_normalization", "demonstration_fraction", "actor_warm_start")
+        model = load_weights(cls, path, env, without=needing, **keywords)
+        model.pretrained = True  # the weights hold what the demonstrations taught
+        return model
 
     def _excluded_save_params(self) -> list[str]:
         aliases = ["actor", "critic", "generator", "prior", "actor_target", "critic_target"]

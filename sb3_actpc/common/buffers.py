@@ -97,6 +97,20 @@ class _SignalReplay(ReplayBuffer):
         super().reset()
         self._running = [[] for _ in range(self.n_envs)]
 
+    # ------------------------------------------------------------------ checkpoints
+
+    def checkpoint_state(self) -> dict[str, Any]:
+        """What a checkpoint keeps beside the arrays with a row per step: the episodes begun and the self-imitation memory."""
+        running = [_joined_steps(steps) for steps in self._running]
+        memory = None if self.self_imitation is None else self.self_imitation.checkpoint_state()
+        return {"running": running, "self_imitation": memory}
+
+    def restore_checkpoint_state(self, state: dict[str, Any]) -> None:
+        """:param state: what :meth:`checkpoint_state` returned"""
+        self._running = [_split_steps(steps) for steps in state["running"]]
+        if self.self_imitation is not None and state["self_imitation"] is not None:
+            self.self_imitation.restore_checkpoint_state(state["self_imitation"])
+
     # ------------------------------------------------------------------ sampling
 
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> SignalReplaySamples:  # type: ignore[override]
@@ -257,6 +271,35 @@ class CombinedHerReplayBuffer(_SignalReplay, HerReplayBuffer):  # type: ignore[m
             batch.next_observations[key][index] = virtual.next_observations[key]
         batch.rewards[index] = virtual.rewards
         return batch
+
+
+def _joined_steps(steps: list[tuple[Any, np.ndarray, float]]) -> dict[str, Any] | None:
+    """The steps of an episode as arrays with a row each; None before its first."""
+    if not steps:
+        return None
+    first = steps[0][0]
+    if isinstance(first, dict):
+        observations: Observations = {key: np.stack([step[0][key] for step in steps]) for key in first}
+    else:
+        observations = np.stack([step[0] for step in steps])
+    return {
+        "observations": observations,
+        "actions": np.stack([step[1] for step in steps]),
+        "rewards": np.array([step[2] for step in steps]),
+    }
+
+
+def _split_steps(joined: dict[str, Any] | None) -> list[tuple[Any, np.ndarray, float]]:
+    """The inverse of :func:`_joined_steps`."""
+    if joined is None:
+        return []
+    rewards = joined["rewards"].tolist()
+    observations = joined["observations"]
+    if isinstance(observations, dict):
+        rows: list[Any] = [dict(zip(observations, parts, strict=True)) for parts in zip(*observations.values(), strict=True)]
+    else:
+        rows = list(observations)
+    return list(zip(rows, joined["actions"], rewards, strict=True))
 
 
 def combined_buffer_class(

@@ -125,6 +125,20 @@ class SelfImitationMemory:
         self._joined = None
         return True
 
+    def checkpoint_state(self) -> dict[str, Any]:
+        """The stored episodes and their returns, for a checkpoint."""
+        parts = [{"observations": episode.observations, "actions": episode.actions} for episode in self._episodes]
+        return {"returns": list(self.returns), "episodes": parts}
+
+    def restore_checkpoint_state(self, state: dict[str, Any]) -> None:
+        """:param state: what :meth:`checkpoint_state` returned"""
+        self.returns = deque(state["returns"])
+        self._episodes = deque(
+            Episodes(part["observations"], part["actions"], np.zeros(len(part["actions"]), dtype=np.int64))
+            for part in state["episodes"]
+        )
+        self._joined = None
+
     @property
     def episodes(self) -> Episodes:
         """All stored episodes laid end to end."""

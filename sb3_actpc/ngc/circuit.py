@@ -9,7 +9,7 @@ from torch import nn
 from sb3_actpc.ngc.activations import get_activation
 from sb3_actpc.ngc.dynamics import DYNAMICS, SettledState, SettlingChain, predict
 from sb3_actpc.ngc.plasticity import SYNAPTIC_SCALINGS, HebbianChanges, bound_columns_, hebbian_changes, soft_bound_
-from sb3_actpc.ngc.stability import power_iteration_, settling_rates
+from sb3_actpc.ngc.stability import arrival_fractions, power_iteration_, settling_rates
 
 SETTLINGS = ("iterative", "scheduled")
 FEEDBACKS = ("learned", "tied")
@@ -44,6 +44,9 @@ class NGCCircuit(nn.Module):
     :param dynamics: "error" (error neurons integrate, states follow their predictions) or "state" (eq. 1 to the letter);
         same fixed points, see :class:`~sb3_actpc.ngc.dynamics.SettlingChain`
     :param settling_rate: β, a number in (0, 1], or "auto": kept inside the stable range as the synapses grow
+    :param compensate_arrival: divide every layer's error by the share of the output's error that K steps had time to bring
+        there (:func:`~sb3_actpc.ngc.stability.arrival_fractions`; 1 for large K). Without it the first layers' changes shrink by
+        orders of magnitude as the rates follow the growing synapses, faster than an adaptive optimiser forgets
     :param leak: γ of eq. 1; 0 by default
     :param feedback: "tied" (``feedback_scale`` W^T) or "learned" (own error synapses E, started independently of W: the
         paper's; they take some thousand updates to align with W^T, so that a fresh circuit learns little at first)
@@ -74,6 +77,7 @@ class NGCCircuit(nn.Module):
         n_settling_steps: int = 10,
         dynamics: str = "error",
         settling_rate: float | str = "auto",
+        compensate_arrival: bool = True,
         leak: float = 0.0,
         feedback: str = "tied",  # the paper's is "learned"; see above
         feedback_scale: float = 1.0,
@@ -119,6 +123,7 @@ class NGCCircuit(nn.Module):
         self.activation = get_activation(activation)
         self.output_activation = get_activation(output_activation)
         self.settling, self.n_settling_steps, self.dynamics = settling, n_settling_steps, dynamics
+        self.compensate_arrival = compensate_arrival
         self.settling_rate, self.leak, self.derivative_free = settling_rate, leak, derivative_free
         self.feedback, self.feedback_scale, self.feedback_rate = feedback, feedback_scale, feedback_rate
         self.synaptic_scaling, self.weight_bound = synaptic_scaling, weight_bound
@@ -219,7 +224,8 @@ class NGCCircuit(nn.Module):
             chain.sweep()
             return chain.state()
         chain.start_settling()
-        rates = self.rates.tolist()
+        rates = self.rates.tolist()[: self.n_hidden]
+        chain.arrived = arrival_fractions(tuple(rates), self.n_settling_steps)
         for _ in range(self.n_settling_steps if self.n_hidden else 0):
             chain.integrate(rates)
             chain.predict()
@@ -254,7 +260,10 @@ class NGCCircuit(nn.Module):
 
         For the error synapses see :attr:`HebbianChanges.feedback`. Nothing is changed yet: :meth:`apply_changes` does that.
         """
-        return hebbian_changes(state.postsynaptic, state.activations, state.memory, self.memory_weight)
+        errors = state.postsynaptic
+        if self.compensate_arrival:
+            errors = [e if share == 1.0 else e / share for e, share in zip(errors, state.arrived, strict=True)]
+        return hebbian_changes(errors, state.activations, state.memory, self.memory_weight)
 
     def parameter_groups(self, learning_rate: float) -> list[dict[str, Any]]:
         """

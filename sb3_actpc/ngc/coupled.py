@@ -7,8 +7,9 @@ import torch as th
 from sb3_actpc.ngc.circuit import NGCCircuit
 from sb3_actpc.ngc.dynamics import SettledState, SettlingChain
 from sb3_actpc.ngc.plasticity import HebbianChanges
+from sb3_actpc.ngc.stability import arrival_fractions
 
-COUPLED_RATE = 0.5  # with its output error clamped the pair has no loop: any rate up to 1 is stable
+COUPLED_RATE = 0.5  # "error" dynamics under a clamped output error have no loop: any rate up to 1 is stable
 
 
 @dataclass
@@ -25,7 +26,7 @@ class CoupledState:
 
 
 def settle_coupled(
-    actor: NGCCircuit, critic: NGCCircuit, x: th.Tensor, memory: th.Tensor | None = None, nudge: float = 0.01
+    actor: NGCCircuit, critic: NGCCircuit, x: th.Tensor, memory: th.Tensor | None = None, nudge: float | None = None
 ) -> CoupledState:
     """
     Project actor and critic, hold the action, clamp the critic's output error to +1/A and settle both as one circuit.
@@ -35,13 +36,14 @@ def settle_coupled(
 
     The clamped error is applied as ``nudge`` / A and the actor's errors are divided by ``nudge`` afterwards: the smaller the
     nudge, the closer the settled errors are to those of an infinitesimal perturbation, and the actor's change to the
-    deterministic policy gradient (tied feedback). 1 is the paper's.
+    deterministic policy gradient (tied feedback). The paper's is 1. ``dynamics="error"`` keeps errors apart from the states
+    and can take any; under ``dynamics="state"`` a small one drowns in the rounding of z - z̄.
 
     :param actor: observation (and memory) -> action
     :param critic: [observation, action] -> action-values; its last A inputs are the action
     :param x: observations, (B, n_observation)
     :param memory: the actor's m_t, (B, n_memory), or None
-    :param nudge: scale of the perturbation, in (0, 1]
+    :param nudge: scale of the perturbation, in (0, 1]; None for 1e-5 under the actor's ``dynamics="error"``, else 1
     :return: the actor's state, the actions and their values
     :raises ValueError: when the critic's error synapses do not reach the actor's outputs, or the schedules differ
     """
@@ -51,11 +53,13 @@ def settle_coupled(
             f"the critic has n_inputs={critic.sizes[0]} and n_feedback_inputs={critic.n_feedback_inputs}; under this actor it "
             f"needs {x.shape[1] + n_actions} and {n_actions}"
         )
-    if actor.settling != critic.settling:
-        raise ValueError(f"actor settling={actor.settling!r} and critic settling={critic.settling!r} must agree")
+    for name in ("settling", "n_settling_steps"):
+        if getattr(actor, name) != getattr(critic, name):
+            raise ValueError(f"actor {name}={getattr(actor, name)!r} and critic {name}={getattr(critic, name)!r} must agree")
     motor = SettlingChain(actor, x, memory)
     value = SettlingChain(critic, th.cat([x, motor.output], dim=1), None)
-    scale = nudge if actor.settling == "iterative" else 1.0
+    default = 1e-5 if actor.dynamics == "error" else 1.0
+    scale = 1.0 if actor.settling == "scheduled" else nudge or default
     value.clamp_output_drive(_damped(value, th.full_like(value.output, scale / value.output.shape[1])))
     if actor.settling == "scheduled":
         _sweep_both(motor, value)
@@ -93,11 +97,11 @@ def _sweep_both(motor: SettlingChain, value: SettlingChain, exact: bool = False)
 def _settle_both(motor: SettlingChain, value: SettlingChain) -> None:
     value.start_settling()
     motor.start_settling()
-    value_rates = [COUPLED_RATE] * value.n_hidden
-    motor_rates = [COUPLED_RATE] * motor.n_hidden
-    actor_waits = value.n_hidden  # steps until the critic's first layer has an error to pass on
-    for step in range(value.circuit.n_settling_steps):
-        if step >= actor_waits:
+    value_rates, motor_rates = _coupled_rates(value), _coupled_rates(motor)
+    n_steps, actor_waits = value.circuit.n_settling_steps, value.n_hidden
+    motor.arrived = arrival_fractions((*motor_rates, *value_rates), n_steps)[: motor.n_hidden + 1]
+    for step in range(n_steps):
+        if step >= actor_waits:  # only now has the critic's first layer an error to pass on
             _clamp_actor(motor, value)
             motor.integrate(motor_rates)
         value.integrate(value_rates)
@@ -105,6 +109,14 @@ def _settle_both(motor: SettlingChain, value: SettlingChain) -> None:
             motor.predict(output=False)
         value.predict(output=False)
     _clamp_actor(motor, value)
+
+
+def _coupled_rates(chain: SettlingChain) -> list[float]:
+    """The circuit's own rates; with the default dynamics, where the pair has no loop to keep stable, a larger one."""
+    circuit = chain.circuit
+    if circuit.dynamics == "error" and circuit.settling_rate == "auto":
+        return [COUPLED_RATE] * chain.n_hidden
+    return circuit.rates.tolist()[: chain.n_hidden]
 
 
 def _clamp_actor(motor: SettlingChain, value: SettlingChain, exact: bool = False) -> None:

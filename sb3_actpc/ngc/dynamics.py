@@ -22,6 +22,7 @@ class SettledState:
     :param errors: e = z - z̄, L tensors; ``errors[l]`` belongs to the layer that ``weights[l]`` predicts
     :param output_drive: the output's error times g', what reaches the synapses and the layer above (B, n_outputs)
     :param memory: the working memory m_t, (B, n_memory), or None
+    :param arrived: the share of the output's error that has had time to reach each layer, L numbers in (0, 1]
     """
 
     latents: list[th.Tensor]
@@ -29,6 +30,7 @@ class SettledState:
     errors: list[th.Tensor]
     output_drive: th.Tensor
     memory: th.Tensor | None
+    arrived: tuple[float, ...]
 
     @property
     def postsynaptic(self) -> list[th.Tensor]:
@@ -71,6 +73,7 @@ class SettlingChain:
         self.n_hidden = len(self.latents) - 1
         self.lowest_reached = self.n_hidden + 1
         self.target: th.Tensor | None = None
+        self.arrived = (1.0,) * (self.n_hidden + 1)
         self.drive = self.output_prediction  # replaced as soon as the output is clamped
         self.errors: list[th.Tensor] = []
 
@@ -171,6 +174,7 @@ class SettlingChain:
             errors=[*self.errors, self.output_error],
             output_drive=self.drive,
             memory=self.memory,
+            arrived=self.arrived,
         )
 
 

@@ -1,11 +1,12 @@
 """Rates at which settling is stable: spectral norms by power iteration, and the limits that follow from them."""
 
 import math
+from functools import lru_cache
 
 import torch as th
 
 MAX_AUTO_RATE = 0.3  # activations with kinks chatter at larger rates (batch-mean energy rises by 0.1 %)
-SAFETY = 0.5  # share of the stability limit that "auto" uses
+SAFETY = 0.05  # share of the stability limit that "auto" uses: how deep K = 10 settles; see README, "Settling depth"
 
 
 def power_iteration_(matrix: th.Tensor, vector: th.Tensor, n_iterations: int = 1) -> th.Tensor:
@@ -45,6 +46,25 @@ def error_dynamics_limit(forward_norms: list[float], feedback_norms: list[float]
     eigenvalues = th.linalg.eigvals(matrix)
     limits = -2.0 * eigenvalues.real / eigenvalues.abs().square()
     return float(limits.min())
+
+
+@lru_cache(maxsize=256)
+def arrival_fractions(rates: tuple[float, ...], n_steps: int) -> tuple[float, ...]:
+    """
+    How much of a constant output error has arrived at every layer after ``n_steps`` steps, if nothing answered it.
+
+    Error neurons that integrate what the layer below tells them, ``e_l <- e_l + β_l (e_{l+1} - e_l)``, pass an error on like a
+    queue; with one rate β the fraction at distance d from the output is the chance that a Binomial(n_steps, β) reaches d.
+
+    :param rates: β of every hidden layer, first to last
+    :param n_steps: K
+    :return: fractions in (0, 1], first hidden layer to output (whose fraction is 1)
+    """
+    arrived = [0.0] * len(rates) + [1.0]
+    for _ in range(n_steps):
+        for layer, rate in enumerate(rates):  # first to last: each reads what the next held a step ago
+            arrived[layer] += rate * (arrived[layer + 1] - arrived[layer])
+    return tuple(max(fraction, 1e-12) for fraction in arrived)
 
 
 def settling_rates(dynamics: str, forward_norms: list[float], feedback_norms: list[float]) -> list[float]:

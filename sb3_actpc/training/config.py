@@ -14,6 +14,7 @@ from typing import Any
 import torch as th
 import yaml
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_actpc.common.demonstrations import shipped_demonstrations
 
@@ -192,6 +193,25 @@ def load_preset(preset: str, env_id: str) -> dict[str, Any]:
     if not isinstance(settings, Mapping):
         raise ValueError(f"{path}: expected a mapping under {env_id!r} or 'default', found {settings!r}")
     return {str(key): _with_floats(value) for key, value in settings.items()}
+
+
+def parse_schedule(value: float | str) -> float | LinearSchedule:
+    """A learning rate, or as in rl-zoo3 ``lin_3e-4``: falling linearly to zero at the end of training.
+
+    :param value: a number, or a text such as ``"lin_3e-4"``
+    :return: the number, or the schedule
+    :raises ValueError: when it is neither
+    """
+    if not isinstance(value, str):
+        return value
+    prefix, _, number = value.partition("_")
+    try:
+        start = float(number)
+    except ValueError as error:
+        raise ValueError(f"learning_rate={value!r} must be a number or lin_<number>, such as lin_3e-4") from error
+    if prefix != "lin":
+        raise ValueError(f"learning_rate={value!r} must be a number or lin_<number>, such as lin_3e-4")
+    return LinearSchedule(start, 0.0, 1.0)
 
 
 def parse_assignments(assignments: Iterable[str]) -> dict[str, Any]:

@@ -24,7 +24,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_actpc.common.demonstrations import Demonstrations
 from sb3_actpc.common.files import atomic_write
-from sb3_actpc.training.config import RunConfig, RunPlan, load_algorithm, resolve_run
+from sb3_actpc.training.config import RunConfig, RunPlan, load_algorithm, parse_schedule, resolve_run
 from sb3_actpc.training.evaluation import EvaluationCallback, play_episodes
 from sb3_actpc.training.report import plot_learning_curve
 
@@ -197,6 +197,8 @@ def build_model(plan: RunPlan, config: RunConfig, env: VecEnv) -> OffPolicyAlgor
     :raises ValueError: when a setting has a wrong value
     """
     kwargs = dict(plan.algorithm_kwargs)
+    if "learning_rate" in kwargs:
+        kwargs["learning_rate"] = parse_schedule(kwargs["learning_rate"])
     if plan.uses_demonstrations:
         kwargs["demonstrations"] = plan.demonstrations
     if plan.noise is not None:

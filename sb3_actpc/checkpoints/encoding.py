@@ -1,0 +1,269 @@
+"""Plain values to JSON and arrays, and back: what a checkpoint can hold without running code when it is read."""
+
+from __future__ import annotations
+
+import math
+import random
+import types
+from collections import OrderedDict, defaultdict, deque
+from collections.abc import Mapping
+from enum import Enum
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from gymnasium.envs.registration import EnvSpec
+from stable_baselines3.common.monitor import ResultsWriter
+from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.running_mean_std import RunningMeanStd
+from stable_baselines3.common.vec_env.stacked_observations import StackedObservations
+
+_NOT_NUMBERS = {"nan": math.nan, "inf": math.inf, "-inf": -math.inf}
+_ARRAY_KINDS = "biuf"
+# what a value of these types holds is made anew by the constructors, or never changes
+_LEFT_ALONE: tuple[type, ...] = (
+    type,
+    np.dtype,
+    Enum,
+    EnvSpec,
+    ResultsWriter,
+    gym.Env,
+    types.FunctionType,
+    types.MethodType,
+    types.BuiltinFunctionType,
+    types.ModuleType,
+    th.device,
+)
+_LEFT_ALONE_NAMES = ("mujoco._structs.MjModel", "gymnasium.envs.mujoco.mujoco_rendering.MujocoRenderer")
+# objects whose attributes are written one by one into an object of the same class that is there already
+_TRANSPARENT: tuple[type, ...] = (RunningMeanStd, StackedObservations, ActionNoise)
+
+
+class OpaqueValue(ValueError):
+    """A value that cannot be written without running code when it is read.
+
+    :param where: path of the value
+    :param value: the value
+    """
+
+    def __init__(self, where: str, value: Any) -> None:
+        self.where = where
+        super().__init__(f"{where}: a {type(value).__module__}.{type(value).__qualname__} cannot be stored as plain data")
+
+
+class Encoder:
+    """Turns values into JSON; the arrays and tensors in them are collected beside it.
+
+    Kinds: None, bool, int, float, str, list, tuple, dict, deque, set, bytes, NumPy scalars and arrays of numbers, tensors,
+    NumPy's and Python's random generators, spaces (their generators), and objects of a few known classes.
+    """
+
+    def __init__(self) -> None:
+        self.arrays: dict[str, np.ndarray] = {}
+        self.tensors: dict[str, th.Tensor] = {}
+        self._open: set[int] = set()
+
+    def encode(self, value: Any, where: str) -> Any:
+        """
+        :param value: what to store
+        :param where: its path, for the message and for the names of arrays
+        :return: JSON
+        :raises OpaqueValue: when it, or something in it, is of another kind or contains itself
+        """
+        if value is None or isinstance(value, (bool, str)) or type(value) is int:
+            return value
+        if type(value) is float:
+            return value if math.isfinite(value) else {"number": str(value)}
+        if isinstance(value, (np.ndarray, np.generic, th.Tensor)):
+            return self._array(value, where)
+        if isinstance(value, (list, tuple, deque, set, dict)):
+            return self._container(value, where)
+        return self._object(value, where)
+
+    def _array(self, value: np.ndarray | np.generic | th.Tensor, where: str) -> dict[str, Any]:
+        if isinstance(value, th.Tensor):
+            name = f"{where}#{len(self.tensors)}"
+            self.tensors[name] = value.detach()
+            return {"tensor": name}
+        if value.dtype.kind not in _ARRAY_KINDS or value.dtype.itemsize > 8:
+            if isinstance(value, np.ndarray) and value.dtype == object and value.size == 0:
+                return {"empty": list(value.shape)}
+            raise OpaqueValue(where, value)
+        name = f"{where}#{len(self.arrays)}"
+        self.arrays[name] = np.asarray(value)
+        return {"scalar" if isinstance(value, np.generic) else "array": name}
+
+    def _container(self, value: Any, where: str) -> Any:
+        if id(value) in self._open:
+            raise OpaqueValue(where, value)
+        self._open.add(id(value))
+        try:
+            if isinstance(value, dict):
+                kind = "ordered" if type(value) is OrderedDict else "dict"
+                pairs = value.items()
+                return {kind: [[self.encode(key, where), self.encode(part, f"{where}.{key}")] for key, part in pairs]}
+            parts = [self.encode(part, f"{where}.{index}") for index, part in enumerate(value)]
+        finally:
+            self._open.discard(id(value))
+        if isinstance(value, deque):
+            return {"deque": parts, "maxlen": value.maxlen}
+        if isinstance(value, tuple) and hasattr(value, "_fields"):
+            raise OpaqueValue(where, value)
+        return parts if isinstance(value, list) else {"tuple" if isinstance(value, tuple) else "set": parts}
+
+    def _object(self, value: Any, where: str) -> dict[str, Any]:
+        if isinstance(value, np.random.Generator):
+            return {"generator": self.encode(value.bit_generator.state, where)}
+        if isinstance(value, np.random.RandomState):
+            return {"random_state": self.encode(value.get_state(legacy=False), where)}
+        if isinstance(value, random.Random):
+            return {"random": self.encode(value.getstate(), where)}
+        if isinstance(value, bytes):
+            return {"bytes": value.hex()}
+        if isinstance(value, spaces.Space):
+            return {"space": self.encode(space_generators(value), where)}
+        if isinstance(value, _LEFT_ALONE) or f"{type(value).__module__}.{type(value).__qualname__}" in _LEFT_ALONE_NAMES:
+            return {"left": type(value).__qualname__}
+        if isinstance(value, _TRANSPARENT):
+            return {"object": type(value).__qualname__, "attributes": self.encode(vars(value), where)}
+        raise OpaqueValue(where, value)
+
+
+class Decoder:
+    """The inverse of :class:`Encoder`.
+
+    :param arrays: by the names that the encoder gave
+    :param tensors: likewise
+    """
+
+    def __init__(self, arrays: Mapping[str, np.ndarray], tensors: Mapping[str, th.Tensor]) -> None:
+        self.arrays, self.tensors = arrays, tensors
+
+    def decode(self, node: Any, existing: Any = None) -> Any:
+        """
+        :param node: JSON that :meth:`Encoder.encode` returned
+        :param existing: the value that is there now; generators, spaces and objects are changed in place
+        :return: the value, new where it could be made new
+        :raises ValueError: when the JSON is of another form, or the existing value of another kind
+        """
+        if not isinstance(node, (dict, list)):
+            return node
+        if isinstance(node, list):
+            old = existing if isinstance(existing, list) else []
+            return [self.decode(part, old[index] if index < len(old) else None) for index, part in enumerate(node)]
+        kind = next(iter(node), None)
+        method = getattr(self, f"_{kind}", None)
+        if method is None:
+            raise ValueError(f"a value of the unknown kind {kind!r} is stored: the file was written by another version")
+        return method(node, existing)
+
+    def _number(self, node: dict[str, Any], existing: Any) -> float:
+        return _NOT_NUMBERS[node["number"]]
+
+    def _array(self, node: dict[str, Any], existing: Any) -> np.ndarray:
+        return self.arrays[node["array"]].copy()
+
+    def _scalar(self, node: dict[str, Any], existing: Any) -> Any:
+        return self.arrays[node["scalar"]][()]
+
+    def _tensor(self, node: dict[str, Any], existing: Any) -> th.Tensor:
+        return self.tensors[node["tensor"]].clone()
+
+    def _empty(self, node: dict[str, Any], existing: Any) -> np.ndarray:
+        return np.empty(node["empty"], dtype=object)
+
+    def _tuple(self, node: dict[str, Any], existing: Any) -> tuple[Any, ...]:
+        return tuple(self.decode(part) for part in node["tuple"])
+
+    def _set(self, node: dict[str, Any], existing: Any) -> set[Any]:
+        return {self.decode(part) for part in node["set"]}
+
+    def _deque(self, node: dict[str, Any], existing: Any) -> deque[Any]:
+        return deque((self.decode(part) for part in node["deque"]), maxlen=node["maxlen"])
+
+    def _bytes(self, node: dict[str, Any], existing: Any) -> bytes:
+        return bytes.fromhex(node["bytes"])
+
+    def _dict(self, node: dict[str, Any], existing: Any) -> dict[Any, Any]:
+        old = existing if isinstance(existing, dict) else {}
+        new = {}
+        for key_node, part in node["dict"]:
+            key = self.decode(key_node)
+            new[key] = self.decode(part, old.get(key))
+        if isinstance(existing, defaultdict):
+            existing.clear()
+            existing.update(new)
+            return existing
+        return new
+
+    def _ordered(self, node: dict[str, Any], existing: Any) -> OrderedDict[Any, Any]:
+        return OrderedDict(self._dict({"dict": node["ordered"]}, existing))
+
+    def _generator(self, node: dict[str, Any], existing: Any) -> np.random.Generator:
+        state = self.decode(node["generator"])
+        name = state["bit_generator"]
+        if isinstance(existing, np.random.Generator) and existing.bit_generator.state["bit_generator"] == name:
+            existing.bit_generator.state = state
+            return existing
+        kinds: dict[str, Any] = {kind.__name__: kind for kind in (np.random.PCG64, np.random.MT19937, np.random.Philox)}
+        if name not in kinds:
+            raise ValueError(f"the generator {name!r} is unknown; expected one of {sorted(kinds)}")
+        generator = np.random.Generator(kinds[name]())
+        generator.bit_generator.state = state
+        return generator
+
+    def _random_state(self, node: dict[str, Any], existing: Any) -> np.random.RandomState:
+        made = existing if isinstance(existing, np.random.RandomState) else np.random.RandomState()
+        made.set_state(self.decode(node["random_state"]))
+        return made
+
+    def _random(self, node: dict[str, Any], existing: Any) -> random.Random:
+        made = existing if isinstance(existing, random.Random) else random.Random()
+        made.setstate(self.decode(node["random"]))
+        return made
+
+    def _space(self, node: dict[str, Any], existing: Any) -> Any:
+        if isinstance(existing, spaces.Space):
+            restore_space_generators(existing, self.decode(node["space"]))
+        return existing
+
+    def _left(self, node: dict[str, Any], existing: Any) -> Any:
+        return existing
+
+    def _object(self, node: dict[str, Any], existing: Any) -> Any:
+        if type(existing).__qualname__ != node["object"]:
+            found = type(existing).__qualname__
+            raise ValueError(f"expected a {node['object']}, found a {found}: make it as it was made before")
+        for name, value in self.decode(node["attributes"], vars(existing)).items():
+            setattr(existing, name, value)
+        return existing
+
+
+def _subspaces(space: spaces.Space) -> list[spaces.Space]:
+    """The space and all spaces in it, in a fixed order."""
+    parts: list[spaces.Space] = []
+    if isinstance(space, spaces.Dict):
+        parts = list(space.spaces.values())
+    elif isinstance(space, (spaces.Tuple, spaces.OneOf)):
+        parts = list(space.spaces)
+    return [space, *(inner for part in parts for inner in _subspaces(part))]
+
+
+def space_generators(space: spaces.Space) -> list[dict[str, Any] | None]:
+    """
+    :param space: a space, with spaces in it or without
+    :return: the state of each one's generator, None where it has not been used
+    """
+    return [None if part._np_random is None else dict(part._np_random.bit_generator.state) for part in _subspaces(space)]
+
+
+def restore_space_generators(space: spaces.Space, states: list[dict[str, Any] | None]) -> None:
+    """
+    :param space: a space of the same form
+    :param states: what :func:`space_generators` returned
+    """
+    for part, state in zip(_subspaces(space), states, strict=True):
+        if state is not None:
+            part.np_random.bit_generator.state = state

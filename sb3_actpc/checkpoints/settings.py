@@ -1,0 +1,167 @@
+"""Constructor settings as plain values: classes by their names, looked up in a fixed table when they are read."""
+
+from __future__ import annotations
+
+import inspect
+import os
+from collections.abc import Mapping
+from enum import Enum
+from typing import Any
+
+import numpy as np
+import torch as th
+from stable_baselines3.common import buffers as sb3_buffers
+from stable_baselines3.common import torch_layers
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.noise import (
+    ActionNoise,
+    NormalActionNoise,
+    OrnsteinUhlenbeckActionNoise,
+    VectorizedActionNoise,
+)
+from stable_baselines3.common.type_aliases import TrainFreq
+from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
+from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
+
+from sb3_actpc.common import buffers
+
+_ACTIVATIONS = ("ReLU", "LeakyReLU", "Tanh", "ELU", "GELU", "SiLU", "Mish", "Sigmoid", "Softplus", "Identity", "ReLU6")
+_OPTIMIZERS = ("Adam", "AdamW", "SGD", "RMSprop", "Adamax", "NAdam", "RAdam", "Adagrad")
+_BUFFERS = ("CombinedReplayBuffer", "CombinedNStepReplayBuffer", "CombinedDictReplayBuffer", "CombinedHerReplayBuffer")
+CLASSES: dict[str, type] = {
+    **{f"torch.nn.{name}": getattr(th.nn, name) for name in _ACTIVATIONS},
+    **{f"torch.optim.{name}": getattr(th.optim, name) for name in _OPTIMIZERS},
+    **{f"sb3.{name}": getattr(torch_layers, name) for name in ("FlattenExtractor", "CombinedExtractor", "NatureCNN")},
+    **{f"sb3.{name}": getattr(sb3_buffers, name) for name in ("ReplayBuffer", "DictReplayBuffer", "NStepReplayBuffer")},
+    "sb3.HerReplayBuffer": HerReplayBuffer,
+    **{f"sb3_actpc.{name}": getattr(buffers, name) for name in _BUFFERS},
+}
+_NAMES = {kind: name for name, kind in CLASSES.items()}
+_SCHEDULES: dict[str, tuple[Any, tuple[str, ...]]] = {
+    "linear": (LinearSchedule, ("start", "end", "end_fraction")),
+    "constant": (ConstantSchedule, ("val",)),
+}
+_NOISES: dict[str, tuple[Any, dict[str, str]]] = {
+    "normal": (NormalActionNoise, {"mean": "_mu", "sigma": "_sigma"}),
+    "ornstein-uhlenbeck": (
+        OrnsteinUhlenbeckActionNoise,
+        {"mean": "_mu", "sigma": "_sigma", "theta": "_theta", "dt": "_dt"},
+    ),
+}
+# chosen anew by whoever loads, or stored otherwise
+_NOT_STORED = {"self", "env", "policy", "device", "verbose", "tensorboard_log", "_init_setup_model"}
+_ATTRIBUTE_OF = {"stats_window_size": "_stats_window_size"}
+
+
+def constructor_settings(model: BaseAlgorithm) -> dict[str, Any]:
+    """
+    :param model: an SB3 algorithm
+    :return: JSON: its constructor's keywords by name, the policy's name among them; a value that cannot be named is left
+        out and its keyword listed under ``"unnamed"``
+    """
+    record: dict[str, Any] = {"policy": policy_name(model), "keywords": {}, "unnamed": []}
+    for name in inspect.signature(type(model).__init__).parameters:
+        attribute = _ATTRIBUTE_OF.get(name, name)
+        if name in _NOT_STORED or not hasattr(model, attribute):
+            continue
+        try:
+            record["keywords"][name] = _name_value(getattr(model, attribute))
+        except ValueError:
+            record["unnamed"].append(name)
+    return record
+
+
+def read_settings(record: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
+    """
+    :param record: what :func:`constructor_settings` returned
+    :param overrides: keywords that replace the stored ones
+    :return: keywords of the constructor, ``policy`` among them
+    :raises ValueError: when a value has no name in this version, or a keyword that could not be stored is not given
+    """
+    missing = [name for name in record["unnamed"] if name not in overrides]
+    if missing:
+        raise ValueError(f"{', '.join(missing)} could not be stored as plain values: pass the same again, {missing[0]}=...")
+    keywords = {name: read_value(value) for name, value in record["keywords"].items() if name not in overrides}
+    policy = overrides.get("policy", record["policy"])
+    if policy is None:
+        raise ValueError("the policy's class could not be stored by name: pass the same again, policy=...")
+    return {**keywords, **overrides, "policy": policy}
+
+
+def policy_name(model: BaseAlgorithm) -> str | None:
+    """The name under which the algorithm knows its policy's class; None for a class of the user's."""
+    return next((name for name, kind in model.policy_aliases.items() if kind is model.policy_class), None)
+
+
+def _name_value(value: Any) -> Any:
+    """JSON of one setting; every JSON object has one key, the kind of the value."""
+    if isinstance(value, Enum):
+        return value.name.lower()
+    if value is None or isinstance(value, (bool, int, float, str)):
+        return value
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, os.PathLike):
+        return os.fspath(value)
+    if isinstance(value, TrainFreq):
+        return {"tuple": [value.frequency, value.unit.value]}
+    if isinstance(value, dict):
+        if not all(isinstance(key, str) for key in value):
+            raise ValueError(f"{value!r} has keys that are not texts")
+        return {"dict": {key: _name_value(part) for key, part in value.items()}}
+    if isinstance(value, (list, tuple)):
+        parts = [_name_value(part) for part in value]
+        return parts if isinstance(value, list) else {"tuple": parts}
+    return _name_object(value)
+
+
+def _name_object(value: Any) -> dict[str, Any]:
+    if isinstance(value, type) and value in _NAMES:
+        return {"class": _NAMES[value]}
+    if isinstance(value, FloatSchedule):
+        return _name_object(value.value_schedule)
+    if isinstance(value, VectorizedActionNoise):
+        return _name_object(value.base_noise)
+    for name, (kind, attributes) in _SCHEDULES.items():
+        if type(value) is kind:
+            return {"schedule": [name, *(float(getattr(value, attribute)) for attribute in attributes)]}
+    if isinstance(value, ActionNoise):
+        for name, (kind, parameters) in _NOISES.items():
+            if type(value) is kind:
+                return {"noise": [name, {key: np.asarray(vars(value)[part]).tolist() for key, part in parameters.items()}]}
+    raise ValueError(f"{value!r} has no name here")
+
+
+def read_value(node: Any) -> Any:
+    """
+    :param node: what :func:`constructor_settings` stored for one keyword
+    :return: the value
+    :raises ValueError: for a class, a schedule or a noise that is not in the tables
+    """
+    if isinstance(node, list):
+        return [read_value(part) for part in node]
+    if not isinstance(node, dict):
+        return node
+    (kind, content), *others = node.items()
+    if others or kind not in ("tuple", "dict", "class", "schedule", "noise"):
+        raise ValueError(f"a setting is stored as {sorted(node)}, which this version does not know")
+    if kind == "tuple":
+        return tuple(read_value(part) for part in content)
+    if kind == "dict":
+        return {key: read_value(part) for key, part in content.items()}
+    return _read_object(kind, content)
+
+
+def _read_object(kind: str, content: Any) -> Any:
+    tables: dict[str, Mapping[str, Any]] = {"class": CLASSES, "schedule": _SCHEDULES, "noise": _NOISES}
+    table = tables[kind]
+    name = content if kind == "class" else content[0]
+    if not isinstance(name, str) or name not in table:
+        raise ValueError(f"the {kind} {name!r} is not one of {sorted(table)}: it is not loaded")
+    if kind == "class":
+        return table[name]
+    if kind == "schedule":
+        return table[name][0](*map(float, content[1:]))
+    make, parameters = table[name]
+    values = {key: np.asarray(content[1][key], dtype=np.float64) for key in parameters}
+    return make(**{key: value if value.ndim else float(value) for key, value in values.items()})

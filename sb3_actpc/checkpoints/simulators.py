@@ -1,0 +1,247 @@
+"""Environments in the middle of an episode: simulator, wrappers' counters and generators, as plain data."""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper, VecNormalize
+
+from sb3_actpc.checkpoints.encoding import Decoder, Encoder, OpaqueValue
+
+# buffers of the current step, and what the constructors make anew
+_SKIPPED = {"venv", "env", "class_attributes", "results_writer", "obs_spaces", "metadata", "_metadata", "spec", "_cached_spec"}
+_SKIPPED_WALL_TIME = {"t_start"}
+_DUMMY_SKIPPED = {"envs", "buf_infos", "reset_infos", "keys", "actions"}
+
+
+def vec_env_layers(env: VecEnv) -> list[VecEnv]:
+    """The environment, the one it wraps, and so on, outermost first."""
+    layers = [env]
+    while isinstance(layers[-1], VecEnvWrapper):
+        layers.append(layers[-1].venv)
+    return layers
+
+
+def env_layers(env: gym.Env[Any, Any]) -> list[gym.Env[Any, Any]]:
+    """The wrappers of one environment, outermost first, and the environment itself."""
+    layers = [env]
+    while isinstance(layers[-1], gym.Wrapper):
+        layers.append(layers[-1].env)
+    return layers
+
+
+def env_name(env: VecEnv) -> str:
+    """The Gymnasium id of the task, or the class of an environment that has none; never an empty text."""
+    spec = env.get_attr("spec", indices=0)[0] if env.has_attr("spec") else None
+    if spec is not None:
+        return str(spec.id)
+    innermost = vec_env_layers(env)[-1]
+    if isinstance(innermost, DummyVecEnv):
+        return type(innermost.envs[0].unwrapped).__qualname__
+    return type(innermost).__qualname__
+
+
+def capture_vec_env(env: VecEnv, encoder: Encoder, where: str) -> dict[str, Any]:
+    """
+    :param env: the training environment, with its wrappers
+    :param encoder: takes the values
+    :param where: path of the environment in the checkpoint
+    :return: JSON; environments whose state cannot be stored are named in it with the reason
+    """
+    *wrappers, innermost = vec_env_layers(env)
+    record: dict[str, Any] = {"wrappers": [], "envs": []}
+    for index, wrapper in enumerate(wrappers):
+        name = f"{where}.{type(wrapper).__qualname__}{index}"
+        record["wrappers"].append(_capture_wrapper(wrapper, encoder, name))
+    if not isinstance(innermost, DummyVecEnv):
+        reason = f"the environments of a {type(innermost).__qualname__} run in other processes"
+        record["envs"] = [{"reason": reason} for _ in range(env.num_envs)]
+        return record
+    for index, one in enumerate(innermost.envs):
+        record["envs"].append(_capture_env(one, encoder, f"{where}.{index}"))
+    return record
+
+
+def restore_vec_env(env: VecEnv, record: dict[str, Any], decoder: Decoder) -> list[tuple[int, str]]:
+    """
+    :param env: an environment made as the captured one was
+    :param record: what :func:`capture_vec_env` returned
+    :param decoder: gives the values back
+    :return: (index, reason) of each environment whose episode must start again
+    :raises ValueError: when the environment is wrapped in another way
+    """
+    *wrappers, innermost = vec_env_layers(env)
+    kinds, stored = [type(wrapper).__qualname__ for wrapper in wrappers], [entry["class"] for entry in record["wrappers"]]
+    if kinds != stored or len(record["envs"]) != env.num_envs:
+        raise ValueError(
+            f"the checkpoint's environment has {len(record['envs'])} copies wrapped in {stored}, this one {env.num_envs} "
+            f"wrapped in {kinds}: make it as it was made before"
+        )
+    lost = []
+    for index, entry in enumerate(record["envs"]):
+        one = innermost.envs[index] if isinstance(innermost, DummyVecEnv) else None
+        reason = entry.get("reason") or _layers_mismatch(one, entry)
+        if one is not None:
+            _restore_env(one, entry, decoder, generators_only=reason is not None)
+        if reason is not None:
+            lost.append((index, reason))
+    for wrapper, entry in zip(wrappers, record["wrappers"], strict=True):
+        _restore_attributes(wrapper, entry["attributes"], decoder)
+    _forget_seeds(innermost)
+    return lost
+
+
+def restart_episode(env: VecEnv, index: int, observations: Any) -> None:
+    """
+    Reset one environment and put its first observation into those of all.
+
+    :param env: the training environment, with its wrappers
+    :param index: which environment
+    :param observations: (n_envs, *obs_shape), or a dict of such, not normalised; changed in place
+    """
+    innermost = vec_env_layers(env)[-1]
+    if isinstance(innermost, DummyVecEnv):
+        first = innermost.envs[index].reset()[0]
+    else:
+        first = innermost.env_method("reset", indices=[index])[0][0]
+    for layer in vec_env_layers(env):
+        if isinstance(layer, VecNormalize):
+            layer.returns[index] = 0.0
+    if isinstance(observations, dict):
+        for key, rows in observations.items():
+            rows[index] = first[key]
+    else:
+        observations[index] = first
+
+
+# ------------------------------------------------------------------ one environment
+
+
+def _capture_env(env: gym.Env[Any, Any], encoder: Encoder, where: str) -> dict[str, Any]:
+    layers = env_layers(env)
+    record: dict[str, Any] = {"classes": [type(layer).__qualname__ for layer in layers], "layers": []}
+    for depth, layer in enumerate(layers):
+        attributes: dict[str, Any] = {}
+        for name, value in vars(layer).items():
+            if name in _SKIPPED or name in _SKIPPED_WALL_TIME:
+                continue
+            try:
+                attributes[name] = _encode_attribute(layer, name, value, encoder, f"{where}.{depth}.{name}")
+            except OpaqueValue as error:
+                record.setdefault("reason", str(error))
+        record["layers"].append(attributes)
+    return record
+
+
+def _encode_attribute(layer: Any, name: str, value: Any, encoder: Encoder, where: str) -> Any:
+    if _is_physics(value):
+        return {"physics": encoder.encode(capture_physics(value.model, value), where)}
+    return encoder.encode(value, where)
+
+
+def _layers_mismatch(env: gym.Env[Any, Any] | None, entry: dict[str, Any]) -> str | None:
+    classes = None if env is None else [type(layer).__qualname__ for layer in env_layers(env)]
+    if classes == entry.get("classes"):
+        return None
+    return f"it is wrapped as {classes}, the checkpoint's as {entry.get('classes')}"
+
+
+def _restore_env(env: gym.Env[Any, Any], entry: dict[str, Any], decoder: Decoder, generators_only: bool) -> None:
+    for layer, attributes in zip(env_layers(env), entry.get("layers", []), strict=False):
+        for name, node in attributes.items():
+            if generators_only and not _is_generator(node):
+                continue
+            if isinstance(node, dict) and "physics" in node:
+                data = getattr(layer, name)
+                restore_physics(data.model, data, decoder.decode(node["physics"]))
+            else:
+                _set_attribute(layer, name, node, decoder)
+
+
+def _restore_attributes(layer: Any, attributes: dict[str, Any], decoder: Decoder) -> None:
+    for name, node in attributes.items():
+        _set_attribute(layer, name, node, decoder)
+
+
+def _set_attribute(layer: Any, name: str, node: Any, decoder: Decoder) -> None:
+    existing = vars(layer).get(name)
+    if isinstance(node, dict) and "left" in node:
+        return
+    value = decoder.decode(node, existing)
+    if value is not existing:
+        setattr(layer, name, value)
+
+
+def _is_generator(node: Any) -> bool:
+    return isinstance(node, dict) and bool({"generator", "random_state", "random", "space"} & node.keys())
+
+
+def _capture_wrapper(wrapper: VecEnv, encoder: Encoder, where: str) -> dict[str, Any]:
+    attributes = {}
+    for name, value in vars(wrapper).items():
+        if name in _SKIPPED or name in _SKIPPED_WALL_TIME:
+            continue
+        try:
+            attributes[name] = encoder.encode(value, f"{where}.{name}")
+        except OpaqueValue:  # wrappers of vectorised environments hold settings besides what is known to change
+            continue
+    return {"class": type(wrapper).__qualname__, "attributes": attributes}
+
+
+def _forget_seeds(innermost: VecEnv) -> None:
+    """Seeds given before are for the first reset, which the stopped run has had."""
+    innermost._reset_seeds()
+    innermost._reset_options()
+
+
+# ------------------------------------------------------------------ MuJoCo
+
+
+def _is_physics(value: Any) -> bool:
+    return type(value).__name__ == "MjData" and type(value).__module__.startswith("mujoco")
+
+
+def capture_physics(model: Any, data: Any) -> dict[str, np.ndarray]:
+    """
+    :param model: ``mujoco.MjModel``
+    :param data: ``mujoco.MjData``
+    :return: the full integration state, (n,) float64 under "", and every other array of ``data`` by its name, since some of
+        them lag behind the state
+    """
+    mujoco = importlib.import_module("mujoco")
+    kind = mujoco.mjtState.mjSTATE_INTEGRATION
+    state = np.empty(mujoco.mj_stateSize(model, kind))
+    mujoco.mj_getState(model, data, state, kind)
+    return {"": state, **{name: np.array(value) for name, value in _physics_arrays(data).items()}}
+
+
+def restore_physics(model: Any, data: Any, arrays: dict[str, np.ndarray]) -> None:
+    """
+    :param model: ``mujoco.MjModel`` of the same simulation
+    :param data: ``mujoco.MjData``, changed
+    :param arrays: what :func:`capture_physics` returned
+    :raises ValueError: when they are of another simulation
+    """
+    mujoco = importlib.import_module("mujoco")
+    kind = mujoco.mjtState.mjSTATE_INTEGRATION
+    if len(arrays[""]) != mujoco.mj_stateSize(model, kind):
+        raise ValueError(
+            f"the checkpoint's simulator has a state of size {len(arrays[''])}, this one of "
+            f"{mujoco.mj_stateSize(model, kind)}: use the same task and the same MuJoCo"
+        )
+    mujoco.mj_setState(model, data, arrays[""], kind)
+    mujoco.mj_forward(model, data)
+    for name, value in _physics_arrays(data).items():
+        stored = arrays.get(name)
+        if stored is not None and stored.shape == value.shape:
+            value[...] = stored
+
+
+def _physics_arrays(data: Any) -> dict[str, np.ndarray]:
+    """Arrays whose size the model fixes (those of constraints and contacts change from step to step)."""
+    named = {name: getattr(data, name) for name in dir(data) if not name.startswith("_")}
+    fixed = {name: value for name, value in named.items() if isinstance(value, np.ndarray) and value.dtype.kind in "biuf"}
+    return {name: value for name, value in fixed.items() if value.size and not name.startswith(("efc_", "iefc_", "contact"))}

@@ -1,0 +1,468 @@
+"""What a checkpoint holds of an SB3 off-policy algorithm, and how it is put back."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import inspect
+import random
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from weakref import WeakKeyDictionary
+
+import numpy as np
+import safetensors.numpy
+import safetensors.torch
+import torch as th
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import CSVOutputFormat
+from stable_baselines3.common.noise import VectorizedActionNoise
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.save_util import recursive_getattr
+from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
+
+from sb3_actpc.checkpoints.bundle import Bundle, BundleWriter, Report
+from sb3_actpc.checkpoints.encoding import Decoder, Encoder, OpaqueValue
+from sb3_actpc.checkpoints.simulators import capture_vec_env, env_name, restore_vec_env
+
+_COUNTERS = (
+    "num_timesteps",
+    "_total_timesteps",
+    "_num_timesteps_at_start",
+    "_n_updates",
+    "_n_calls",
+    "_episode_num",
+    "_current_progress_remaining",
+    "exploration_rate",
+    "_last_obs",
+    "_last_original_obs",
+    "_last_episode_starts",
+    "ep_info_buffer",
+    "ep_success_buffer",
+)
+_BUFFER_CURSORS = ("pos", "full", "_current_ep_start")
+_NOISE_MATRICES = ("exploration_mat", "exploration_matrices")  # of SB3's state-dependent exploration
+_CALLBACK_SKIPPED = {"model", "locals", "globals", "parent", "callback", "callbacks", "logger"}
+_LOGGER_VALUES = ("name_to_value", "name_to_count", "name_to_excluded")
+_RECORDED_PACKAGES = ("sb3-actpc", "stable-baselines3", "torch", "gymnasium", "mujoco", "numpy", "safetensors")
+
+
+@dataclass
+class Resumed:
+    """What can only be put back once ``learn`` has begun.
+
+    :param state: the checkpoint's plain values
+    :param decoder: gives them back
+    """
+
+    state: dict[str, Any]
+    decoder: Decoder
+
+
+_RESUMED: WeakKeyDictionary[BaseAlgorithm, Resumed] = WeakKeyDictionary()
+
+
+def take_resumed(model: BaseAlgorithm) -> Resumed | None:
+    """What :func:`restore_model` left for the start of ``learn``, once; None where there is nothing."""
+    return _RESUMED.pop(model, None)
+
+
+# ------------------------------------------------------------------ writing
+
+
+def capture_model(
+    model: OffPolicyAlgorithm, callbacks: Sequence[BaseCallback], writer: BundleWriter, gradient_steps_left: int = 0
+) -> None:
+    """
+    Write everything that the rest of the training depends on.
+
+    :param model: the agent, between two steps of the environment
+    :param callbacks: whose state is kept
+    :param writer: takes the files
+    :param gradient_steps_left: updates that the interrupted ``train()`` had still to do
+    :raises ValueError: when a weight is not finite
+    :raises OSError: when the files cannot be written
+    """
+    check_weights(model)
+    encoder = Encoder()
+    assert model.env is not None and model.replay_buffer is not None
+    state = {
+        "counters": {name: encoder.encode(vars(model)[name], name) for name in _COUNTERS if name in vars(model)},
+        "torch": _capture_torch(model, encoder),
+        "generators": encoder.encode(_generators(model), "generators"),
+        "spaces": encoder.encode([model.action_space, model.observation_space], "spaces"),
+        "noise": encoder.encode(model.action_noise, "noise"),
+        "env": capture_vec_env(model.env, encoder, "env"),
+        "buffer": _capture_buffer(model.replay_buffer, encoder, writer),
+        "own": encoder.encode(_own_state(model), "own"),
+        "callbacks": [[name, _capture_callback(callback, encoder, name)] for name, callback in named(callbacks)],
+        "logger": _capture_logger(model, encoder),
+        "gradient_steps_left": gradient_steps_left,
+    }
+    tensors = {name: tensor.cpu().contiguous().clone() for name, tensor in encoder.tensors.items()}
+    writer.add_bytes("tensors.safetensors", safetensors.torch.save(tensors))
+    arrays = {name: np.ascontiguousarray(array).reshape(array.shape) for name, array in encoder.arrays.items()}
+    writer.add_bytes("arrays.safetensors", safetensors.numpy.save(arrays))
+    writer.add_json("state.json", state)
+
+
+def describe_model(model: OffPolicyAlgorithm, env_id: str) -> dict[str, Any]:
+    """
+    :param model: the agent
+    :param env_id: name of its task
+    :return: plain values by which a checkpoint of another agent or task is recognised, and the versions
+    """
+    assert model.env is not None and model.replay_buffer is not None
+    return {
+        "agent": {
+            "algorithm": type(model).__name__,
+            "env": env_id,
+            "n_envs": model.n_envs,
+            "observation_space": str(model.observation_space),
+            "action_space": str(model.action_space),
+            "replay_buffer": type(model.replay_buffer).__name__,
+            "buffer_size": model.replay_buffer.buffer_size,
+            "weights": {name: list(tensor.shape) for name, tensor in model.policy.state_dict().items()},
+        },
+        "versions": {name: _version(name) for name in _RECORDED_PACKAGES},
+    }
+
+
+def check_weights(model: OffPolicyAlgorithm) -> None:
+    """:raises ValueError: naming the first weight that is NaN or infinite"""
+    for name, parameter in model.policy.named_parameters():
+        if not bool(th.isfinite(parameter).all()):
+            raise ValueError(
+                f"{name}: weights are not finite at step {model.num_timesteps}; lower the learning rate, bound the weights or "
+                "normalise the observations, and go on from the last good checkpoint"
+            )
+
+
+def named(callbacks: Sequence[BaseCallback]) -> list[tuple[str, BaseCallback]]:
+    """Each callback with its class's name and its number among those of that class."""
+    seen: dict[str, int] = {}
+    result = []
+    for callback in callbacks:
+        kind = type(callback).__qualname__
+        seen[kind] = seen.get(kind, 0) + 1
+        result.append((f"{kind}{seen[kind]}", callback))
+    return result
+
+
+def _version(package: str) -> str:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:  # a source checkout, or an extra that is not installed
+        return "unknown"
+
+
+def _generators(model: OffPolicyAlgorithm) -> dict[str, Any]:
+    states = {"python": random.getstate(), "numpy": np.random.get_state(legacy=False), "torch": th.get_rng_state()}
+    if model.device.type == "cuda":
+        states["cuda"] = th.cuda.get_rng_state(model.device)
+    return states
+
+
+def _restore_generators(model: OffPolicyAlgorithm, states: dict[str, Any]) -> None:
+    random.setstate(states["python"])
+    np.random.set_state(states["numpy"])
+    th.set_rng_state(states["torch"])
+    if "cuda" in states and model.device.type == "cuda":
+        th.cuda.set_rng_state(states["cuda"], model.device)
+
+
+def _capture_torch(model: OffPolicyAlgorithm, encoder: Encoder) -> dict[str, Any]:
+    dicts, variables = model._get_torch_save_params()
+    record = {
+        "dicts": {name: encoder.encode(dict(recursive_getattr(model, name).state_dict()), name) for name in dicts},
+        "variables": {name: encoder.encode(recursive_getattr(model, name), name) for name in variables},
+    }
+    matrices = _noise_matrices(model)
+    record["noise"] = {name: encoder.encode(getattr(matrices, name), name) for name in _NOISE_MATRICES if matrices}
+    return record
+
+
+def _noise_matrices(model: OffPolicyAlgorithm) -> Any:
+    return getattr(getattr(model, "actor", None), "action_dist", None) if model.use_sde else None
+
+
+def _own_state(model: OffPolicyAlgorithm) -> Any:
+    """What an algorithm keeps beside SB3's, from its method ``checkpoint_state``; None without one."""
+    method: Callable[[], Any] | None = getattr(model, "checkpoint_state", None)
+    return None if method is None else method()
+
+
+# ------------------------------------------------------------------ buffers
+
+
+def stored_rows(buffer: ReplayBuffer) -> int:
+    """How many rows of the buffer's arrays are in use; with ``optimize_memory_usage`` the next one holds an observation."""
+    return buffer.buffer_size if buffer.full else min(buffer.pos + 1, buffer.buffer_size)
+
+
+def buffer_arrays(buffer: ReplayBuffer) -> dict[str, np.ndarray]:
+    """
+    :param buffer: a replay buffer of SB3's or of this package
+    :return: its arrays with a row per step, (buffer_size, n_envs, ...), by name; dictionaries' as ``name.key``
+    """
+    arrays: dict[str, np.ndarray] = {}
+    for name, value in vars(buffer).items():
+        parts = {f"{name}.{key}": part for key, part in value.items()} if isinstance(value, dict) else {name: value}
+        for path, part in parts.items():
+            if isinstance(part, np.ndarray) and part.dtype != object and name not in _BUFFER_CURSORS:
+                if part.shape[:1] == (buffer.buffer_size,):
+                    arrays[path] = part
+    return arrays
+
+
+def _capture_buffer(buffer: ReplayBuffer, encoder: Encoder, writer: BundleWriter) -> dict[str, Any]:
+    rows = stored_rows(buffer)
+    arrays = buffer_arrays(buffer)
+    files = {name: f"buffer_{index:02d}_{_file_name(name)}.npy" for index, name in enumerate(arrays)}
+    for name, array in arrays.items():
+        writer.add_array(files[name], array[:rows])
+    own: Callable[[], Any] | None = getattr(buffer, "checkpoint_state", None)
+    infos = buffer.infos[:rows].tolist() if isinstance(buffer, HerReplayBuffer) and buffer.copy_info_dict else None
+    return {
+        "rows": rows,
+        "files": files,
+        "cursors": {name: encoder.encode(vars(buffer)[name], name) for name in _BUFFER_CURSORS if name in vars(buffer)},
+        "own": encoder.encode(None if own is None else own(), "buffer"),
+        "infos": encoder.encode(infos, "infos"),
+    }
+
+
+def _file_name(name: str) -> str:
+    return "".join(letter if letter.isalnum() else "_" for letter in name)
+
+
+def _restore_buffer(buffer: ReplayBuffer, record: dict[str, Any], bundle: Bundle, decoder: Decoder) -> None:
+    was_used = buffer.full or buffer.pos > 0
+    rows = record["rows"]
+    for name, array in buffer_arrays(buffer).items():
+        bundle.read_array_into(record["files"][name], array[:rows])
+        if was_used:
+            array[rows:] = 0
+    for name, node in record["cursors"].items():
+        setattr(buffer, name, decoder.decode(node))
+    own = decoder.decode(record["own"])
+    if own is not None:
+        buffer.restore_checkpoint_state(own)  # type: ignore[attr-defined]
+    infos = decoder.decode(record["infos"])
+    if infos is not None and isinstance(buffer, HerReplayBuffer):
+        for row, entries in enumerate(infos):
+            buffer.infos[row] = entries
+
+
+def _check_buffer(buffer: ReplayBuffer, record: dict[str, Any], bundle: Bundle) -> None:
+    arrays = buffer_arrays(buffer)
+    if arrays.keys() != record["files"].keys():
+        raise ValueError(f"{bundle.path}: its replay buffer holds {sorted(record['files'])}, this one {sorted(arrays)}")
+    for name, array in arrays.items():
+        shape, dtype = bundle.array_header(record["files"][name])
+        if (shape[1:], dtype) != (array.shape[1:], array.dtype):
+            raise ValueError(
+                f"{bundle.path}: its replay buffer's {name} have shape {shape[1:]} and type {dtype}, this one's "
+                f"{array.shape[1:]} and {array.dtype}"
+            )
+
+
+def _cut_running_episodes(buffer: ReplayBuffer) -> None:
+    """The episodes begun will not be finished: as ``cut_running_episodes`` of this package's buffers does it."""
+    cut: Callable[[], None] | None = getattr(buffer, "cut_running_episodes", None)
+    if cut is not None:
+        cut()
+    elif isinstance(buffer, HerReplayBuffer):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            buffer.truncate_last_trajectory()
+    elif buffer.full or buffer.pos > 0:
+        newest = (buffer.pos - 1) % buffer.buffer_size
+        open_ends = buffer.dones[newest] == 0
+        buffer.dones[newest][open_ends] = 1.0
+        buffer.timeouts[newest][open_ends] = 1.0
+
+
+# ------------------------------------------------------------------ callbacks and logger
+
+
+def _capture_callback(callback: BaseCallback, encoder: Encoder, where: str) -> dict[str, Any]:
+    own: Callable[[], Any] | None = getattr(callback, "checkpoint_state", None)
+    if own is not None:
+        return {"own": encoder.encode(own(), where)}
+    attributes, envs = {}, {}
+    chosen = inspect.signature(type(callback).__init__).parameters.keys() | _CALLBACK_SKIPPED
+    for name, value in vars(callback).items():
+        if isinstance(value, VecEnv):
+            envs[name] = capture_vec_env(value, encoder, f"{where}.{name}")
+        if isinstance(value, VecEnv) or name in chosen:
+            continue
+        try:
+            attributes[name] = encoder.encode(value, f"{where}.{name}")
+        except OpaqueValue:  # bars, figures, open files: the new callback has its own
+            continue
+    return {"attributes": attributes, "envs": envs}
+
+
+def _restore_callback(callback: BaseCallback, record: dict[str, Any], decoder: Decoder) -> None:
+    if "own" in record:
+        callback.restore_checkpoint_state(decoder.decode(record["own"]))  # type: ignore[attr-defined]
+        return
+    for name, node in record["attributes"].items():
+        if not (isinstance(node, dict) and "left" in node):
+            setattr(callback, name, decoder.decode(node, vars(callback).get(name)))
+    for name, env_record in record["envs"].items():
+        restore_vec_env(vars(callback)[name], env_record, decoder)
+
+
+def _csv_formats(model: BaseAlgorithm) -> list[CSVOutputFormat]:
+    return [output for output in model.logger.output_formats if isinstance(output, CSVOutputFormat)]
+
+
+def _capture_logger(model: OffPolicyAlgorithm, encoder: Encoder) -> dict[str, Any] | None:
+    if not hasattr(model, "_logger"):
+        return None
+    values: dict[str, Any] = {}
+    for name in _LOGGER_VALUES:
+        values[name] = {}
+        for key, value in getattr(model.logger, name).items():
+            try:
+                values[name][key] = encoder.encode(value, f"logger.{key}")
+            except OpaqueValue:  # figures and videos belong to the next dump only
+                continue
+    texts = []
+    for output in _csv_formats(model):
+        output.file.flush()
+        texts.append(Path(output.file.name).read_text(encoding="utf-8"))
+    return {"values": values, "csv": texts}
+
+
+def _restore_logger(model: OffPolicyAlgorithm, record: dict[str, Any], decoder: Decoder) -> None:
+    for name, values in record["values"].items():
+        target = getattr(model.logger, name)
+        target.clear()
+        target.update({key: decoder.decode(node) for key, node in values.items()})
+    for output, text in zip(_csv_formats(model), record["csv"], strict=False):
+        output.file.seek(0)
+        output.file.truncate()
+        output.file.write(text)
+        output.file.flush()
+        header = text.partition("\n")[0]
+        output.keys = header.split(",") if header else []
+
+
+# ------------------------------------------------------------------ reading
+
+
+def restore_model(model: OffPolicyAlgorithm, bundle: Bundle, report: Report) -> None:
+    """
+    Put everything back into an agent that was made with the same settings. Nothing is changed when the two do not fit.
+
+    The rest is put back by :func:`restore_learning` once ``learn(..., reset_num_timesteps=False)`` has begun.
+
+    :param model: the agent, with its environment
+    :param bundle: a checkpoint that was verified
+    :param report: given a line for each environment whose episode starts again
+    :raises ValueError: when the checkpoint is of another algorithm, task, network or buffer
+    """
+    assert model.env is not None and model.replay_buffer is not None
+    state = bundle.read_json("state.json")
+    _check_fit(describe_model(model, env_name(model.env))["agent"], bundle)
+    _check_buffer(model.replay_buffer, state["buffer"], bundle)
+    decoder = Decoder(
+        safetensors.numpy.load(bundle.read_bytes("arrays.safetensors")),
+        safetensors.torch.load(bundle.read_bytes("tensors.safetensors")),
+    )
+    lost = restore_vec_env(model.env, state["env"], decoder)
+    _restore_torch(model, state["torch"], decoder)
+    _restore_buffer(model.replay_buffer, state["buffer"], bundle, decoder)
+    for name, node in state["counters"].items():
+        setattr(model, name, decoder.decode(node))
+    own = decoder.decode(state["own"])
+    if own is not None:
+        model.restore_checkpoint_state(own)  # type: ignore[attr-defined]
+    _restore_noise(model, state["noise"], decoder)
+    _restore_random(model, state, decoder)
+    if lost:
+        _start_episodes_again(model, lost, report)
+    _RESUMED[model] = Resumed(state, decoder)
+
+
+def restore_learning(model: OffPolicyAlgorithm, callbacks: Sequence[BaseCallback], resumed: Resumed, report: Report) -> int:
+    """
+    Put back what the beginning of ``learn`` has changed or made: callbacks, logger, action noise, generators.
+
+    :param model: the agent, at the start of its first rollout
+    :param callbacks: of this ``learn``
+    :param resumed: what :func:`take_resumed` returned
+    :param report: given a line for each callback without a match
+    :return: updates that the interrupted ``train()`` had still to do
+    """
+    state, decoder = resumed.state, resumed.decoder
+    present = dict(named(callbacks))
+    for name, record in state["callbacks"]:
+        if name in present:
+            _restore_callback(present[name], record, decoder)
+        elif "own" in record:
+            report(f"the checkpoint holds the state of a callback {name}, which is not used now")
+    if state["logger"] is not None:
+        _restore_logger(model, state["logger"], decoder)
+    _restore_noise(model, state["noise"], decoder)
+    matrices = _noise_matrices(model)
+    for name, node in state["torch"]["noise"].items():
+        setattr(matrices, name, decoder.decode(node).to(model.device))
+    _restore_random(model, state, decoder)
+    return int(state["gradient_steps_left"])
+
+
+def _check_fit(mine: dict[str, Any], bundle: Bundle) -> None:
+    stored = bundle.manifest["agent"]
+    for name in ("algorithm", "env", "n_envs", "observation_space", "action_space", "replay_buffer", "buffer_size"):
+        if stored[name] != mine[name]:
+            raise ValueError(
+                f"{bundle.path} is a checkpoint with {name}={stored[name]!r}, the agent has {name}={mine[name]!r}: resume "
+                "with the settings and the task of the stopped run"
+            )
+    theirs, own = stored["weights"], mine["weights"]
+    for name in [*own, *(name for name in theirs if name not in own)]:
+        if theirs.get(name) != own.get(name):
+            raise ValueError(
+                f"{bundle.path} is a checkpoint of another network: {name} has shape {theirs.get(name)}, the agent's "
+                f"{own.get(name)}: resume with the settings of the stopped run"
+            )
+
+
+def _restore_torch(model: OffPolicyAlgorithm, record: dict[str, Any], decoder: Decoder) -> None:
+    for name, node in record["dicts"].items():
+        recursive_getattr(model, name).load_state_dict(decoder.decode(node))
+    for name, node in record["variables"].items():
+        recursive_getattr(model, name).data = decoder.decode(node).to(model.device)
+
+
+def _restore_noise(model: OffPolicyAlgorithm, node: Any, decoder: Decoder) -> None:
+    if node is None:
+        return
+    if model.action_noise is None:
+        raise ValueError(f"the checkpoint's agent has the action noise {node['object']}, this one none: pass action_noise=")
+    if node["object"] == VectorizedActionNoise.__name__ and not isinstance(model.action_noise, VectorizedActionNoise):
+        model.action_noise = VectorizedActionNoise(model.action_noise, model.n_envs)
+    decoder.decode(node, model.action_noise)
+
+
+def _restore_random(model: OffPolicyAlgorithm, state: dict[str, Any], decoder: Decoder) -> None:
+    decoder.decode(state["spaces"], [model.action_space, model.observation_space])
+    _restore_generators(model, decoder.decode(state["generators"]))
+
+
+def _start_episodes_again(model: OffPolicyAlgorithm, lost: list[tuple[int, str]], report: Report) -> None:
+    """``learn`` resets the environments when there is no last observation."""
+    assert model.replay_buffer is not None
+    for index, reason in lost:
+        report(f"environment {index} cannot be restored within its episode, all episodes start again: {reason}")
+    _cut_running_episodes(model.replay_buffer)
+    model._last_obs = None

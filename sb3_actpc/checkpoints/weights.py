@@ -1,0 +1,191 @@
+"""Agents made from files alone: from a checkpoint, or from a file of weights that cannot run code."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+import safetensors
+import safetensors.torch
+import torch as th
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.running_mean_std import RunningMeanStd
+from stable_baselines3.common.type_aliases import GymEnv
+from stable_baselines3.common.vec_env import VecNormalize
+
+from sb3_actpc.checkpoints.bundle import Report, _warn, find_bundle
+from sb3_actpc.checkpoints.settings import constructor_settings, read_settings
+from sb3_actpc.checkpoints.state import check_weights, restore_model
+from sb3_actpc.common.files import atomic_write
+
+SelfAlgorithm = TypeVar("SelfAlgorithm", bound=OffPolicyAlgorithm)
+
+FORMAT = "sb3_actpc weights"
+VERSION = 1
+_SUFFIX = ".safetensors"
+_NORMALIZER = "vec_normalize/"
+
+
+def load_checkpoint(
+    algorithm: type[SelfAlgorithm],
+    path: str | os.PathLike[str],
+    env: GymEnv | str,
+    device: th.device | str = "auto",
+    report: Report = _warn,
+    **overrides: Any,
+) -> SelfAlgorithm:
+    """
+    Make an agent with the settings of a checkpoint and put everything back into it; no code is run from the file.
+
+    :param algorithm: the class
+    :param path: a checkpoint, or the folder of several: the newest whole one is taken
+    :param env: an environment made as the stopped run's
+    :param device: where the agent lives
+    :param report: given a line for each damaged checkpoint, and when episodes must start again
+    :param overrides: constructor keywords: those that could not be stored by name, and what may differ (``verbose``, ...)
+    :return: the agent, for :func:`~sb3_actpc.checkpoints.continue_learning`
+    :raises FileNotFoundError: when there is no checkpoint
+    :raises ValueError: when it is damaged, does not fit or was written by a newer version
+    """
+    bundle = find_bundle(path, report)
+    if bundle.manifest["agent"]["algorithm"] != algorithm.__name__:
+        raise ValueError(f"{bundle.path} is a checkpoint of {bundle.manifest['agent']['algorithm']}, not {algorithm.__name__}")
+    keywords = read_settings(bundle.manifest["settings"], overrides)
+    model = algorithm(env=env, device=device, **keywords)
+    restore_model(model, bundle, report)
+    return model
+
+
+def save_weights(model: OffPolicyAlgorithm, path: str | os.PathLike[str]) -> Path:
+    """
+    Write the weights and the constructor's settings, by name, into one safetensors file; VecNormalize's statistics with them.
+
+    :param model: the agent
+    :param path: file to write; ``.safetensors`` is added where it is missing
+    :return: the file
+    :raises ValueError: when a weight is not finite, or the policy or a setting is of a class without a name
+    """
+    check_weights(model)
+    settings = constructor_settings(model)
+    if callable(getattr(model, "learning_rate", None)) and "learning_rate" in settings["unnamed"]:
+        settings["unnamed"].remove("learning_rate")
+        settings["keywords"]["learning_rate"] = float(model.lr_schedule(1.0))
+    unnamed = [name for name in settings["unnamed"] if name not in ("demonstrations", "action_noise")]
+    if settings["policy"] is None or unnamed:
+        what = ", ".join(unnamed) or f"policy={model.policy_class.__name__}"
+        raise ValueError(f"{what} cannot be written by name: only classes of torch, SB3 and sb3_actpc can; use save() instead")
+    settings["unnamed"] = []
+    settings["keywords"].pop("demonstrations", None)
+    header = {
+        "format": FORMAT,
+        "version": VERSION,
+        "algorithm": type(model).__name__,
+        "observation_space": str(model.observation_space),
+        "action_space": str(model.action_space),
+        "settings": settings,
+    }
+    tensors = {name: tensor.detach().cpu().contiguous().clone() for name, tensor in model.policy.state_dict().items()}
+    tensors.update(_normalizer_tensors(model.get_vec_normalize_env()))
+    path = Path(path)
+    path = path if path.suffix == _SUFFIX else path.with_name(path.name + _SUFFIX)
+    with atomic_write(path) as file:
+        file.write(safetensors.torch.save(tensors, metadata={"sb3_actpc": json.dumps(header)}))
+    return path
+
+
+def load_weights(
+    algorithm: type[SelfAlgorithm],
+    path: str | os.PathLike[str],
+    env: GymEnv | str,
+    device: th.device | str = "auto",
+    without: tuple[str, ...] = (),
+    **overrides: Any,
+) -> SelfAlgorithm:
+    """
+    Make an agent from a file of :func:`save_weights`. Nothing in the file is run: it holds numbers and names.
+
+    :param algorithm: the class
+    :param path: the file; ``.safetensors`` may be left out
+    :param env: the environment, or its id
+    :param device: where the agent lives
+    :param without: stored keywords that are left at the constructor's defaults
+    :param overrides: constructor keywords that replace the stored ones
+    :return: the agent; its replay buffer is empty
+    :raises FileNotFoundError: when there is no such file
+    :raises ValueError: when it is no such file, of a newer version, names an unknown class or does not fit the environment
+    """
+    path = Path(path)
+    path = path if path.exists() or path.suffix == _SUFFIX else path.with_name(path.name + _SUFFIX)
+    header, tensors = _read(path)
+    if header["algorithm"] != algorithm.__name__:
+        raise ValueError(f"{path} holds weights of {header['algorithm']}, not {algorithm.__name__}")
+    for name in without:
+        if name not in overrides:
+            header["settings"]["keywords"].pop(name, None)
+    model = algorithm(env=env, device=device, **read_settings(header["settings"], overrides))
+    for name in ("observation_space", "action_space"):
+        if str(getattr(model, name)) != header[name]:
+            raise ValueError(f"{path} was trained with {name}={header[name]}, the environment has {getattr(model, name)}")
+    _restore_normalizer(model.get_vec_normalize_env(), tensors, path)
+    try:
+        model.policy.load_state_dict({name: value for name, value in tensors.items() if not name.startswith(_NORMALIZER)})
+    except RuntimeError as error:
+        raise ValueError(f"{path} does not fit its own settings: {' '.join(str(error).split())}") from error
+    return model
+
+
+def _read(path: Path) -> tuple[dict[str, Any], dict[str, th.Tensor]]:
+    if not path.is_file():
+        raise FileNotFoundError(f"no file of weights at {path}")
+    try:
+        with safetensors.safe_open(path, framework="pt") as file:
+            text = (file.metadata() or {}).get("sb3_actpc", "")
+            tensors = {name: file.get_tensor(name) for name in file.keys()}
+        header = json.loads(text)
+    except (safetensors.SafetensorError, ValueError) as error:
+        raise ValueError(f"{path}: not a file of save_weights ({' '.join(str(error).split())})") from error
+    if not isinstance(header, dict) or header.get("format") != FORMAT:
+        raise ValueError(f"{path}: not a file of save_weights")
+    if header["version"] > VERSION:
+        raise ValueError(
+            f"{path} has format version {header['version']}, this sb3_actpc reads up to {VERSION}: install a newer one"
+        )
+    return header, tensors
+
+
+def _normalizer_statistics(env: VecNormalize) -> dict[str, RunningMeanStd]:
+    """Name -> statistics, of the observations (or each of their keys) and of the returns."""
+    named: dict[str, RunningMeanStd] = {"returns": env.ret_rms}
+    if env.norm_obs and isinstance(env.obs_rms, dict):
+        named.update({f"observations.{key}": value for key, value in env.obs_rms.items()})
+    elif env.norm_obs:
+        named["observations"] = env.obs_rms
+    return named
+
+
+def _normalizer_tensors(env: VecNormalize | None) -> dict[str, th.Tensor]:
+    if env is None:
+        return {}
+    return {
+        f"{_NORMALIZER}{name}/{part}": th.as_tensor(np.array(getattr(statistics, part), dtype=np.float64))
+        for name, statistics in _normalizer_statistics(env).items()
+        for part in ("mean", "var", "count")
+    }
+
+
+def _restore_normalizer(env: VecNormalize | None, tensors: dict[str, th.Tensor], path: Path) -> None:
+    stored = {name.removeprefix(_NORMALIZER) for name in tensors if name.startswith(_NORMALIZER)}
+    present = {} if env is None else _normalizer_statistics(env)
+    if stored != {f"{name}/{part}" for name in present for part in ("mean", "var", "count")}:
+        wanted = "wrap the environment in VecNormalize" if env is None else "wrap the environment as it was in training"
+        raise ValueError(
+            f"{path} holds the VecNormalize statistics {sorted(stored)}, the environment {sorted(present)}: {wanted}"
+        )
+    for name, statistics in present.items():
+        values = {part: tensors[f"{_NORMALIZER}{name}/{part}"].numpy() for part in ("mean", "var", "count")}
+        statistics.mean, statistics.var, statistics.count = values["mean"], values["var"], float(values["count"])
+
+

@@ -1,0 +1,145 @@
+"""Runs that are stopped and resumed, and the comparison with the run that was never stopped."""
+
+from __future__ import annotations
+
+import csv
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import configure
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.save_util import recursive_getattr
+
+from sb3_actpc.checkpoints import CheckpointCallback, TrainingStopped, continue_learning, restore
+from sb3_actpc.checkpoints.state import buffer_arrays
+
+WALL_TIME = {"time/fps", "time/time_elapsed", "wall_seconds"}
+MakeModel = Callable[[], OffPolicyAlgorithm]
+
+
+class StopAt(BaseCallback):
+    """Pretends that SIGTERM came between two rollouts."""
+
+    def __init__(self, step: int, checkpoints: CheckpointCallback) -> None:
+        super().__init__()
+        self.step, self.checkpoints = step, checkpoints
+
+    def _on_rollout_start(self) -> None:
+        if self.num_timesteps >= self.step:
+            self.checkpoints.signals.received = "SIGTERM"
+
+    def _on_step(self) -> bool:
+        return True
+
+
+class StopInUpdate(CheckpointCallback):
+    """Pretends that SIGTERM came in an update of the first ``train()`` after a step."""
+
+    def __init__(self, folder: Path, step: int, update: int, **options: Any) -> None:
+        super().__init__(folder, **options)
+        self.step, self.update = step, update
+
+    def _on_sample(self) -> None:
+        if self.num_timesteps >= self.step and self._samples == self.update:
+            self.signals.received = "SIGTERM"
+        super()._on_sample()
+
+
+def learn_straight(make: MakeModel, folder: Path, n_steps: int, *more: BaseCallback) -> OffPolicyAlgorithm:
+    """The run that is never stopped, and never saved either."""
+    model = make()
+    model.set_logger(configure(str(folder), ["csv"]))
+    return model.learn(n_steps, callback=[*more], log_interval=1)
+
+
+def learn_in_two(
+    make: MakeModel,
+    folder: Path,
+    n_steps: int,
+    stop_at: int,
+    more: Callable[[], list[BaseCallback]] = list,
+    stop_in_update: int | None = None,
+    **options: Any,
+) -> OffPolicyAlgorithm:
+    """The run that is stopped at a step and resumed by a new agent."""
+    first = make()
+    first.set_logger(configure(str(folder), ["csv"]))
+    if stop_in_update is None:
+        checkpoints = CheckpointCallback(folder / "checkpoints", **options)
+        callbacks = [*more(), StopAt(stop_at, checkpoints), checkpoints]
+    else:
+        callbacks = [*more(), StopInUpdate(folder / "checkpoints", stop_at, stop_in_update, **options)]
+    try:
+        first.learn(n_steps, callback=callbacks, log_interval=1)
+    except TrainingStopped as stopped:
+        assert stopped.num_timesteps >= stop_at
+    else:
+        raise AssertionError("the run was not stopped")
+    shutil.copy(folder / "progress.csv", folder / "progress_of_the_stopped_run.csv")
+    second = make()
+    np.random.random(13)
+    th.randn(7)
+    second.action_space.sample()
+    second.set_logger(configure(str(folder), ["csv"]))
+    restore(second, folder / "checkpoints")
+    checkpoints = CheckpointCallback(folder / "checkpoints", **options)
+    return continue_learning(second, [*more(), checkpoints], log_interval=1)
+
+
+def assert_same(one: OffPolicyAlgorithm, other: OffPolicyAlgorithm) -> None:
+    """Weights, optimisers, buffers, counters, normalisers and the next numbers of the generators are equal bit for bit."""
+    for name in one._get_torch_save_params()[0]:
+        assert_equal(recursive_getattr(one, name).state_dict(), recursive_getattr(other, name).state_dict(), name)
+    for name in one._get_torch_save_params()[1]:
+        assert_equal(recursive_getattr(one, name), recursive_getattr(other, name), name)
+    assert one.replay_buffer is not None and other.replay_buffer is not None
+    assert (one.replay_buffer.pos, one.replay_buffer.full) == (other.replay_buffer.pos, other.replay_buffer.full)
+    arrays = buffer_arrays(other.replay_buffer)
+    for name, array in buffer_arrays(one.replay_buffer).items():
+        assert_equal(array, arrays[name], name)
+    for name in ("num_timesteps", "_n_updates", "_episode_num", "_total_timesteps", "_last_obs", "_last_original_obs"):
+        assert_equal(getattr(one, name), getattr(other, name), name)
+    rewards = [[(info["r"], info["l"]) for info in model.ep_info_buffer or ()] for model in (one, other)]
+    assert rewards[0] == rewards[1]
+    mine, theirs = one.get_vec_normalize_env(), other.get_vec_normalize_env()
+    if mine is not None and theirs is not None:
+        for name in ("obs_rms", "ret_rms", "returns", "old_obs", "old_reward"):
+            assert_equal(_plain(getattr(mine, name)), _plain(getattr(theirs, name)), name)
+    if hasattr(one, "checkpoint_state"):
+        assert_equal(one.checkpoint_state(), other.checkpoint_state(), "own state")
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _plain(part) for key, part in value.items()}
+    return dict(vars(value)) if hasattr(value, "var") and not isinstance(value, np.ndarray) else value
+
+
+def assert_equal(one: Any, other: Any, where: str) -> None:
+    """Equal bit for bit, through dictionaries, lists and tuples."""
+    if isinstance(one, dict):
+        assert one.keys() == other.keys(), where
+        for key, value in one.items():
+            assert_equal(value, other[key], f"{where}.{key}")
+    elif isinstance(one, (list, tuple)):
+        assert len(one) == len(other), where
+        for index, (mine, theirs) in enumerate(zip(one, other, strict=True)):
+            assert_equal(mine, theirs, f"{where}.{index}")
+    elif isinstance(one, th.Tensor):
+        assert th.equal(one, other), where
+    elif isinstance(one, np.ndarray):
+        assert one.dtype == other.dtype and one.tobytes() == other.tobytes(), where
+    else:
+        assert one == other, where
+
+
+def log_rows(path: Path) -> list[dict[str, str]]:
+    """Rows of a CSV file without the columns that measure time."""
+    with open(path, newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    return [{key: value for key, value in row.items() if key not in WALL_TIME and value} for row in rows]

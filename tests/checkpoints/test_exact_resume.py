@@ -1,0 +1,179 @@
+"""A run that is stopped and resumed is, bit for bit, the run that was never stopped."""
+
+from copy import deepcopy
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+from stable_baselines3 import DDPG, SAC, TD3
+from stable_baselines3.common.callbacks import EvalCallback
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.envs import BitFlippingEnv
+from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
+from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
+
+import sb3_actpc.envs  # noqa: F401, registers the sparse tasks
+from sb3_actpc import ActPC
+from tests.actpc.envs import CountingEnv
+from tests.actpc.test_agent import demonstrations
+from tests.checkpoints.runs import assert_equal, assert_same, learn_in_two, learn_straight, log_rows
+
+SMALL: dict[str, Any] = {"policy_kwargs": {"net_arch": [16, 16]}, "learning_starts": 10, "batch_size": 16, "seed": 3}
+ACTPC: dict[str, Any] = {**SMALL, "settling": "scheduled", "prior_updates": 5, "buffer_size": 200, "device": "cpu"}
+
+
+def make_actpc(env: Any, n_envs: int = 1, normalize: bool = False, **keywords: Any) -> ActPC:
+    vec_env: Any = make_vec_env(env, n_envs=n_envs)
+    if normalize:
+        vec_env = VecNormalize(vec_env, gamma=0.9)
+    return ActPC(keywords.pop("policy", "MlpPolicy"), vec_env, **deepcopy({**ACTPC, **keywords}))
+
+
+def check(make: Any, folder: Path, n_steps: int, stop_at: int, **options: Any) -> None:
+    """Compare agents and logs of the two runs."""
+    straight = learn_straight(make, folder / "straight", n_steps)
+    resumed = learn_in_two(make, folder / "resumed", n_steps, stop_at, **options)
+    assert_same(straight, resumed)
+    assert log_rows(folder / "straight" / "progress.csv") == log_rows(folder / "resumed" / "progress.csv")
+
+
+@pytest.mark.parametrize("normalize", [False, True])
+@pytest.mark.parametrize("n_envs", [1, 2])
+@pytest.mark.parametrize("stop_at", [34, 41])
+def test_actpc(tmp_path: Path, n_envs: int, normalize: bool, stop_at: int) -> None:
+    """The episodes have 5, 9, 3 and 12 steps: 34 is (with one environment) an end, 41 is not."""
+    make = lambda: make_actpc(CountingEnv, n_envs, normalize, demonstrations=demonstrations(), alpha_ext=1.0)  # noqa: E731
+    check(make, tmp_path, 90, stop_at)
+    assert len(log_rows(tmp_path / "resumed" / "progress.csv")) > 8
+
+
+@pytest.mark.parametrize(
+    "keywords",
+    [
+        {"working_memory": True, "memory_history": 3},
+        {"buffer_size": 20},
+        {"settling": "iterative", "n_critics": 2, "target_policy_noise": 0.2, "circuit_kwargs": {"feedback": "learned"}},
+        {"n_steps": 3, "signal_normalizer": "quantile"},
+        {"optimize_memory_usage": True, "replay_buffer_kwargs": {"handle_timeout_termination": False}},
+        {"demonstration_fraction": 0.25, "actor_warm_start": 3, "observation_normalization": "demonstrations"},
+        {"target_update": "hard", "target_update_interval": 7, "train_freq": (3, "step"), "gradient_steps": -1},
+        {"train_freq": (1, "episode"), "gradient_steps": 2},
+        {"action_noise": OrnsteinUhlenbeckActionNoise(np.zeros(2), 0.1 * np.ones(2))},
+    ],
+    ids=lambda keywords: next(iter(keywords)),
+)
+def test_actpc_with(tmp_path: Path, keywords: dict[str, Any]) -> None:
+    check(lambda: make_actpc(CountingEnv, demonstrations=demonstrations(), **keywords), tmp_path, 90, 41)
+
+
+def test_actpc_with_dictionaries_of_observations(tmp_path: Path) -> None:
+    make = lambda: make_actpc(lambda: CountingEnv(dict_observations=True), policy="MultiInputPolicy")  # noqa: E731
+    check(make, tmp_path, 80, 41)
+
+
+class ContinuousBitFlipping(BitFlippingEnv):
+    """SB3's with a Box of actions, as ActPC and TD3 need."""
+
+    def __init__(self) -> None:
+        super().__init__(n_bits=3, continuous=True, max_steps=4)
+        assert isinstance(self.action_space, spaces.Box)
+
+
+@pytest.mark.parametrize("n_envs", [1, 2])
+@pytest.mark.parametrize("algorithm", [ActPC, TD3])
+def test_hindsight_replay(tmp_path: Path, algorithm: Any, n_envs: int) -> None:
+    def make() -> Any:
+        keywords = ACTPC if algorithm is ActPC else {**SMALL, "buffer_size": 200}
+        buffer = {"replay_buffer_class": HerReplayBuffer, "replay_buffer_kwargs": {"copy_info_dict": True}}
+        env = make_vec_env(ContinuousBitFlipping, n_envs=n_envs)
+        return algorithm("MultiInputPolicy", env, **deepcopy({**keywords, **buffer, "buffer_size": 24 * n_envs}))
+
+    check(make, tmp_path, 80, 41)
+
+
+@pytest.mark.parametrize("algorithm", [TD3, DDPG, SAC])
+@pytest.mark.parametrize("n_envs", [1, 2])
+def test_baselines(tmp_path: Path, algorithm: Any, n_envs: int) -> None:
+    def make() -> Any:
+        noise = None if algorithm is SAC else NormalActionNoise(np.zeros(2), 0.2 * np.ones(2))
+        env = VecNormalize(make_vec_env(CountingEnv, n_envs=n_envs))
+        return algorithm("MlpPolicy", env, action_noise=noise, buffer_size=200, **deepcopy(SMALL))
+
+    check(make, tmp_path, 80, 41)
+
+
+def test_state_dependent_exploration(tmp_path: Path) -> None:
+    def make() -> SAC:
+        keywords = {"use_sde": True, "sde_sample_freq": 4, "buffer_size": 99}
+        return SAC("MlpPolicy", make_vec_env(CountingEnv), **keywords, **deepcopy(SMALL))
+
+    check(make, tmp_path / "between", 60, 33)
+    check(make, tmp_path / "within", 60, 33, stop_in_update=0)
+
+
+@pytest.mark.parametrize("env_id", ["SparseReacher-v5", "SparseHopper-v4", "HalfCheetah-v5", "Pendulum-v1"])
+def test_the_simulator_goes_on_in_the_middle_of_an_episode(tmp_path: Path, env_id: str) -> None:
+    def make() -> Any:
+        return make_actpc(env_id, learning_starts=20, normalize=True)
+
+    check(make, tmp_path, 260, 231)
+
+
+class OpaqueEnv(CountingEnv):
+    """Holds something that nobody can store."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.handle = iter([1, 2, 3])
+
+
+@pytest.mark.parametrize("algorithm", [ActPC, TD3])
+def test_an_episode_that_cannot_be_restored_starts_again_and_the_log_says_so(tmp_path: Path, algorithm: Any) -> None:
+    def make() -> Any:
+        return algorithm("MlpPolicy", make_vec_env(OpaqueEnv), **deepcopy(ACTPC if algorithm is ActPC else SMALL))
+
+    with pytest.warns(UserWarning, match="environment 0 cannot be restored within its episode.*list_iterator"):
+        resumed = learn_in_two(make, tmp_path, 60, 33)
+    assert resumed.num_timesteps == 60
+    buffer = resumed.replay_buffer
+    assert buffer.dones[33 - 1 + 0].item() == 1.0 and buffer.timeouts[33 - 1].item() == 1.0
+    assert buffer.observations[33, 0, 1] == 0.0  # the first observation of an episode
+
+
+def test_sb3s_evaluation_callback_remembers_its_best_and_its_rows(tmp_path: Path) -> None:
+    make = lambda: make_actpc("Pendulum-v1", learning_starts=20)  # noqa: E731
+
+    def evaluation(folder: Path) -> EvalCallback:
+        env = make_vec_env("Pendulum-v1", seed=5)
+        return EvalCallback(env, n_eval_episodes=1, eval_freq=40, log_path=str(folder), verbose=0)
+
+    one, two = evaluation(tmp_path / "one"), evaluation(tmp_path / "two")
+    learn_straight(make, tmp_path / "one", 130, one)
+    learn_in_two(make, tmp_path / "two", 130, 90, more=lambda: [evaluation(tmp_path / "two")])
+    del two
+    results = [dict(np.load(tmp_path / name / "evaluations.npz")) for name in ("one", "two")]
+    assert_equal(*results, "evaluations")
+    assert len(results[0]["timesteps"]) == 3
+
+
+def test_a_stop_inside_a_long_train_loses_no_update(tmp_path: Path) -> None:
+    for algorithm in (ActPC, TD3, SAC):
+        folder = tmp_path / algorithm.__name__
+
+        def make(algorithm: Any = algorithm) -> Any:
+            keywords = {**(ACTPC if algorithm is ActPC else SMALL), "gradient_steps": 40, "train_freq": 10, "buffer_size": 99}
+            return algorithm("MlpPolicy", make_vec_env(CountingEnv), **deepcopy(keywords))
+
+        straight = learn_straight(make, folder / "straight", 50)
+        resumed = learn_in_two(make, folder / "resumed", 50, 25, stop_in_update=17)
+        assert_same(straight, resumed)
+        if algorithm is ActPC:
+            assert log_rows(folder / "straight" / "progress.csv") == log_rows(folder / "resumed" / "progress.csv")
+
+
+def test_a_registered_env_is_needed() -> None:
+    assert "SparseReacher-v5" in gym.registry
