@@ -1,5 +1,6 @@
 """ActPC: active predictive coding as a Stable-Baselines3 algorithm (Ororbia & Mali, arXiv 2209.09174, Algorithm 1)."""
 
+import warnings
 from collections.abc import Iterable
 from functools import reduce
 from os import PathLike
@@ -16,8 +17,8 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 
+from sb3_actpc.actpc.demonstration_replay import DemonstrationReplay
 from sb3_actpc.actpc.diagnostics import Diagnostics
-from sb3_actpc.actpc.expert import Expert
 from sb3_actpc.actpc.inputs import Batch, CircuitInputs
 from sb3_actpc.actpc.policies import ActPCActor, ActPCPolicy, CnnPolicy, Critics, MlpPolicy, MultiInputPolicy
 from sb3_actpc.actpc.signals import SIGNAL_ERRORS, make_normalizer, summed_squared_errors
@@ -33,6 +34,7 @@ SelfActPC = TypeVar("SelfActPC", bound="ActPC")
 BOOTSTRAPS = ("joint", "literal")
 TARGET_UPDATES = ("polyak", "hard")
 OBSERVATION_NORMALIZATIONS = ("none", "demonstrations")
+SMALLEST_VALUE_SCALE = 0.1  # of the mean absolute action-value that ``scale_pressure`` divides by: values start near 0
 EXPERT_SIGNALS_INTERVAL = 1000  # updates between two evaluations of the demonstrations' signals
 
 
@@ -82,7 +84,7 @@ class ActPC(OffPolicyAlgorithm):
     :param signal_normalizer: "max" (running maximum, the paper), "saturating" (r / (r + 1)) or "quantile"
     :param signal_errors: the signals sum the squared errors of "all" layers (the paper) or of the "output" alone
     :param actor_pressure: weight of the critic's pressure on the actor; 0 leaves refresh alone (cloning)
-    :param scale_pressure: divide the pressure by the batch's mean absolute action-value
+    :param scale_pressure: divide the pressure by the batch's mean absolute action-value (at least 0.1)
     :param nudge: scale of the critic's clamped error while actor and critic settle as one (the paper's is 1); None for
         1e-5, or 1 with ``dynamics="state"``
     :param critic_warmup: updates before the critic's pressure reaches the actor
@@ -229,7 +231,8 @@ class ActPC(OffPolicyAlgorithm):
         self.critic_kwargs = critic_kwargs
         self.generator_kwargs = generator_kwargs
         self.prior_kwargs = prior_kwargs
-        self.demonstrations = demonstrations
+        # a path is kept absolute, so that the saved agent finds its demonstrations from any folder
+        self.demonstrations = Path(demonstrations).absolute() if isinstance(demonstrations, (str, Path)) else demonstrations
         self.n_demonstrations = n_demonstrations
         self.n_demonstration_transitions = n_demonstration_transitions
         self.prior_updates = prior_updates
@@ -292,8 +295,12 @@ class ActPC(OffPolicyAlgorithm):
             **{f"{name}_kwargs": getattr(self, f"{name}_kwargs") for name in ("actor", "critic", "generator", "prior")},
         }
         merged = {**own, **self.policy_kwargs}
-        common = {"settling": self.settling, **(self.circuit_kwargs or {})}
-        merged["circuit_kwargs"] = {**common, **merged.get("circuit_kwargs", {})}
+        given = {**(self.circuit_kwargs or {}), **merged.get("circuit_kwargs", {})}
+        if given.get("settling", self.settling) != self.settling:
+            raise ValueError(
+                f"circuit_kwargs has settling={given['settling']!r} but the agent's is {self.settling!r}; pass settling="
+            )
+        merged["circuit_kwargs"] = {**given, "settling": self.settling}
         return merged
 
     @property
@@ -311,18 +318,24 @@ class ActPC(OffPolicyAlgorithm):
 
     def _setup_demonstrations(self) -> None:
         """Check the demonstrations against the environment, cut them, and derive what follows from having them."""
-        self.expert: Expert | None = None
+        self.expert: DemonstrationReplay | None = None
         if self.demonstrations is None:
-            if self.demonstration_fraction or self.actor_warm_start or self.observation_normalization == "demonstrations":
-                raise ValueError(
-                    "demonstration_fraction, actor_warm_start and observation_normalization='demonstrations' need "
-                    "demonstrations=; pass a file or leave them out"
-                )
+            names = "demonstration_fraction actor_warm_start n_demonstrations n_demonstration_transitions".split()
+            idle = [name for name in names if getattr(self, name)]
+            idle += ["observation_normalization"] if self.observation_normalization == "demonstrations" else []
+            if idle:
+                raise ValueError(f"{' and '.join(idle)} need demonstrations=; pass a file or leave them out")
             return
-        demonstrations = resolve(self.demonstrations).select(self.n_demonstrations, self.n_demonstration_transitions)
+        try:
+            demonstrations = resolve(self.demonstrations)
+        except FileNotFoundError:
+            if not self.pretrained:
+                raise
+            return  # a trained agent acts without them; ``learn`` says what is missing
+        demonstrations = demonstrations.select(self.n_demonstrations, self.n_demonstration_transitions)
         demonstrations.check(self.observation_space, self.action_space, self._env_id())
         assert isinstance(self.action_space, spaces.Box)
-        self.expert = Expert(demonstrations, self.observation_space, self.action_space, self.history)
+        self.expert = DemonstrationReplay(demonstrations, self.observation_space, self.action_space, self.history)
         if self.observation_normalization == "demonstrations" and not self.pretrained:
             observations = self.inputs.observations(self.expert.episodes.observations)
             self.actor.normalizer.fit(self.inputs.features(observations))
@@ -339,14 +352,9 @@ class ActPC(OffPolicyAlgorithm):
         return None if spec is None else spec.id
 
     @property
-    def has_prior(self) -> bool:
-        """Whether there are demonstrations, and with them a prior circuit."""
-        return self.expert is not None
-
-    @property
     def reward_weights(self) -> tuple[float, float, float]:
         """(α_ext, α_ep, α_in) as used: without demonstrations there is no prior and the task's reward takes its role."""
-        if self.has_prior:
+        if self.demonstrations is not None:
             return (0.0 if self.alpha_ext is None else self.alpha_ext), self.alpha_ep, self.alpha_in
         return (1.0 if self.alpha_ext is None else self.alpha_ext), self.alpha_ep, 0.0
 
@@ -366,13 +374,22 @@ class ActPC(OffPolicyAlgorithm):
             if self.replay_buffer is not None:
                 self.replay_buffer.cut_running_episodes()
         result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
+        self._check_observations(self._last_obs)
         self.pretrain()
         return result
 
     def pretrain(self) -> None:
         """Train the prior (and, if asked for, the actor) on the demonstrations, once; ``learn`` calls this."""
+        if self.expert is None and self.demonstrations is not None:
+            raise ValueError(f"no demonstrations file at {self.demonstrations}: set agent.demonstrations, or put it back")
         if self.pretrained or self.expert is None:
             return
+        if self._vec_normalize_env is not None and self._vec_normalize_env.norm_obs:
+            warnings.warn(
+                "VecNormalize's observation statistics drift under the frozen prior: use VecNormalize(norm_obs=False) with "
+                "observation_normalization='demonstrations'",
+                stacklevel=2,
+            )
         for _ in range(self.prior_updates if self.alpha_in else 0):  # without a weight the prior has no role
             self._update_prior(self.policy.batch_size_of("prior", self.batch_size))
         for _ in range(self.actor_warm_start):
@@ -412,11 +429,17 @@ class ActPC(OffPolicyAlgorithm):
         dones: np.ndarray,
         infos: list[dict[str, Any]],
     ) -> None:
-        map_observations(lambda array: check_finite("environment", "observations", array, self.num_timesteps), new_obs)
+        self._check_observations(new_obs)
+        for info in infos:
+            if "terminal_observation" in info:
+                self._check_observations(info["terminal_observation"])
         check_finite("environment", "rewards", reward, self.num_timesteps)
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
         self._rollout_starts = np.array(dones, dtype=bool)
         self._compute_newest_signals()
+
+    def _check_observations(self, observations: Any) -> None:
+        map_observations(lambda array: check_finite("environment", "observations", array, self.num_timesteps), observations)
 
     def _compute_newest_signals(self) -> None:
         """The signals of the transitions just stored (Algorithm 1, lines 10 to 13)."""
@@ -482,6 +505,8 @@ class ActPC(OffPolicyAlgorithm):
     def _sample_batch(self, batch_size: int) -> Batch:
         """Replayed transitions, the newest among them, then the share that comes from the demonstrations."""
         assert self.replay_buffer is not None
+        sizes = [self.policy.batch_size_of(name, batch_size) for name in ("actor", "critic", "generator")]
+        batch_size = max(sizes)
         n_expert = round(self.demonstration_fraction * batch_size) if self.expert is not None else 0
         replayed = self.replay_buffer.sample(batch_size - n_expert, env=self._vec_normalize_env)
         inputs, weights = self.inputs, self.reward_weights
@@ -499,12 +524,15 @@ class ActPC(OffPolicyAlgorithm):
             dones=replayed.dones,
             discounts=th.full_like(replayed.dones, self.gamma) if replayed.discounts is None else replayed.discounts,
         )
-        if not n_expert or self.expert is None:
+        if n_expert and self.expert is not None:
+            if any(weights[1:]) and (self._n_updates % EXPERT_SIGNALS_INTERVAL == 1 or not self.expert.has_signals):
+                normalizers = self.epistemic_normalizer, self.instrumental_normalizer
+                self.expert.refresh_signals(self._raw_signals, inputs, *normalizers)
+            batch = batch.join(self.expert.sample(n_expert, inputs, weights, self.gamma))
+        if min(sizes) == batch_size:
             return batch
-        if self._n_updates % EXPERT_SIGNALS_INTERVAL == 1 and any(weights[1:]):
-            normalizers = self.epistemic_normalizer, self.instrumental_normalizer
-            self.expert.refresh_signals(self._raw_signals, inputs, *normalizers)
-        return batch.join(self.expert.sample(n_expert, inputs, weights, self.gamma))
+        # circuits with a smaller batch take its first rows: the newest, then a fair mixture of the rest
+        return batch.shuffled(keep=self.n_envs if self.combined_replay else 0)
 
     def _update_actor(self, batch: Batch) -> None:
         """Motor-action circuit: pressure of the critic (line 17) plus refresh (line 23), in one step of the optimiser."""
@@ -512,12 +540,16 @@ class ActPC(OffPolicyAlgorithm):
         if changes is not None:
             self.diagnostics.change_norms("refresh", changes.scale_(self.refresh_weight))
         if self.actor_pressure and self._n_updates > self.critic_warmup:
-            rows = slice(self.policy.batch_size_of("actor", len(batch.features)))
+            rows = slice(self.policy.batch_size_of("actor", self.batch_size))
             memory = None if batch.memory is None else batch.memory[rows]
             coupled = settle_coupled(self.actor.circuit, self.critic.first(), batch.features[rows], memory, self.nudge)
             pressure = self.actor.circuit.hebbian_update(coupled.actor)
-            weight = self.actor_pressure / coupled.action_values.abs().mean() if self.scale_pressure else self.actor_pressure
+            weight: float | th.Tensor = self.actor_pressure
+            if self.scale_pressure:
+                weight = weight / coupled.action_values.abs().mean().clamp_min(SMALLEST_VALUE_SCALE)
             self.diagnostics.coupled(coupled, pressure, batch.features[rows], memory)
+            if changes is None:
+                self.diagnostics.settled("actor", coupled.actor)
             self.diagnostics.change_norms("pressure", pressure.scale_(weight))
             changes = pressure if changes is None else changes.add_(pressure)
         if changes is not None:
@@ -525,13 +557,13 @@ class ActPC(OffPolicyAlgorithm):
 
     def _update_critic(self, batch: Batch) -> None:
         """Policy circuit(s): settle on the bootstrapped targets (lines 19 and 20)."""
-        rows = slice(self.policy.batch_size_of("critic", len(batch.features)))
+        rows = slice(self.policy.batch_size_of("critic", self.batch_size))
         inputs = th.cat([batch.features, batch.actions], dim=1)[rows]
         targets = self._critic_targets(batch)[rows]
         for index, critic in enumerate(self.critic):
             state = critic.settle(inputs, targets)
             critic.apply_changes(critic.hebbian_update(state), critic.optimizer)
-            self.diagnostics.settled(f"critic.{index}", state)
+            self.diagnostics.settled(f"critic.{index}" if index else "critic", state)
 
     def _critic_targets(self, batch: Batch) -> th.Tensor:
         """t = r + γ c, or r alone when terminal; one and the same reward for every action output, (B, A)."""
@@ -551,8 +583,7 @@ class ActPC(OffPolicyAlgorithm):
         """World model: settle on the next observation (line 21). Without weight in the reward it has no role."""
         if not self.alpha_ep:
             return
-        n_replayed = len(batch.features) - round(self.demonstration_fraction * len(batch.features))
-        rows = slice(min(n_replayed, self.policy.batch_size_of("generator", n_replayed)))
+        rows = slice(self.policy.batch_size_of("generator", self.batch_size))
         inputs = th.cat([batch.features[rows], batch.actions[rows]], dim=1)
         state = self.generator.settle(inputs, batch.next_features[rows], None if batch.memory is None else batch.memory[rows])
         self.generator.apply_changes(self.generator.hebbian_update(state), self.generator.optimizer)

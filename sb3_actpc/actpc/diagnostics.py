@@ -1,6 +1,5 @@
 """What is logged about the circuits, measured every so many updates so that it costs next to nothing."""
 
-from collections.abc import Callable
 from typing import Any
 
 import torch as th
@@ -42,7 +41,7 @@ class Diagnostics:
     def follow(self, **values: Any) -> None:
         """Log the latest of these values; a callable is evaluated only when this update is measured."""
         for key, value in values.items():
-            if not isinstance(value, Callable):  # type: ignore[arg-type]
+            if not callable(value):
                 self.values[key] = float(value)
             elif self.active:
                 self.values[key] = float(value())
@@ -51,12 +50,15 @@ class Diagnostics:
         """Energy (batch mean) and settling residual of a circuit."""
         if self.active:
             self.values[f"{name}_energy"] = float(state.total_discrepancy().mean())
-            self.values[f"{name}_residual"] = float(self.circuits[name].residual(state))
+            self.values[f"{name}_residual"] = float(self.circuits[_key(name)].residual(state))
 
     def coupled(
         self, state: CoupledState, changes: HebbianChanges, features: th.Tensor, memory: th.Tensor | None
     ) -> None:
-        """Action-values, and per layer the cosine of the actor's change with the deterministic policy gradient."""
+        """
+        Action-values, and per layer how the actor's change compares with the deterministic policy gradient: cosine and ratio
+        of the norms. (The gradient is for the log alone; it goes through W^T, which learned error synapses never see.)
+        """
         if not self.active:
             return
         self.values["action_value"] = float(state.action_values.mean())
@@ -65,6 +67,7 @@ class Diagnostics:
         for layer, (mine, exact) in enumerate(zip(changes.weights, gradient.weights, strict=True)):
             cosine = th.nn.functional.cosine_similarity(mine.flatten(), exact.flatten(), dim=0)
             self.values[f"actor_cosine_{layer}"] = float(cosine)
+            self.values[f"actor_ratio_{layer}"] = float(mine.norm() / exact.norm().clamp_min(1e-30))
 
     def change_norms(self, name: str, changes: HebbianChanges) -> None:
         """Per layer, the norm of one of the two changes that are added up for the actor."""
@@ -75,3 +78,7 @@ class Diagnostics:
     def summary(self) -> dict[str, float]:
         """Everything measured last."""
         return self.values
+
+
+def _key(name: str) -> str:
+    return "critic.0" if name == "critic" else name

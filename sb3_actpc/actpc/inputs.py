@@ -40,6 +40,13 @@ class Batch(NamedTuple):
         columns: list[Any] = [None if mine is None else th.cat([mine, theirs]) for mine, theirs in pairs]
         return Batch(*columns)
 
+    def shuffled(self, keep: int) -> "Batch":
+        """The first ``keep`` rows as they are, the others in random order."""
+        order = th.arange(len(self.features), device=self.features.device)
+        order[keep:] = keep + th.randperm(max(len(order) - keep, 0), device=order.device)
+        columns: list[Any] = [None if column is None else column[order] for column in self]
+        return Batch(*columns)
+
 
 class CircuitInputs:
     """

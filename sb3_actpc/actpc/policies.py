@@ -37,7 +37,8 @@ class ObservationNormalizer(nn.Module):
     def fit(self, features: th.Tensor) -> None:
         """:param features: (N, n_features) whose mean and standard deviation are used from now on"""
         self.mean.copy_(features.mean(0))
-        self.scale.copy_(1.0 / features.std(0).clamp_min(1e-3))
+        std = features.std(0, correction=0)
+        self.scale.copy_(th.where(std > 1e-4, 1.0 / std, 1.0))  # a feature that never changed says nothing of its scale
         self.clip.fill_(OBSERVATION_CLIP)
 
     def forward(self, features: th.Tensor) -> th.Tensor:
@@ -183,8 +184,8 @@ class ActPCPolicy(BasePolicy):
     :param action_space: Box with finite bounds
     :param lr_schedule: learning rate as a function of the remaining progress; circuits with a ``learning_rate`` of their own
         keep its ratio to the schedule's start
-    :param net_arch: hidden sizes of actor, critic and generator, or a dict with the keys ``pi``, ``qf``, ``generator``
-        and ``prior`` (sizes left out stay at their defaults)
+    :param net_arch: hidden sizes of all circuits, or a dict with the keys ``pi``, ``qf``, ``generator`` and ``prior`` (sizes
+        left out stay at their defaults: 256 and 256, the prior's 512 and 256)
     :param n_critics: critic circuits; with two or more the smallest value bootstraps
     :param circuit_kwargs: keywords of every :class:`~sb3_actpc.ngc.NGCCircuit`
     :param actor_kwargs: the same for the actor alone, and ``net_arch``, ``learning_rate``, ``batch_size``
@@ -227,6 +228,9 @@ class ActPCPolicy(BasePolicy):
                 f"observations of shape {observation_space.shape} are images: ActPC learns no convolutions; use "
                 "'CnnPolicy' (fixed random ones), policy_kwargs=dict(features_extractor_class=...) or vector observations"
             )
+        unknown = set(net_arch) - {"pi", "qf", "generator", "prior"} if isinstance(net_arch, dict) else set()
+        if unknown:
+            raise ValueError(f"net_arch has unknown keys {sorted(unknown)}; choose from pi, qf, generator, prior")
         super().__init__(
             observation_space,
             action_space,

@@ -123,9 +123,7 @@ class CheckpointCallback(BaseCallback):
 
     def _on_rollout_start(self) -> None:
         self._samples = None
-        resumed = take_resumed(self._algorithm)
-        if resumed is not None:
-            self._finish_updates(restore_learning(self._algorithm, self._others, resumed, self.report))
+        self._resume()
         if self.signals.received:
             self._stop(0)
         if self.num_timesteps - self._last_saved >= self.save_freq:
@@ -143,11 +141,17 @@ class CheckpointCallback(BaseCallback):
         self._begin_updates(steps if steps >= 0 else self.locals["num_collected_steps"] * self.training_env.num_envs)
 
     def _on_training_end(self) -> None:
+        self._resume()  # where no step was left
         self.close()
         if self.at_end and self._last_saved != self._algorithm.num_timesteps:
             self._save_or_report()
 
-    # ------------------------------------------------------------------ stopping
+    # ------------------------------------------------------------------ resuming
+
+    def _resume(self) -> None:
+        resumed = take_resumed(self._algorithm)
+        if resumed is not None:
+            self._finish_updates(restore_learning(self._algorithm, self._others, resumed, self.report))
 
     def _finish_updates(self, left: int) -> None:
         """What the interrupted ``train()`` had still to do, and what SB3 does between it and the start of the rollout."""
@@ -160,6 +164,8 @@ class CheckpointCallback(BaseCallback):
         model.policy.set_training_mode(False)
         if model.use_sde:
             model.actor.reset_noise(model.n_envs)  # type: ignore[operator]
+
+    # ------------------------------------------------------------------ stopping
 
     def _begin_updates(self, planned: int) -> None:
         self._samples, self._planned, self._updates_before = 0, planned, self._algorithm._n_updates

@@ -7,7 +7,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper
 
 from sb3_actpc.checkpoints.encoding import Decoder, Encoder, OpaqueValue
 
@@ -53,6 +53,8 @@ def capture_vec_env(env: VecEnv, encoder: Encoder, where: str) -> dict[str, Any]
     """
     *wrappers, innermost = vec_env_layers(env)
     record: dict[str, Any] = {"wrappers": [], "envs": []}
+    # what the next reset will be given
+    record["seeds"] = encoder.encode([innermost._seeds, innermost._options], f"{where}.seeds")
     for index, wrapper in enumerate(wrappers):
         name = f"{where}.{type(wrapper).__qualname__}{index}"
         record["wrappers"].append(_capture_wrapper(wrapper, encoder, name))
@@ -90,31 +92,8 @@ def restore_vec_env(env: VecEnv, record: dict[str, Any], decoder: Decoder) -> li
             lost.append((index, reason))
     for wrapper, entry in zip(wrappers, record["wrappers"], strict=True):
         _restore_attributes(wrapper, entry["attributes"], decoder)
-    _forget_seeds(innermost)
+    innermost._seeds, innermost._options = decoder.decode(record["seeds"])
     return lost
-
-
-def restart_episode(env: VecEnv, index: int, observations: Any) -> None:
-    """
-    Reset one environment and put its first observation into those of all.
-
-    :param env: the training environment, with its wrappers
-    :param index: which environment
-    :param observations: (n_envs, *obs_shape), or a dict of such, not normalised; changed in place
-    """
-    innermost = vec_env_layers(env)[-1]
-    if isinstance(innermost, DummyVecEnv):
-        first = innermost.envs[index].reset()[0]
-    else:
-        first = innermost.env_method("reset", indices=[index])[0][0]
-    for layer in vec_env_layers(env):
-        if isinstance(layer, VecNormalize):
-            layer.returns[index] = 0.0
-    if isinstance(observations, dict):
-        for key, rows in observations.items():
-            rows[index] = first[key]
-    else:
-        observations[index] = first
 
 
 # ------------------------------------------------------------------ one environment
@@ -191,12 +170,6 @@ def _capture_wrapper(wrapper: VecEnv, encoder: Encoder, where: str) -> dict[str,
     return {"class": type(wrapper).__qualname__, "attributes": attributes}
 
 
-def _forget_seeds(innermost: VecEnv) -> None:
-    """Seeds given before are for the first reset, which the stopped run has had."""
-    innermost._reset_seeds()
-    innermost._reset_options()
-
-
 # ------------------------------------------------------------------ MuJoCo
 
 
@@ -241,7 +214,7 @@ def restore_physics(model: Any, data: Any, arrays: dict[str, np.ndarray]) -> Non
 
 
 def _physics_arrays(data: Any) -> dict[str, np.ndarray]:
-    """Arrays whose size the model fixes (those of constraints and contacts change from step to step)."""
+    """Real arrays whose size the model fixes: those of constraints and contacts change, indices are scratch memory."""
     named = {name: getattr(data, name) for name in dir(data) if not name.startswith("_")}
-    fixed = {name: value for name, value in named.items() if isinstance(value, np.ndarray) and value.dtype.kind in "biuf"}
+    fixed = {name: value for name, value in named.items() if isinstance(value, np.ndarray) and value.dtype.kind == "f"}
     return {name: value for name, value in fixed.items() if value.size and not name.startswith(("efc_", "iefc_", "contact"))}

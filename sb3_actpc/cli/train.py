@@ -3,6 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import shlex
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from sb3_actpc.training import RunConfig
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -15,7 +22,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         help="train an agent on a sparse-reward task",
         description="Train an agent; evaluate it on the dense task as it goes; write the model, CSV files and a plot.",
     )
-    parser.add_argument("--env", required=True, help="Gymnasium id, such as SparseHalfCheetah-v5")
+    task = parser.add_mutually_exclusive_group(required=True)
+    task.add_argument("--env", help="Gymnasium id, such as SparseHalfCheetah-v5")
+    task.add_argument("--resume", metavar="DIR", help="go on with the stopped run in this folder, with its settings")
     parser.add_argument("--algo", default="actpc", help="algorithm (default: %(default)s)")
     parser.add_argument("--preset", metavar="NAME", help="file of hyperparams/, or a path ending in .yml (default: ALGO)")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="replace a setting of the preset")
@@ -32,21 +41,56 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("--n-envs", type=int, metavar="N", help="parallel environments (default: the preset's, or 1)")
     parser.add_argument("--threads", type=int, default=1, help="torch threads (default: %(default)s)")
     parser.add_argument("--no-progress", action="store_true", help="no progress bar")
+    parser.add_argument(
+        "--checkpoint-freq", type=int, metavar="N", help="steps between checkpoints, 0 for none (default: as --eval-freq)"
+    )
+    parser.set_defaults(default_of=parser.get_default)
 
 
 def run(args: argparse.Namespace) -> int:
     """Train, then print the table.
 
     :param args: parsed arguments
-    :return: exit code
+    :return: exit code: 0, or 75 when a signal stopped the run after everything was saved
     :raises ValueError: when an argument or a setting is wrong
-    :raises FileNotFoundError: when the preset or the demonstrations do not exist
+    :raises FileNotFoundError: when the preset, the demonstrations or the run to resume do not exist
     """
-    from sb3_actpc.training import RunConfig, train_run
-    from sb3_actpc.training.config import parse_assignments
+    from sb3_actpc.checkpoints import EXIT_STOPPED, TrainingStopped
+    from sb3_actpc.training import resume_run, train_run
     from sb3_actpc.training.report import result_table
 
-    config = RunConfig(
+    try:
+        if args.resume is None:
+            result = train_run(_config(args), report=_report)
+        else:
+            _check_only_resume(args)
+            result = resume_run(Path(args.resume), report=_report, progress=not args.no_progress)
+    except TrainingStopped as stop:
+        run_folder = Path(stop.checkpoint).parents[1]
+        print(f"sb3-actpc: {stop}; go on with: sb3-actpc train --resume {shlex.quote(str(run_folder))}", file=sys.stderr)
+        return EXIT_STOPPED
+    print(f"\n{result_table(result)}\n\nwritten to {result['folder']}: model.zip, evaluations.csv, learning_curve.png")
+    return 0
+
+
+def _report(line: str) -> None:
+    print(line, flush=True)
+
+
+def _check_only_resume(args: argparse.Namespace) -> None:
+    """:raises ValueError: when an option is given that the run's own settings decide"""
+    others = set(vars(args)) - {"resume", "no_progress", "command", "debug", "default_of"}
+    given = sorted(name for name in others if getattr(args, name) != args.default_of(name))
+    if given:
+        option = "--" + given[0].replace("_", "-")
+        raise ValueError(f"{option} cannot be given with --resume: the run goes on with its own settings, leave it out")
+
+
+def _config(args: argparse.Namespace) -> RunConfig:
+    from sb3_actpc.training import RunConfig
+    from sb3_actpc.training.config import parse_assignments
+
+    return RunConfig(
         env=args.env,
         algo=args.algo,
         preset=args.preset,
@@ -62,7 +106,5 @@ def run(args: argparse.Namespace) -> int:
         n_envs=args.n_envs,
         threads=args.threads,
         progress=not args.no_progress,
+        checkpoint_freq=args.checkpoint_freq,
     )
-    result = train_run(config, report=lambda line: print(line, flush=True))
-    print(f"\n{result_table(result)}\n\nwritten to {result['folder']}: model.zip, evaluations.csv, learning_curve.png")
-    return 0

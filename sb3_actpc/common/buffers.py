@@ -1,5 +1,6 @@
 """Replay buffers: combined experience replay, the two internal signals, self-imitation and rebuilt working memory."""
 
+import warnings
 from typing import Any
 
 import numpy as np
@@ -91,7 +92,8 @@ class _SignalReplay(ReplayBuffer):
         for env, steps in enumerate(self._running):
             steps.clear()
             if (self.full or self.pos > 0) and not self.dones[self.newest, env]:
-                self.dones[self.newest, env] = self.timeouts[self.newest, env] = 1.0  # as a time limit does
+                self.dones[self.newest, env] = 1.0
+                self.timeouts[self.newest, env] = float(self.handle_timeout_termination)  # as a time limit does
 
     def reset(self) -> None:
         super().reset()
@@ -255,7 +257,9 @@ class CombinedHerReplayBuffer(_SignalReplay, HerReplayBuffer):  # type: ignore[m
         for steps in self._running:
             steps.clear()
         if (self._current_ep_start != self.pos).any():
-            self.truncate_last_trajectory()
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # SB3 recommends an option that ``learn`` does not have
+                self.truncate_last_trajectory()
 
     def _relabel(
         self, batch: SignalReplaySamples, rows: np.ndarray, envs: np.ndarray, n_newest: int, env: VecNormalize | None
@@ -269,6 +273,8 @@ class CombinedHerReplayBuffer(_SignalReplay, HerReplayBuffer):  # type: ignore[m
         for key, value in virtual.observations.items():
             batch.observations[key][index] = value
             batch.next_observations[key][index] = virtual.next_observations[key]
+        if isinstance(batch.history, dict):  # the past was lived under another goal: remember it under the new one
+            batch.history["desired_goal"][index] = virtual.observations["desired_goal"][:, None]
         batch.rewards[index] = virtual.rewards
         return batch
 
@@ -312,6 +318,8 @@ def combined_buffer_class(
     :return: the ActPC buffer that does what ``given`` does
     :raises ValueError: for a class that does not keep ActPC's signals
     """
+    if n_steps > 1 and given is not None and issubclass(given, HerReplayBuffer):
+        raise ValueError(f"n_steps={n_steps} does not work with hindsight relabelling; use n_steps=1")
     if given is None and isinstance(observation_space, spaces.Dict):
         return CombinedDictReplayBuffer
     if given is None:

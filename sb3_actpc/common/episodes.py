@@ -26,7 +26,11 @@ def split_observations(space: spaces.Space, rows: np.ndarray) -> Observations:
     :param space: a Box, or a Dict of Boxes
     :param rows: (N, flat size)
     :return: (N, *shape), or a dict of such
+    :raises ValueError: for other spaces
     """
+    parts_of = space.spaces.values() if isinstance(space, spaces.Dict) else [space]
+    if not all(isinstance(part, spaces.Box) for part in parts_of):
+        raise ValueError(f"demonstrations need Box observations or a Dict of Boxes, found {space}")
     if not isinstance(space, spaces.Dict):
         return rows.reshape(len(rows), *(space.shape or ()))
     parts, start = {}, 0

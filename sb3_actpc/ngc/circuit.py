@@ -44,9 +44,9 @@ class NGCCircuit(nn.Module):
     :param dynamics: "error" (error neurons integrate, states follow their predictions) or "state" (eq. 1 to the letter);
         same fixed points, see :class:`~sb3_actpc.ngc.dynamics.SettlingChain`
     :param settling_rate: β, a number in (0, 1], or "auto": kept inside the stable range as the synapses grow
-    :param compensate_arrival: divide every layer's error by the share of the output's error that K steps had time to bring
-        there (:func:`~sb3_actpc.ngc.stability.arrival_fractions`; 1 for large K). Without it the first layers' changes shrink by
-        orders of magnitude as the rates follow the growing synapses, faster than an adaptive optimiser forgets
+    :param compensate_arrival: divide every layer's error by the share of the output's error that K steps had time to
+        bring there (:func:`~sb3_actpc.ngc.stability.arrival_fractions`; 1 for large K). Without it the first layers' changes
+        shrink by orders of magnitude as the rates follow the growing synapses, faster than an adaptive optimiser forgets
     :param leak: γ of eq. 1; 0 by default
     :param feedback: "tied" (``feedback_scale`` W^T) or "learned" (own error synapses E, started independently of W: the
         paper's; they take some thousand updates to align with W^T, so that a fresh circuit learns little at first)

@@ -2,7 +2,7 @@
 
 from sb3_actpc.training.config import ALGORITHMS, RunConfig, load_preset
 from sb3_actpc.training.evaluation import EpisodeStatistics, EvaluationCallback, play_episodes
-from sb3_actpc.training.run import evaluate_run, train_run
+from sb3_actpc.training.run import evaluate_run, resume_run, train_run
 
 __all__ = [
     "ALGORITHMS",
@@ -12,5 +12,6 @@ __all__ = [
     "evaluate_run",
     "load_preset",
     "play_episodes",
+    "resume_run",
     "train_run",
 ]

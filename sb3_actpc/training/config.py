@@ -56,6 +56,7 @@ class RunConfig:
     :param n_envs: parallel training environments; by default the preset's, or 1
     :param threads: threads that torch uses
     :param progress: show a progress bar
+    :param checkpoint_freq: environment steps between two checkpoints, 0 for none; by default as ``eval_freq``
     :raises ValueError: when a number is too small, or the algorithm or the device is unknown
     """
 
@@ -74,6 +75,7 @@ class RunConfig:
     n_envs: int | None = None
     threads: int = 1
     progress: bool = True
+    checkpoint_freq: int | None = None
 
     def __post_init__(self) -> None:
         if self.algo not in ALGORITHMS:
@@ -84,6 +86,8 @@ class RunConfig:
             value = getattr(self, name)
             if value is not None and value < 1:
                 raise ValueError(f"{name} must be at least 1, found {value}")
+        if self.checkpoint_freq is not None and self.checkpoint_freq < 0:
+            raise ValueError(f"checkpoint_freq must be at least 0 (none), found {self.checkpoint_freq}")
         _check_device(self.device)
 
     @property
@@ -105,6 +109,7 @@ class RunPlan:
     :param noise: type and standard deviation of the action noise, or None
     :param algorithm_kwargs: constructor keywords of the algorithm
     :param demonstrations: demonstrations file, or None
+    :param checkpoint_freq: environment steps between two checkpoints; 0 for none
     """
 
     algorithm: type[OffPolicyAlgorithm]
@@ -116,6 +121,7 @@ class RunPlan:
     noise: tuple[str, float] | None
     algorithm_kwargs: dict[str, Any]
     demonstrations: Path | None
+    checkpoint_freq: int = 0
 
     @property
     def uses_demonstrations(self) -> bool:
@@ -147,16 +153,18 @@ def resolve_run(config: RunConfig) -> RunPlan:
     if isinstance(settings.get("train_freq"), list):
         settings["train_freq"] = tuple(settings["train_freq"])
     check_keywords(algorithm, settings)
+    eval_freq = config.eval_freq or max(1, n_timesteps // 10)
     return RunPlan(
         algorithm=algorithm,
         policy=policy,
         n_timesteps=n_timesteps,
         n_envs=n_envs,
-        eval_freq=config.eval_freq or max(1, n_timesteps // 10),
+        eval_freq=eval_freq,
         env_kwargs={**env_kwargs, **config.env_kwargs},
         noise=noise,
         algorithm_kwargs=settings,
         demonstrations=find_demonstrations(config.env, config.demonstrations),
+        checkpoint_freq=eval_freq if config.checkpoint_freq is None else config.checkpoint_freq,
     )
 
 

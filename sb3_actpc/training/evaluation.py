@@ -148,7 +148,7 @@ class EvaluationCallback(BaseCallback):
         self.evaluation_seconds = 0.0
         self.last_summary: dict[str, float | None] = {}
         self._last_timesteps = -1
-        self._started = 0.0
+        self._started = time.perf_counter()
 
     def begin(self, model: BaseAlgorithm) -> None:
         """Evaluate before ``learn``, which may begin with demonstrations and not with steps.
@@ -160,6 +160,33 @@ class EvaluationCallback(BaseCallback):
         with open(self.folder / "evaluations.csv", "w", newline="", encoding="utf-8") as file:
             csv.writer(file).writerow(EVALUATION_COLUMNS)
         self._evaluate()
+
+    @property
+    def wall_seconds(self) -> float:
+        """Seconds since :meth:`begin`, the time while the run was stopped left out."""
+        return time.perf_counter() - self._started
+
+    def checkpoint_state(self) -> dict[str, Any]:
+        """What a checkpoint keeps: timers, the last evaluation and the rows written so far."""
+        return {
+            "wall_seconds": self.wall_seconds,
+            "evaluation_seconds": self.evaluation_seconds,
+            "last_summary": self.last_summary,
+            "last_timesteps": self._last_timesteps,
+            "rows": (self.folder / "evaluations.csv").read_text(encoding="utf-8"),
+        }
+
+    def restore_checkpoint_state(self, state: dict[str, Any]) -> None:
+        """Go on where the checkpoint was taken; rows written after it are dropped, they will be written again.
+
+        :param state: what :meth:`checkpoint_state` returned
+        """
+        self._started = time.perf_counter() - state["wall_seconds"]
+        self.evaluation_seconds = state["evaluation_seconds"]
+        self.last_summary = state["last_summary"]
+        self._last_timesteps = state["last_timesteps"]
+        with atomic_write(self.folder / "evaluations.csv", "w") as file:
+            file.write(state["rows"])
 
     def _on_step(self) -> bool:
         # at the last step, the update that belongs to it is still to come
@@ -181,7 +208,7 @@ class EvaluationCallback(BaseCallback):
         self.evaluation_seconds += now - started
         self._last_timesteps = self.num_timesteps
         self.last_summary = statistics.summary()
-        self._append_row({**self.last_summary, "timesteps": self.num_timesteps, "wall_seconds": round(now - self._started, 2)})
+        self._append_row({**self.last_summary, "timesteps": self.num_timesteps, "wall_seconds": round(self.wall_seconds, 2)})
         for name in ("dense_return", "sparse_return", "success_rate"):
             if self.last_summary[name] is not None:
                 self.logger.record(f"eval/{name}", self.last_summary[name])

@@ -6,7 +6,7 @@ import dataclasses
 import importlib.metadata
 import json
 import platform
-import time
+import shutil
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -15,13 +15,14 @@ import gymnasium as gym
 import numpy as np
 import torch as th
 import yaml
-from stable_baselines3.common.callbacks import ProgressBarCallback
+from stable_baselines3.common.callbacks import BaseCallback, ProgressBarCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.noise import ActionNoise, NormalActionNoise, OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_actpc.checkpoints import CheckpointCallback, list_bundles, restore
 from sb3_actpc.common.demonstrations import Demonstrations
 from sb3_actpc.common.files import atomic_write
 from sb3_actpc.training.config import RunConfig, RunPlan, load_algorithm, parse_schedule, resolve_run
@@ -31,6 +32,7 @@ from sb3_actpc.training.report import plot_learning_curve
 # the evaluation's episodes start from other states than the training's
 EVALUATION_SEED_OFFSET = 1_000_000
 MAX_EVALUATION_ENVS = 10
+CHECKPOINTS = "checkpoints"  # folder in the run's folder
 _RECORDED_PACKAGES = ("sb3-actpc", "stable-baselines3", "torch", "gymnasium", "mujoco", "numpy")
 
 
@@ -48,12 +50,34 @@ def train_run(config: RunConfig, report: Callable[[str], None] = lambda line: No
     :raises gymnasium.error.Error: when the environment is unknown
     """
     check_env_id(config.env)
-    plan = resolve_run(config)
+    return _run(config, resolve_run(config), report, None)
+
+
+def resume_run(folder: Path, report: Callable[[str], None] = lambda line: None, progress: bool = True) -> dict[str, Any]:
+    """Go on with a run that was stopped, from its newest whole checkpoint, with the settings in its ``config.yml``.
+
+    :param folder: run folder
+    :param report: given a line of text when the run goes on, after each evaluation and for each damaged checkpoint
+    :param progress: show a progress bar
+    :return: as :func:`train_run`
+    :raises FileNotFoundError: when the folder is not that of a run
+    :raises ValueError: when the run is finished, or its checkpoints do not fit or are all damaged
+    """
+    if (folder / "result.json").exists():
+        raise ValueError(f"the run in {folder} is finished: start another with more --steps")
+    if not (folder / "config.yml").is_file():
+        raise FileNotFoundError(f"no run in {folder}: config.yml is missing")
+    config, plan = _read_plan(folder, progress)
+    check_env_id(config.env)
+    return _run(config, plan, report, folder)
+
+
+def _run(config: RunConfig, plan: RunPlan, report: Callable[[str], None], resumed: Path | None) -> dict[str, Any]:
     th.set_num_threads(config.threads)
     eval_envs = make_eval_envs(config.env, plan.env_kwargs, config.eval_episodes)
     train_env = make_vec_env(config.env, n_envs=plan.n_envs, seed=config.seed, env_kwargs=plan.env_kwargs)
     try:
-        return _train(config, plan, train_env, eval_envs, report)
+        return _train(config, plan, train_env, eval_envs, report, resumed)
     finally:
         train_env.close()
         for env in eval_envs:
@@ -101,13 +125,41 @@ def load_run(folder: Path) -> tuple[dict[str, Any], OffPolicyAlgorithm]:
     for name in ("config.yml", "model.zip"):
         if not (folder / name).is_file():
             raise FileNotFoundError(f"no run in {folder}: {name} is missing")
+    record = _read_config(folder, {"env", "env_kwargs", "algo", "seed"})
+    return record, load_algorithm(record["algo"]).load(folder / "model.zip", device="cpu")
+
+
+def _read_config(folder: Path, needed: set[str]) -> dict[str, Any]:
     try:
         record = yaml.safe_load((folder / "config.yml").read_text(encoding="utf-8"))
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise ValueError(f"{folder / 'config.yml'}: not a YAML file") from error
-    if not isinstance(record, dict) or not {"env", "env_kwargs", "algo", "seed"} <= record.keys():
-        raise ValueError(f"{folder / 'config.yml'}: expected the settings of a run (env, env_kwargs, algo, seed)")
-    return record, load_algorithm(record["algo"]).load(folder / "model.zip", device="cpu")
+    if not isinstance(record, dict) or not needed <= record.keys():
+        raise ValueError(f"{folder / 'config.yml'}: expected the settings of a run ({', '.join(sorted(needed))})")
+    return record
+
+
+def _read_plan(folder: Path, progress: bool) -> tuple[RunConfig, RunPlan]:
+    """The choices and the plan of a run from what :func:`_write_config` wrote."""
+    choices = {field.name for field in dataclasses.fields(RunConfig)}
+    record = _read_config(folder, {*choices, "policy", "noise", "settings"})
+    config = RunConfig(**{**{name: record[name] for name in choices}, "output": str(folder), "progress": progress})
+    settings = dict(record["settings"])
+    if isinstance(settings.get("train_freq"), list):
+        settings["train_freq"] = tuple(settings["train_freq"])
+    plan = RunPlan(
+        algorithm=load_algorithm(record["algo"]),
+        policy=record["policy"],
+        n_timesteps=record["n_timesteps"],
+        n_envs=record["n_envs"],
+        eval_freq=record["eval_freq"],
+        env_kwargs=record["env_kwargs"],
+        noise=None if record["noise"] is None else (record["noise"][0], record["noise"][1]),
+        algorithm_kwargs=settings,
+        demonstrations=None if record["demonstrations"] is None else Path(record["demonstrations"]),
+        checkpoint_freq=record["checkpoint_freq"],
+    )
+    return config, plan
 
 
 def make_env(env_id: str, env_kwargs: Mapping[str, Any], render_mode: str | None = None) -> gym.Env[Any, Any]:
@@ -158,19 +210,24 @@ def check_env_id(env_id: str) -> None:
 
 
 def run_folder(config: RunConfig) -> Path:
-    """The folder of a run: new, or left by a run that did not finish.
+    """The folder of a run: new, or left by a run that stopped before its first checkpoint.
 
     :param config: the user's choices
-    :return: ``config.output``, or ``runs/<env>/<algo>_<preset>_seed<seed>`` with ``_2``, ``_3``, … when it holds a result
-    :raises ValueError: when ``config.output`` holds a finished run
+    :return: ``config.output``, or ``runs/<env>/<algo>_<preset>_seed<seed>`` with ``_2``, ``_3``, … when it holds a result or
+        checkpoints
+    :raises ValueError: when ``config.output`` holds a finished run, or one that can be resumed
     """
     if config.output is not None:
         if (Path(config.output) / "result.json").exists():
             raise ValueError(f"{config.output} already holds a finished run: choose another folder")
+        if list_bundles(Path(config.output) / CHECKPOINTS):
+            raise ValueError(
+                f"{config.output} holds a stopped run: go on with --resume {config.output}, or choose another folder"
+            )
         return Path(config.output)
     base = Path("runs") / config.env.replace(":", "_") / f"{config.algo}_{config.preset_name}_seed{config.seed}"
     folder, number = base, 1
-    while (folder / "result.json").exists():
+    while (folder / "result.json").exists() or list_bundles(folder / CHECKPOINTS):
         number += 1
         folder = base.with_name(f"{base.name}_{number}")
     return folder
@@ -216,21 +273,27 @@ def _train(
     train_env: VecEnv,
     eval_envs: list[gym.Env[Any, Any]],
     report: Callable[[str], None],
+    resumed: Path | None,
 ) -> dict[str, Any]:
     reference = demonstrators_return(plan.demonstrations)
     model = build_model(plan, config, train_env)
-    folder = run_folder(config)
+    folder = run_folder(config) if resumed is None else resumed
+    has_checkpoint = resumed is not None and bool(list_bundles(folder / CHECKPOINTS))
+    if has_checkpoint:  # before any file of the run is touched
+        restore(model, folder / CHECKPOINTS, report)
     folder.mkdir(parents=True, exist_ok=True)
-    _write_config(folder, config, plan, reference)
+    if resumed is None:
+        _write_config(folder, config, plan, reference)
     model.set_logger(configure(str(folder), ["csv"]))
     callback = EvaluationCallback(
         eval_envs, folder, plan.eval_freq, config.eval_episodes, config.seed + EVALUATION_SEED_OFFSET, report
     )
-    report(f"{config.env}: {config.algo}, {plan.n_timesteps} steps, into {folder}")
-    started = time.perf_counter()
-    callback.begin(model)
-    _learn(model, plan.n_timesteps, callback, config.progress)
-    seconds = time.perf_counter() - started
+    since = f" from step {model.num_timesteps}" if has_checkpoint else ""
+    report(f"{config.env}: {config.algo}, {plan.n_timesteps} steps{since}, into {folder}")
+    if not has_checkpoint:
+        callback.begin(model)
+    _learn(model, plan.n_timesteps, _callbacks(folder, plan, callback, report), config.progress)
+    seconds = callback.wall_seconds
     result = {
         **callback.last_summary,
         "env": config.env,
@@ -249,20 +312,32 @@ def _train(
     plot_learning_curve(folder / "evaluations.csv", folder / "learning_curve.png", f"{config.env}, {config.algo}", reference)
     with atomic_write(folder / "result.json", "w") as file:
         json.dump(result, file, indent=2)
+    shutil.rmtree(folder / CHECKPOINTS, ignore_errors=True)  # there is nothing left to resume
     return result
 
 
-def _learn(model: OffPolicyAlgorithm, n_timesteps: int, callback: EvaluationCallback, progress: bool) -> None:
-    if not progress:
-        model.learn(n_timesteps, callback=callback)
-        return
+def _callbacks(
+    folder: Path, plan: RunPlan, evaluation: EvaluationCallback, report: Callable[[str], None]
+) -> list[BaseCallback]:
+    """The checkpoints, where they are wanted, and the evaluation."""
+    if not plan.checkpoint_freq:
+        return [evaluation]
+    return [CheckpointCallback(folder / CHECKPOINTS, plan.checkpoint_freq, at_end=False, report=report), evaluation]
+
+
+def _learn(model: OffPolicyAlgorithm, n_timesteps: int, callbacks: list[BaseCallback], progress: bool) -> None:
     # what progress_bar=True does, but closed when training stops early
-    bar = ProgressBarCallback()
+    bar = [ProgressBarCallback()] if progress else []
+    left = n_timesteps - model.num_timesteps
     try:
-        model.learn(n_timesteps, callback=[callback, bar])
+        model.learn(max(left, 0), callback=[*callbacks, *bar], reset_num_timesteps=model.num_timesteps == 0)
     finally:
-        if hasattr(bar, "pbar"):
-            bar.pbar.close()
+        for callback in callbacks:
+            if isinstance(callback, CheckpointCallback):
+                callback.close()
+        for one in bar:
+            if hasattr(one, "pbar"):
+                one.pbar.close()
 
 
 def _write_config(folder: Path, config: RunConfig, plan: RunPlan, reference: float | None) -> None:
@@ -273,6 +348,7 @@ def _write_config(folder: Path, config: RunConfig, plan: RunPlan, reference: flo
         "n_timesteps": plan.n_timesteps,
         "n_envs": plan.n_envs,
         "eval_freq": plan.eval_freq,
+        "checkpoint_freq": plan.checkpoint_freq,
         "env_kwargs": plan.env_kwargs,
         "noise": None if plan.noise is None else list(plan.noise),
         "settings": {key: list(value) if isinstance(value, tuple) else value for key, value in plan.algorithm_kwargs.items()},

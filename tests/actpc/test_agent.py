@@ -82,7 +82,8 @@ def test_each_part_of_the_reward_reaches_the_critic_and_the_actor(name):
     """An earlier agent of this family computed the epistemic term and never used it."""
     learned = []
     for weight in (0.0, 2.0):
-        model = make(demonstrations=demonstrations(), **{"alpha_ep": 0.0, "alpha_in": 0.0, "alpha_ext": 0.0, name: weight})
+        weights = {"alpha_ep": 0.0, "alpha_in": 0.0, "alpha_ext": 0.0, name: weight}
+        model = make(demonstrations=demonstrations(), prior_updates=0, **weights)  # both runs draw the same numbers
         model.learn(80)
         learned.append((weights_of(model.critic[0]), weights_of(model.actor.circuit)))
     assert differ(learned[0][0], learned[1][0]) and differ(learned[0][1], learned[1][1])
@@ -238,7 +239,18 @@ def test_target_smoothing_is_bounded_noise():
     batch = model._sample_batch(16)
     quiet = model._critic_targets(batch)
     model.target_noise_clip = 0.5
-    assert not th.allclose(quiet, model._critic_targets(batch))
+    noisy = model._critic_targets(batch)
+    assert not th.allclose(quiet, noisy)
+    model.target_policy_noise, model.target_noise_clip = 1e6, 0.1  # every action is moved by 0.1, up or down
+    next_actions = model.actor_target.project(batch.next_features)
+    corners = [
+        (next_actions + th.tensor(shift)).clamp(-1, 1) for shift in ([0.1, 0.1], [0.1, -0.1], [-0.1, 0.1], [-0.1, -0.1])
+    ]
+    possible = th.stack(
+        [model.critic_target.first().project(th.cat([batch.next_features, a], dim=1)) for a in corners]
+    )
+    expected = batch.rewards + (1 - batch.dones) * model.gamma * possible
+    assert th.isclose(expected, model._critic_targets(batch), atol=1e-5).any(0).all()
 
 
 def test_the_prior_learns_from_the_demonstrations_and_then_stands_still():
@@ -268,8 +280,45 @@ def test_demonstrations_fill_their_share_of_the_critic_batch():
     model.learn(40)
     batch = model._sample_batch(16)
     rows = {tuple(row) for row in data.observations.tolist()}
-    assert [tuple(row) in rows for row in batch.features.tolist()] == [False] * 8 + [True] * 8
+    demonstrated = [tuple(row) in rows for row in batch.features.tolist()]
+    assert sum(demonstrated) == 8 and not demonstrated[0]  # the newest transition comes first
     assert batch.rewards.shape == (16, 1)
+
+
+def test_a_circuit_with_a_smaller_batch_takes_the_newest_and_a_fair_mixture_of_the_rest():
+    data = demonstrations()
+    sizes = {"batch_size": 16, "critic_kwargs": {"batch_size": 64}, "generator_kwargs": {"batch_size": 32}}
+    model = make(demonstrations=data, demonstration_fraction=0.5, alpha_ext=1.0, **sizes)
+    model.learn(40)
+    rows = {tuple(row) for row in data.observations.tolist()}
+    newest = tuple(model.replay_buffer.observations[model.replay_buffer.newest, 0].tolist())
+    shares = []
+    for _ in range(50):
+        batch = model._sample_batch(16)
+        assert len(batch.features) == 64 and tuple(batch.features[0].tolist()) == newest
+        shares.append(np.mean([tuple(row) in rows for row in batch.features[:16].tolist()]))
+    assert np.mean(shares) == pytest.approx(0.5, abs=0.07)
+
+
+def test_signals_of_demonstrations_are_there_from_the_first_batch_also_after_loading(tmp_path):
+    model = make(demonstrations=demonstrations(), demonstration_fraction=0.5).learn(40)
+    model.save(tmp_path / "agent")
+    loaded = ActPC.load(tmp_path / "agent", env=DummyVecEnv([CountingEnv]))
+    loaded.learn(20, reset_num_timesteps=False)
+    for agent in (model, loaded):
+        assert agent.expert.epistemic.min() > 0 and agent.expert.instrumental.max() < 0
+
+
+def test_a_trained_agent_acts_without_its_demonstrations_and_says_what_is_missing_when_it_learns(tmp_path):
+    demonstrations().save(tmp_path / "demos.npz")
+    model = make(demonstrations=tmp_path / "demos.npz").learn(30)
+    model.save(tmp_path / "agent")
+    (tmp_path / "demos.npz").unlink()
+    loaded = ActPC.load(tmp_path / "agent", env=DummyVecEnv([CountingEnv]))
+    obs = np.ones((1, 3), np.float32)
+    assert np.array_equal(loaded.predict(obs)[0], model.predict(obs)[0]) and loaded.reward_weights == (0.0, 1.0, 1.0)
+    with pytest.raises(ValueError, match=r"no demonstrations file at .*demos\.npz"):
+        loaded.learn(10)
 
 
 def test_fewer_demonstrations_can_be_used():
@@ -282,7 +331,8 @@ def test_observations_are_normalised_by_the_demonstrations_and_do_not_drift():
     data = demonstrations()
     model = make(demonstrations=data, observation_normalization="demonstrations")
     features = model.inputs.features(th.as_tensor(data.observations))
-    assert th.allclose(features.mean(0), th.zeros(3), atol=1e-5) and th.allclose(features.std(0), th.ones(3), atol=1e-4)
+    assert th.allclose(features.mean(0), th.zeros(3), atol=1e-5)
+    assert th.allclose(features.std(0, correction=0), th.ones(3), atol=1e-4)
     model.learn(60)
     assert th.equal(features, model.inputs.features(th.as_tensor(data.observations)))
 
@@ -402,6 +452,16 @@ def test_an_environment_that_is_not_finite_is_named_with_its_step(field):
         make(DummyVecEnv([Broken])).learn(100)
 
 
+def test_a_terminal_observation_that_is_not_finite_blames_the_environment():
+    class Diverging(CountingEnv):
+        def step(self, action):
+            obs, reward, terminated, truncated, info = super().step(action)
+            return (obs * np.nan if terminated else obs), reward, terminated, truncated, info
+
+    with pytest.raises(ValueError, match="environment: observations are not finite at step 5"):
+        make(DummyVecEnv([Diverging])).learn(100)
+
+
 def test_discrete_actions_and_images_get_one_clear_line():
     with pytest.raises(AssertionError, match="only supports"):
         ActPC("MlpPolicy", "CartPole-v1")
@@ -429,7 +489,11 @@ def test_discrete_actions_and_images_get_one_clear_line():
         ({"refresh_weight": -1.0}, "refresh_weight=-1.0"),
         ({"n_critics": 0}, "n_critics=0"),
         ({"nudge": 0.0}, "nudge=0.0"),
-        ({"actor_warm_start": 10}, "need demonstrations="),
+        ({"actor_warm_start": 10}, "actor_warm_start need demonstrations="),
+        ({"n_demonstrations": 3}, "n_demonstrations need demonstrations="),
+        ({"circuit_kwargs": {"settling": "iterative"}}, "settling='iterative' but the agent's is 'scheduled'"),
+        ({"policy_kwargs": {"net_arch": {"vf": [8]}}}, "unknown keys"),
+        ({"replay_buffer_class": HerReplayBuffer, "n_steps": 3}, "n_steps=3 does not work with hindsight"),
         ({"settling": "fast"}, "settling='fast'"),
         ({"circuit_kwargs": {"activation": "gelu"}}, "activation='gelu'"),
     ],
@@ -515,7 +579,8 @@ def test_a_second_learn_cuts_the_episode_it_interrupts():
 def test_vec_normalize_relabels_the_task_reward_alone():
     env = VecNormalize(DummyVecEnv([CountingEnv]))
     model = make(env, demonstrations=demonstrations(), demonstration_fraction=0.25, alpha_ext=1.0, working_memory=True)
-    model.learn(60)
+    with pytest.warns(UserWarning, match="statistics drift under the frozen prior"):
+        model.learn(60)
     np.random.seed(0)
     raw = model.replay_buffer.sample(32)
     np.random.seed(0)

@@ -14,7 +14,7 @@ from sb3_actpc.common.episodes import Episodes, split_observations
 RawSignals = Callable[[th.Tensor, th.Tensor, th.Tensor, th.Tensor | None], tuple[np.ndarray, np.ndarray]]
 
 
-class Expert:
+class DemonstrationReplay:
     """
     :param demonstrations: N transitions that fit the environment
     :param observation_space: the environment's
@@ -37,6 +37,7 @@ class Expert:
             self.episodes.starts,
         )
         self.epistemic, self.instrumental = np.zeros((2, len(demonstrations)), dtype=np.float32)
+        self.has_signals = False
 
     def __len__(self) -> int:
         return len(self.demonstrations)
@@ -90,3 +91,4 @@ class Expert:
             raw_ep, raw_in = raw_signals(batch.features, batch.actions, batch.next_features, batch.memory)
             self.epistemic[rows] = epistemic.rescale(raw_ep)
             self.instrumental[rows] = -instrumental.rescale(raw_in)
+        self.has_signals = True

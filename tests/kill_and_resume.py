@@ -1,0 +1,151 @@
+"""Kill a training run (SIGKILL) at random moments, resume it each time, and compare its end with the run never stopped.
+
+    python tests/kill_and_resume.py --kills 30
+
+Prints one line per kill and ends with exit code 0 when both runs are equal bit for bit: weights, optimisers, replay buffer,
+normalisers, generators, simulators, evaluations and logs (times of the clock left out).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import random
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+N_STEPS = 600
+SAVE_FREQ = 10
+CLOCK = {"time/fps", "time/time_elapsed"}
+
+
+def train(folder: Path) -> None:
+    """The run: start it, or go on with it, to its end."""
+    import torch as th
+    from stable_baselines3.common.callbacks import EvalCallback
+    from stable_baselines3.common.env_util import make_vec_env
+    from stable_baselines3.common.logger import configure
+    from stable_baselines3.common.vec_env import VecNormalize
+
+    import sb3_actpc.envs  # noqa: F401, registers the task
+    from sb3_actpc import ActPC
+    from sb3_actpc.checkpoints import CheckpointCallback, continue_learning, list_bundles, restore
+
+    th.set_num_threads(1)
+    env = VecNormalize(make_vec_env("SparseReacher-v5", n_envs=2, seed=0))
+    model = ActPC(
+        "MlpPolicy", env, settling="scheduled", policy_kwargs={"net_arch": [16, 16]}, batch_size=16, buffer_size=500,
+        learning_starts=20, working_memory=True, seed=0, device="cpu",
+    )  # fmt: skip
+    evaluation = EvalCallback(
+        VecNormalize(make_vec_env("SparseReacher-v5", seed=9), training=False, norm_reward=False),
+        n_eval_episodes=1, eval_freq=60, log_path=str(folder), verbose=0,
+    )  # fmt: skip
+    checkpoints = CheckpointCallback(folder / "checkpoints", SAVE_FREQ, report=print)
+    resumes = bool(list_bundles(folder / "checkpoints"))
+    if resumes:
+        restore(model, folder / "checkpoints", print)
+    model.set_logger(configure(str(folder), ["csv"]))
+    print(f"learning from step {model.num_timesteps}", flush=True)
+    if resumes:
+        continue_learning(model, [checkpoints, evaluation], log_interval=1)
+    else:
+        model.learn(N_STEPS, [checkpoints, evaluation], log_interval=1)
+
+
+def start(folder: Path) -> subprocess.Popen[str]:
+    """The run in a process of its own, returned once it learns."""
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    command = [sys.executable, str(Path(__file__).resolve()), "--train", str(folder)]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment)
+    assert process.stdout is not None
+    for line in process.stdout:
+        if line.startswith("learning"):
+            print(" ", line.strip(), flush=True)
+            return process
+        print(" ", line.strip())
+    raise RuntimeError(f"the run ended with code {process.wait()} before it learned")
+
+
+def end_state(folder: Path) -> dict[str, Any]:
+    """What the run has come to, without times of the clock."""
+    from sb3_actpc.checkpoints import find_bundle
+    from tests.checkpoints.runs import log_rows
+
+    bundle = find_bundle(folder / "checkpoints")
+    files = {name: entry["sha256"] for name, entry in bundle.manifest["files"].items() if name != "state.json"}
+    state = bundle.read_json("state.json")
+    del state["logger"]["values"], state["counters"]["_num_timesteps_at_start"]
+    state["logger"]["csv"] = None
+    return {
+        "files": files,
+        "state": json.loads(json.dumps(state), object_hook=_without_clock),
+        "progress": log_rows(folder / "progress.csv"),
+        "steps": bundle.num_timesteps,
+    }
+
+
+def _without_clock(node: dict[str, Any]) -> dict[str, Any]:
+    """Drops the duration of episodes, which Monitor measures, and the folder's name."""
+    if "dict" in node:
+        node["dict"] = [pair for pair in node["dict"] if pair[0] not in {"t", "log_path", *CLOCK}]
+    return {key: value for key, value in node.items() if key != "episode_times"}
+
+
+def kill_and_resume(folder: Path, n_kills: int, seed: int) -> bool:
+    """
+    :param folder: where both runs go
+    :param n_kills: how often
+    :param seed: of the moments
+    :return: whether both runs are equal
+    """
+    moments = random.Random(seed)
+    (folder / "straight").mkdir()
+    (folder / "killed").mkdir()
+    process = start(folder / "straight")
+    started = time.perf_counter()
+    assert process.wait() == 0
+    whole = time.perf_counter() - started
+    done = 0
+    while done < n_kills:
+        process = start(folder / "killed")
+        time.sleep(moments.uniform(0.0, 2.0 * whole / (n_kills + 1)))
+        if process.poll() is not None:
+            break
+        process.kill()
+        process.wait()
+        done += 1
+        print(f"killed {done}", flush=True)
+    if process.poll() != 0:
+        assert start(folder / "killed").wait() == 0
+    one, two = end_state(folder / "straight"), end_state(folder / "killed")
+    for name, value in one.items():
+        if value != two[name]:
+            print(f"{name} differ")
+    print(f"{done} kills, {one['steps']} steps: {'equal' if one == two else 'NOT EQUAL'}")
+    return one == two
+
+
+def main() -> int:
+    """:return: exit code"""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--kills", type=int, default=30)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--train", type=Path, help=argparse.SUPPRESS)
+    args = parser.parse_args()
+    if args.train is not None:
+        train(args.train)
+        return 0
+    sys.path.insert(0, str(ROOT))
+    with tempfile.TemporaryDirectory() as folder:
+        return 0 if kill_and_resume(Path(folder), args.kills, args.seed) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
