@@ -20,12 +20,11 @@ from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
-N_STEPS = 600
 SAVE_FREQ = 10
 CLOCK = {"time/fps", "time/time_elapsed"}
 
 
-def train(folder: Path) -> None:
+def train(folder: Path, n_steps: int) -> None:
     """The run: start it, or go on with it, to its end."""
     import torch as th
     from stable_baselines3.common.callbacks import EvalCallback
@@ -56,13 +55,13 @@ def train(folder: Path) -> None:
     if resumes:
         continue_learning(model, [checkpoints, evaluation], log_interval=1)
     else:
-        model.learn(N_STEPS, [checkpoints, evaluation], log_interval=1)
+        model.learn(n_steps, [checkpoints, evaluation], log_interval=1)
 
 
-def start(folder: Path) -> subprocess.Popen[str]:
+def start(folder: Path, n_steps: int) -> subprocess.Popen[str]:
     """The run in a process of its own, returned once it learns."""
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, str(Path(__file__).resolve()), "--train", str(folder)]
+    command = [sys.executable, str(Path(__file__).resolve()), "--train", str(folder), "--steps", str(n_steps)]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment)
     assert process.stdout is not None
     for line in process.stdout:
@@ -98,23 +97,24 @@ def _without_clock(node: dict[str, Any]) -> dict[str, Any]:
     return {key: value for key, value in node.items() if key != "episode_times"}
 
 
-def kill_and_resume(folder: Path, n_kills: int, seed: int) -> bool:
+def kill_and_resume(folder: Path, n_kills: int, n_steps: int, seed: int) -> bool:
     """
     :param folder: where both runs go
     :param n_kills: how often
+    :param n_steps: environment steps of the run
     :param seed: of the moments
     :return: whether both runs are equal
     """
     moments = random.Random(seed)
     (folder / "straight").mkdir()
     (folder / "killed").mkdir()
-    process = start(folder / "straight")
+    process = start(folder / "straight", n_steps)
     started = time.perf_counter()
     assert process.wait() == 0
     whole = time.perf_counter() - started
     done = 0
     while done < n_kills:
-        process = start(folder / "killed")
+        process = start(folder / "killed", n_steps)
         time.sleep(moments.uniform(0.0, 2.0 * whole / (n_kills + 1)))
         if process.poll() is not None:
             break
@@ -123,7 +123,7 @@ def kill_and_resume(folder: Path, n_kills: int, seed: int) -> bool:
         done += 1
         print(f"killed {done}", flush=True)
     if process.poll() != 0:
-        assert start(folder / "killed").wait() == 0
+        assert start(folder / "killed", n_steps).wait() == 0
     one, two = end_state(folder / "straight"), end_state(folder / "killed")
     for name, value in one.items():
         if value != two[name]:
@@ -136,15 +136,16 @@ def main() -> int:
     """:return: exit code"""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--kills", type=int, default=30)
+    parser.add_argument("--steps", type=int, default=600)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--train", type=Path, help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.train is not None:
-        train(args.train)
+        train(args.train, args.steps)
         return 0
     sys.path.insert(0, str(ROOT))
     with tempfile.TemporaryDirectory() as folder:
-        return 0 if kill_and_resume(Path(folder), args.kills, args.seed) else 1
+        return 0 if kill_and_resume(Path(folder), args.kills, args.steps, args.seed) else 1
 
 
 if __name__ == "__main__":

@@ -10,6 +10,7 @@ import shutil
 import uuid
 import warnings
 from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
@@ -39,30 +40,34 @@ class BundleWriter:
     Files of one checkpoint; made by :func:`write_bundle`.
 
     :param folder: where they go
+    :param hasher: one worker that hashes what is being written
     """
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
+    def __init__(self, folder: Path, hasher: ThreadPoolExecutor) -> None:
+        self.folder, self.hasher = folder, hasher
         self.files: dict[str, dict[str, Any]] = {}
 
     @contextmanager
     def _open(self, name: str) -> Iterator[Callable[[Any], None]]:
-        """Hashes what it is given as it writes it, and flushes the file to the disk at the end."""
+        """Hashes what it is given while it writes it, and flushes the file to the disk at the end."""
         digest, size = hashlib.sha256(), 0
+        hashed: Future[None] | None = None
         with open(self.folder / name, "xb") as file:
 
             def write(data: Any) -> None:
-                nonlocal size
+                nonlocal size, hashed
                 view = memoryview(data).cast("B")
                 for start in range(0, len(view), CHUNK):
                     part = view[start : start + CHUNK]
-                    digest.update(part)
+                    hashed = self.hasher.submit(digest.update, part)
                     file.write(part)
                 size += len(view)
 
             yield write
             file.flush()
             os.fsync(file.fileno())
+        if hashed is not None:
+            hashed.result()  # the worker takes the parts in order: this was the last
         self.files[name] = {"sha256": digest.hexdigest(), "bytes": size}
 
     def add_bytes(self, name: str, data: bytes) -> None:
@@ -186,10 +191,11 @@ def write_bundle(
     temporary = folder / f"{_TEMPORARY}{uuid.uuid4().hex[:12]}"
     temporary.mkdir()
     try:
-        writer = BundleWriter(temporary)
-        yield writer
-        record = {"format": FORMAT, "version": VERSION, "num_timesteps": num_timesteps, **manifest, "files": writer.files}
-        writer.add_json(MANIFEST, {**record, "sha256": _manifest_hash(record)})
+        with ThreadPoolExecutor(max_workers=1) as hasher:
+            writer = BundleWriter(temporary, hasher)
+            yield writer
+            record = {"format": FORMAT, "version": VERSION, "num_timesteps": num_timesteps, **manifest, "files": writer.files}
+            writer.add_json(MANIFEST, {**record, "sha256": _manifest_hash(record)})
         _sync_folder(temporary)
         check()
         numbers = [number for number, _ in _list(folder)]

@@ -289,11 +289,15 @@ def watch(buffer: ReplayBuffer | None, on_sample: Callable[[], None]) -> None:
             return super().sample(*args, **kwargs)
 
         def __reduce_ex__(self, protocol: Any) -> Any:
-            make, arguments, *rest = super().__reduce_ex__(protocol)
-            return (make, (original, *arguments[1:]), *rest)
+            return (_blank, (original,), *super().__reduce_ex__(protocol)[2:])
 
     Watched.__name__, Watched.__qualname__, Watched.__module__ = original.__name__, original.__qualname__, original.__module__
     buffer.__class__ = Watched
+
+
+def _blank(kind: type) -> Any:
+    """An object whose attributes are set by whoever copies or unpickles it."""
+    return kind.__new__(kind)
 
 
 def unwatch(buffer: ReplayBuffer | None) -> None:

@@ -1,0 +1,179 @@
+"""``sb3-actpc train`` stopped by signals and by damage, and gone on with by ``--resume``."""
+
+import csv
+import os
+import signal
+import subprocess
+import sys
+import threading
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from stable_baselines3 import SAC, TD3
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.env_util import make_vec_env
+
+from sb3_actpc import ActPC
+from sb3_actpc.checkpoints import EXIT_STOPPED, CheckpointCallback, TrainingStopped, continue_learning, list_bundles, restore
+from sb3_actpc.cli import main
+from tests.actpc.envs import CountingEnv
+from tests.checkpoints.runs import assert_equal, log_rows
+from tests.checkpoints.test_exact_resume import make_actpc
+
+TRAIN = ["train", "--env", "SparseReacher-v5", "--preset", "small.yml", "--demonstrations", "none", "--no-progress"]
+TRAIN += ["--eval-freq", "60", "--eval-episodes", "1", "--checkpoint-freq", "40"]
+
+
+@pytest.fixture(autouse=True)
+def small_preset(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    settings = {
+        "n_timesteps": 180,
+        "settling": "scheduled",
+        "learning_starts": 20,
+        "batch_size": 16,
+        "buffer_size": 100,
+        "policy_kwargs": {"net_arch": [16, 16]},
+        "train_freq": [2, "step"],
+        "gradient_steps": 3,
+        "learning_rate": "lin_1e-3",
+        "noise_type": "ornstein-uhlenbeck",
+        "noise_std": 0.1,
+    }
+    Path("small.yml").write_text(yaml.safe_dump({"default": settings}), encoding="utf-8")
+
+
+def signal_at(step: int, number: int, monkeypatch: pytest.MonkeyPatch, in_update: bool = False) -> None:
+    """Send this process a real signal once, at an environment step or in the updates after it."""
+    sent = []
+    name = "_update_critic" if in_update else "_store_transition"
+    original = getattr(ActPC, name)
+
+    def send(self: ActPC, *arguments: Any) -> Any:
+        if self.num_timesteps >= step and not sent:
+            sent.append(step)
+            os.kill(os.getpid(), number)
+        return original(self, *arguments)
+
+    monkeypatch.setattr(ActPC, name, send)
+
+
+@pytest.mark.parametrize("in_update", [False, True])
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_stopped_run_goes_on_as_if_it_never_was(
+    number: int, in_update: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    handlers = [signal.getsignal(one) for one in (signal.SIGTERM, signal.SIGINT)]
+    assert main([*TRAIN, "--output", "straight"]) == 0
+    with monkeypatch.context() as patch:
+        signal_at(97, number, patch, in_update)
+        assert main([*TRAIN, "--output", "stopped"]) == EXIT_STOPPED
+    assert "saved in stopped/checkpoints/" in (message := capsys.readouterr().err)
+    assert "sb3-actpc train --resume stopped" in message
+    assert [signal.getsignal(one) for one in (signal.SIGTERM, signal.SIGINT)] == handlers
+    assert not Path("stopped/result.json").exists()
+    assert main([*TRAIN, "--output", "stopped"]) == 2  # it is not overwritten
+    assert main(["train", "--resume", "stopped", "--no-progress"]) == 0
+    assert log_rows(Path("straight/evaluations.csv")) == log_rows(Path("stopped/evaluations.csv"))
+    assert log_rows(Path("straight/progress.csv")) == log_rows(Path("stopped/progress.csv"))
+    one, two = (ActPC.load(f"{name}/model.zip") for name in ("straight", "stopped"))
+    assert_equal(one.policy.state_dict(), two.policy.state_dict(), "policy")
+    with open("stopped/evaluations.csv", encoding="utf-8") as file:
+        seconds = [float(row["wall_seconds"]) for row in csv.DictReader(file)]
+    assert seconds == sorted(seconds)
+    assert not Path("stopped/checkpoints").exists()  # nothing is left to resume
+    assert main(["train", "--resume", "stopped"]) == 2
+
+
+def test_a_damaged_checkpoint_is_named_and_the_one_before_used(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([*TRAIN, "--output", "straight"]) == 0
+    with monkeypatch.context() as patch:
+        signal_at(97, signal.SIGTERM, patch)
+        assert main([*TRAIN, "--output", "stopped"]) == EXIT_STOPPED
+    (list_bundles("stopped/checkpoints")[-1] / "state.json").write_bytes(b"{")
+    assert main(["train", "--resume", "stopped", "--no-progress"]) == 0
+    assert "damaged checkpoint skipped: stopped/checkpoints/000003_step_98: state.json" in capsys.readouterr().out
+    assert log_rows(Path("straight/evaluations.csv")) == log_rows(Path("stopped/evaluations.csv"))
+
+
+def test_a_run_with_checkpoints_is_left_alone_and_the_next_gets_another_folder(monkeypatch: pytest.MonkeyPatch) -> None:
+    with monkeypatch.context() as patch:
+        signal_at(97, signal.SIGTERM, patch)
+        assert main(TRAIN) == EXIT_STOPPED
+    assert main(TRAIN) == 0
+    assert sorted(path.name for path in Path("runs/SparseReacher-v5").iterdir()) == [
+        "actpc_small_seed0",
+        "actpc_small_seed0_2",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--resume", "nowhere"], "no run in nowhere"),
+        (["--resume", "nowhere", "--steps", "9"], "--steps cannot be given with --resume"),
+        (["--env", "SparseReacher-v5", "--checkpoint-freq", "-1"], "checkpoint_freq must be at least 0"),
+    ],
+)
+def test_mistakes_are_named(arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["train", *arguments]) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_a_second_signal_goes_to_the_old_handler(tmp_path: Path) -> None:
+    class Impatient(BaseCallback):
+        def _on_step(self) -> bool:
+            if self.num_timesteps == 15:
+                os.kill(os.getpid(), signal.SIGINT)
+                os.kill(os.getpid(), signal.SIGINT)
+            return True
+
+    callback = CheckpointCallback(tmp_path)
+    with pytest.raises(KeyboardInterrupt):
+        make_actpc(CountingEnv).learn(60, [callback, Impatient()])
+    callback.close()
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_outside_the_main_thread_there_are_checkpoints_but_no_handlers(tmp_path: Path) -> None:
+    before = signal.getsignal(signal.SIGTERM)
+    thread = threading.Thread(target=lambda: make_actpc(CountingEnv).learn(20, CheckpointCallback(tmp_path)))
+    thread.start()
+    thread.join()
+    assert len(list_bundles(tmp_path)) == 1 and signal.getsignal(signal.SIGTERM) is before
+
+
+@pytest.mark.parametrize("algorithm", [ActPC, TD3, SAC])
+def test_a_script_that_is_stopped_exits_with_the_code(tmp_path: Path, algorithm: Any) -> None:
+    """Nobody has to catch anything: TrainingStopped is a SystemExit."""
+    model = algorithm("MlpPolicy", make_vec_env(CountingEnv), policy_kwargs={"net_arch": [8]}, buffer_size=99, seed=0)
+    callback = CheckpointCallback(tmp_path)
+    with pytest.raises(SystemExit) as stop:
+        model.learn(300, [callback, Terminate()])
+    assert isinstance(stop.value, TrainingStopped) and stop.value.code == EXIT_STOPPED == 75
+    again = algorithm("MlpPolicy", make_vec_env(CountingEnv), policy_kwargs={"net_arch": [8]}, buffer_size=99, seed=0)
+    assert continue_learning(restore(again, tmp_path), CheckpointCallback(tmp_path)).num_timesteps == 300
+    with pytest.raises(ValueError, match="has no CheckpointCallback"):
+        continue_learning(again)
+
+
+class Terminate(BaseCallback):
+    """SIGTERM at step 150."""
+
+    def _on_step(self) -> bool:
+        if self.num_timesteps == 150:
+            os.kill(os.getpid(), signal.SIGTERM)
+        return True
+
+
+def test_a_run_killed_at_random_moments_and_resumed_is_the_run_never_killed() -> None:
+    """The short form; ``python tests/kill_and_resume.py`` kills 30 times."""
+    script = Path(__file__).resolve().parents[1] / "kill_and_resume.py"
+    command = [sys.executable, str(script), "--kills", "2", "--steps", "200"]
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stdout + result.stderr
+    assert "200 steps: equal" in result.stdout

@@ -1,0 +1,145 @@
+"""Files from a stranger: loaded without pickle, eval or exec."""
+
+import builtins
+import json
+import pickle
+from pathlib import Path
+from typing import Any
+
+import cloudpickle
+import numpy as np
+import pytest
+import safetensors.torch
+import torch as th
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.vec_env import VecNormalize
+
+from sb3_actpc import ActPC
+from sb3_actpc.checkpoints import CheckpointCallback
+from tests.actpc.envs import CountingEnv
+from tests.actpc.test_agent import demonstrations
+from tests.checkpoints.runs import assert_same
+from tests.checkpoints.test_exact_resume import make_actpc
+
+KEYWORDS: dict[str, Any] = {
+    "working_memory": True,
+    "n_critics": 2,
+    "train_freq": (2, "step"),
+    "action_noise": NormalActionNoise(np.zeros(2), 0.1 * np.ones(2)),
+    "policy_kwargs": {"net_arch": {"pi": [8], "qf": [12, 12]}, "optimizer_class": th.optim.SGD},
+    "circuit_kwargs": {"activation": "tanh"},
+    "learning_rate": lambda progress: 1e-3 * progress,
+}
+
+
+@pytest.fixture
+def no_code(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
+    def refuse(*arguments: Any, **keywords: Any) -> None:
+        raise AssertionError("code would be run")
+
+    for module in (pickle, cloudpickle):
+        for name in ("load", "loads", "Unpickler"):
+            monkeypatch.setattr(module, name, refuse, raising=False)
+    monkeypatch.setattr(th, "load", refuse)
+    monkeypatch.setattr(builtins, "eval", refuse)
+    monkeypatch.setattr(builtins, "exec", refuse)
+    return monkeypatch
+
+
+@pytest.fixture(autouse=True)
+def everything_is_imported() -> None:
+    """Importing a module needs exec."""
+    ActPC("MlpPolicy", make_vec_env(CountingEnv), policy_kwargs={"net_arch": [4]}, buffer_size=9).learn(120)
+
+
+def test_weights_are_loaded_without_running_code(tmp_path: Path, request: pytest.FixtureRequest) -> None:
+    env = VecNormalize(make_vec_env(CountingEnv))
+    model = ActPC("MlpPolicy", env, demonstrations=demonstrations(), prior_updates=3, buffer_size=99, **KEYWORDS).learn(150)
+    assert model.save_weights(tmp_path / "agent") == tmp_path / "agent.safetensors"
+    observations = np.random.default_rng(0).normal(size=(5, 3)).astype(np.float32)
+    expected = model.predict(observations)[0]
+    request.getfixturevalue("no_code")
+    loaded = ActPC.from_weights(tmp_path / "agent", VecNormalize(make_vec_env(CountingEnv)), buffer_size=50)
+    assert (loaded.predict(observations)[0] == expected).all()
+    for name, tensor in model.policy.state_dict().items():
+        assert th.equal(tensor, loaded.policy.state_dict()[name])
+    assert (loaded.gamma, loaded.train_freq, loaded.n_critics, loaded.buffer_size) == (model.gamma, model.train_freq, 2, 50)
+    assert loaded.policy.optimizer_class is th.optim.SGD and loaded.learning_rate == 1e-3
+    assert np.allclose(loaded.get_vec_normalize_env().obs_rms.mean, env.obs_rms.mean)
+    request.getfixturevalue("no_code").undo()
+    loaded.learn(150)
+
+
+def test_weights_with_demonstrations_go_on_learning_from_new_ones(tmp_path: Path) -> None:
+    model = make_actpc(CountingEnv, demonstrations=demonstrations(), observation_normalization="demonstrations")
+    model.learn(30).save_weights(tmp_path / "agent.safetensors")
+    alone = ActPC.from_weights(tmp_path / "agent.safetensors", make_vec_env(CountingEnv))
+    again = ActPC.from_weights(tmp_path / "agent.safetensors", make_vec_env(CountingEnv), demonstrations=demonstrations())
+    for loaded in (alone, again):
+        assert th.equal(loaded.actor.normalizer.mean, model.actor.normalizer.mean)
+        before = loaded.prior.weights[0].clone()
+        loaded.learn(30)
+        assert th.equal(before, loaded.prior.weights[0])  # it was trained before, and is not again
+    assert alone.expert is None and again.expert is not None
+
+
+def test_a_checkpoint_is_loaded_without_running_code(tmp_path: Path, request: pytest.FixtureRequest) -> None:
+    keywords = {**KEYWORDS, "learning_rate": 1e-3}
+    model = ActPC("MlpPolicy", make_vec_env(CountingEnv), buffer_size=99, seed=1, **keywords)
+    model.learn(150, CheckpointCallback(tmp_path))
+    request.getfixturevalue("no_code")
+    loaded = ActPC.load_checkpoint(tmp_path, make_vec_env(CountingEnv))
+    assert_same(model, loaded)
+
+
+def test_what_cannot_be_named_must_be_given_again(tmp_path: Path) -> None:
+    model = make_actpc(CountingEnv, demonstrations=demonstrations(), learning_rate=lambda progress: 1e-3)
+    model.learn(30, CheckpointCallback(tmp_path))
+    with pytest.raises(ValueError, match=r"learning_rate, demonstrations could not be stored"):
+        ActPC.load_checkpoint(tmp_path, make_vec_env(CountingEnv))
+    other = {"learning_rate": lambda progress: 1e-3, "demonstrations": demonstrations(n_episodes=2)}
+    with pytest.raises(ValueError, match="60 demonstrated transitions, this one 40"):
+        ActPC.load_checkpoint(tmp_path, make_vec_env(CountingEnv), **other)
+    loaded = ActPC.load_checkpoint(tmp_path, make_vec_env(CountingEnv), **{**other, "demonstrations": demonstrations()})
+    assert_same(model, loaded)
+
+
+class MyActivation(th.nn.ReLU):
+    """Not in the table of names."""
+
+
+def test_only_named_classes_are_written_and_read(tmp_path: Path) -> None:
+    model = make_actpc(CountingEnv)
+    model.policy_kwargs["optimizer_class"] = MyActivation
+    with pytest.raises(ValueError, match="policy_kwargs cannot be written by name"):
+        model.save_weights(tmp_path / "agent")
+    model = make_actpc(CountingEnv)
+    path = model.save_weights(tmp_path / "agent")
+    tensors = safetensors.torch.load_file(path)
+    with safetensors.safe_open(path, framework="pt") as file:
+        header = json.loads(file.metadata()["sb3_actpc"])
+    for kind in ({"class": "os.system"}, {"class": "builtins.eval"}, {"schedule": ["system"]}, {"call": "x"}):
+        header["settings"]["keywords"]["replay_buffer_class"] = kind
+        safetensors.torch.save_file(tensors, path, metadata={"sb3_actpc": json.dumps(header)})
+        with pytest.raises(ValueError, match=r"is not one of|does not know"):
+            ActPC.from_weights(path, make_vec_env(CountingEnv))
+
+
+def test_files_that_do_not_fit_are_refused(tmp_path: Path) -> None:
+    path = make_actpc(CountingEnv).save_weights(tmp_path / "agent")
+    with pytest.raises(FileNotFoundError, match="no file of weights"):
+        ActPC.from_weights(tmp_path / "nothing", make_vec_env(CountingEnv))
+    with pytest.raises(ValueError, match="trained with observation_space"):
+        ActPC.from_weights(path, "MountainCarContinuous-v0")
+    with pytest.raises(ValueError, match="VecNormalize"):
+        ActPC.from_weights(path, VecNormalize(make_vec_env(CountingEnv)))
+    with pytest.raises(ValueError, match="does not fit its own settings"):
+        ActPC.from_weights(path, make_vec_env(CountingEnv), n_critics=2)
+    (tmp_path / "bad.safetensors").write_bytes(path.read_bytes()[:100])
+    with pytest.raises(ValueError, match="not a file of save_weights"):
+        ActPC.from_weights(tmp_path / "bad.safetensors", make_vec_env(CountingEnv))
+    model = make_actpc(CountingEnv)
+    model.prior.weights[0].fill_(np.inf)
+    with pytest.raises(ValueError, match=r"prior\.weights\.0: weights are not finite"):
+        model.save_weights(tmp_path / "agent")
