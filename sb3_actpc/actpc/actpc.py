@@ -24,13 +24,14 @@ from sb3_actpc.actpc.policies import ActPCActor, ActPCPolicy, CnnPolicy, Critics
 from sb3_actpc.actpc.signals import SIGNAL_ERRORS, make_normalizer, summed_squared_errors
 from sb3_actpc.checkpoints import load_checkpoint, load_weights, save_weights
 from sb3_actpc.common.buffers import _SignalReplay, combined_buffer_class
-from sb3_actpc.common.checks import check_choices, check_finite, check_numbers
+from sb3_actpc.common.checks import check_choices, check_finite, check_kinds, check_numbers
 from sb3_actpc.common.demonstrations import Demonstrations, resolve
 from sb3_actpc.common.episodes import Episodes, map_observations, sample_union
 from sb3_actpc.ngc import HebbianChanges, NGCCircuit, settle_coupled
 
 SelfActPC = TypeVar("SelfActPC", bound="ActPC")
 
+SETTLINGS = ("iterative", "scheduled")
 BOOTSTRAPS = ("joint", "literal")
 TARGET_UPDATES = ("polyak", "hard")
 OBSERVATION_NORMALIZATIONS = ("none", "demonstrations")
@@ -85,8 +86,8 @@ class ActPC(OffPolicyAlgorithm):
     :param signal_errors: the signals sum the squared errors of "all" layers (the paper) or of the "output" alone
     :param actor_pressure: weight of the critic's pressure on the actor; 0 leaves refresh alone (cloning)
     :param scale_pressure: divide the pressure by the batch's mean absolute action-value (at least 0.1)
-    :param nudge: scale of the critic's clamped error while actor and critic settle as one (the paper's is 1); None for
-        1e-5, or 1 with ``dynamics="state"``
+    :param nudge: scale of the critic's clamped error while actor and critic settle as one (the paper's is 1); None for an
+        infinitesimal one, or 1 with ``dynamics="state"``
     :param critic_warmup: updates before the critic's pressure reaches the actor
     :param n_critics: critic circuits; with two or more the smallest target value bootstraps
     :param bootstrap: "joint" (target critic at the target actor's next action, the appendix) or "literal" (at the action
@@ -183,8 +184,21 @@ class ActPC(OffPolicyAlgorithm):
         _init_setup_model: bool = True,
     ) -> None:
         given = dict(locals())
+        check_kinds(
+            given,
+            numbers="tau gamma learning_starts refresh_weight demonstration_fraction alpha_ep alpha_in actor_pressure "
+            "target_policy_noise target_noise_clip",
+            whole="buffer_size batch_size n_steps gradient_steps prior_updates actor_warm_start self_imitation_size "
+            "critic_warmup n_critics target_update_interval memory_history stats_window_size verbose",
+            optional="alpha_ext nudge n_demonstrations n_demonstration_transitions seed",
+            mappings="circuit_kwargs actor_kwargs critic_kwargs generator_kwargs prior_kwargs policy_kwargs "
+            "replay_buffer_kwargs",
+        )
+        if not callable(learning_rate):
+            check_kinds(given, numbers="learning_rate")
         check_choices(
             given,
+            settling=SETTLINGS,
             signal_errors=SIGNAL_ERRORS,
             bootstrap=BOOTSTRAPS,
             target_update=TARGET_UPDATES,
@@ -657,7 +671,7 @@ class ActPC(OffPolicyAlgorithm):
             "rollout_state": self._rollout_state,
             "rollout_starts": self._rollout_starts,
             "normalizers": [dict(vars(self.epistemic_normalizer)), dict(vars(self.instrumental_normalizer))],
-            "expert_signals": None if expert is None else [expert.epistemic, expert.instrumental],
+            "expert_signals": None if expert is None else [expert.epistemic, expert.instrumental, expert.has_signals],
             "diagnostics": dict(self.diagnostics.values),
         }
 
@@ -674,7 +688,7 @@ class ActPC(OffPolicyAlgorithm):
                 "demonstrations="
             )
         if self.expert is not None:
-            self.expert.epistemic, self.expert.instrumental = signals
+            self.expert.epistemic, self.expert.instrumental, self.expert.has_signals = signals
         self.pretrained, self._rollout_state = state["pretrained"], state["rollout_state"]
         self._rollout_starts = state["rollout_starts"]
         normalizers = self.epistemic_normalizer, self.instrumental_normalizer

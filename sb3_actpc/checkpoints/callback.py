@@ -297,7 +297,7 @@ def watch(buffer: ReplayBuffer | None, on_sample: Callable[[], None]) -> None:
 
 def _blank(kind: type) -> Any:
     """An object whose attributes are set by whoever copies or unpickles it."""
-    return kind.__new__(kind)
+    return object.__new__(kind)
 
 
 def unwatch(buffer: ReplayBuffer | None) -> None:

@@ -23,12 +23,12 @@ from stable_baselines3.common.logger import CSVOutputFormat
 from stable_baselines3.common.noise import VectorizedActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.save_util import recursive_getattr
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_actpc.checkpoints.bundle import Bundle, BundleWriter, Report
 from sb3_actpc.checkpoints.encoding import Decoder, Encoder, OpaqueValue
-from sb3_actpc.checkpoints.simulators import capture_vec_env, env_name, restore_vec_env
+from sb3_actpc.checkpoints.simulators import capture_vec_env, env_name, restore_vec_env, vec_env_layers
 
 _COUNTERS = (
     "num_timesteps",
@@ -461,7 +461,9 @@ def _restore_random(model: OffPolicyAlgorithm, state: dict[str, Any], decoder: D
 
 def _start_episodes_again(model: OffPolicyAlgorithm, lost: list[tuple[int, str]], report: Report) -> None:
     """``learn`` resets the environments when there is no last observation."""
-    assert model.replay_buffer is not None
+    assert model.replay_buffer is not None and model.env is not None
+    if model.seed is not None and not isinstance(vec_env_layers(model.env)[-1], DummyVecEnv):
+        model.env.seed((model.seed + model.num_timesteps) % 2**31)  # their generators are out of reach
     for index, reason in lost:
         report(f"environment {index} cannot be restored within its episode, all episodes start again: {reason}")
     _cut_running_episodes(model.replay_buffer)

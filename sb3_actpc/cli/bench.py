@@ -80,7 +80,10 @@ def _td3(device: str) -> OffPolicyAlgorithm:
 
 def _actpc(keywords: dict[str, Any], device: str) -> OffPolicyAlgorithm:
     from sb3_actpc import ActPC
+    from sb3_actpc.training.config import parse_schedule
 
+    if "learning_rate" in keywords:
+        keywords = {**keywords, "learning_rate": parse_schedule(keywords["learning_rate"])}
     quick = {"prior_updates": 1, "actor_warm_start": 0, "critic_warmup": 0, "batch_size": BATCH_SIZE}
     return ActPC("MlpPolicy", TASK, **{**keywords, **quick, **_common(device)})
 

@@ -320,6 +320,8 @@ def combined_buffer_class(
     """
     if n_steps > 1 and given is not None and issubclass(given, HerReplayBuffer):
         raise ValueError(f"n_steps={n_steps} does not work with hindsight relabelling; use n_steps=1")
+    if given is not None and not (isinstance(given, type) and issubclass(given, ReplayBuffer)):
+        raise ValueError(f"replay_buffer_class={given!r} must be None or a subclass of SB3's ReplayBuffer")
     if given is None and isinstance(observation_space, spaces.Dict):
         return CombinedDictReplayBuffer
     if given is None:

@@ -1,6 +1,8 @@
 """Checks of what the user passes and of what circuits and environments produce."""
 
 from collections.abc import Mapping, Sequence
+from numbers import Integral, Real
+from types import NoneType
 from typing import Any
 
 import numpy as np
@@ -30,6 +32,27 @@ def check_numbers(given: Mapping[str, Any], at_least_0: str = "", at_least_1: st
             if not low <= given[name] <= high:
                 bounds = f"at least {low:g}" if np.isinf(high) else f"between {low:g} and {high:g}"
                 raise ValueError(f"{name}={given[name]!r} must be {bounds}")
+
+
+def check_kinds(given: Mapping[str, Any], numbers: str = "", whole: str = "", optional: str = "", mappings: str = "") -> None:
+    """
+    :param given: keyword -> value
+    :param numbers: keywords (separated by spaces) that must be finite numbers
+    :param whole: keywords that must be whole numbers
+    :param optional: keywords that must be finite numbers or None
+    :param mappings: keywords that must be dictionaries or None
+    :raises ValueError: naming the first value of another kind
+    """
+    for names, kind, wanted in (
+        (numbers, Real, "a finite number"),
+        (whole, Integral, "a whole number"),
+        (optional, (Real, NoneType), "a finite number or None"),
+        (mappings, (Mapping, NoneType), "a dictionary or None"),
+    ):
+        for name in names.split():
+            value = given[name]
+            if not isinstance(value, kind) or (isinstance(value, Real) and not np.isfinite(float(value))):
+                raise ValueError(f"{name}={value!r} must be {wanted}")
 
 
 def check_finite(where: str, what: str, values: np.ndarray, step: int) -> None:

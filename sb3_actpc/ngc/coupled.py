@@ -35,15 +35,16 @@ def settle_coupled(
     paper prints -1/A; with changes that are *added*, that sign would lower the action-values.) Neither circuit changes.
 
     The clamped error is applied as ``nudge`` / A and the actor's errors are divided by ``nudge`` afterwards: the smaller the
-    nudge, the closer the settled errors are to those of an infinitesimal perturbation, and the actor's change to the
-    deterministic policy gradient (tied feedback). The paper's is 1. ``dynamics="error"`` keeps errors apart from the states
-    and can take any; under ``dynamics="state"`` a small one drowns in the rounding of z - z̄.
+    nudge, the closer the actor's change comes to the deterministic policy gradient (tied feedback). The paper's is 1. In the
+    limit the states stand still and only the error neurons settle, which costs half the products: ``dynamics="error"`` can do
+    that, ``dynamics="state"`` cannot, and a small nudge there drowns in the rounding of z - z̄.
 
     :param actor: observation (and memory) -> action
     :param critic: [observation, action] -> action-values; its last A inputs are the action
     :param x: observations, (B, n_observation)
     :param memory: the actor's m_t, (B, n_memory), or None
-    :param nudge: scale of the perturbation, in (0, 1]; None for 1e-5 under the actor's ``dynamics="error"``, else 1
+    :param nudge: scale of the perturbation, in (0, 1]; None for an infinitesimal one, or 1 where the dynamics do not allow it
+        (``dynamics="state"``, or a leak)
     :return: the actor's state, the actions and their values
     :raises ValueError: when the critic's error synapses do not reach the actor's outputs, or the schedules differ
     """
@@ -58,13 +59,13 @@ def settle_coupled(
             raise ValueError(f"actor {name}={getattr(actor, name)!r} and critic {name}={getattr(critic, name)!r} must agree")
     motor = SettlingChain(actor, x, memory)
     value = SettlingChain(critic, th.cat([x, motor.output], dim=1), None)
-    default = 1e-5 if actor.dynamics == "error" else 1.0
-    scale = 1.0 if actor.settling == "scheduled" else nudge or default
+    infinitesimal = nudge is None and all(c.dynamics == "error" and not c.leak for c in (actor, critic))
+    scale = 1.0 if nudge is None or actor.settling == "scheduled" else nudge
     value.clamp_output_drive(_damped(value, th.full_like(value.output, scale / value.output.shape[1])))
     if actor.settling == "scheduled":
         _sweep_both(motor, value)
     else:
-        _settle_both(motor, value)
+        _settle_both(motor, value, states_move=not infinitesimal)
         for error in [*motor.errors, motor.output_error]:
             error.div_(scale)
         if motor.drive is not motor.output_error:
@@ -94,7 +95,7 @@ def _sweep_both(motor: SettlingChain, value: SettlingChain, exact: bool = False)
     motor.sweep(exact)
 
 
-def _settle_both(motor: SettlingChain, value: SettlingChain) -> None:
+def _settle_both(motor: SettlingChain, value: SettlingChain, states_move: bool) -> None:
     value.start_settling()
     motor.start_settling()
     value_rates, motor_rates = _coupled_rates(value), _coupled_rates(motor)
@@ -105,9 +106,9 @@ def _settle_both(motor: SettlingChain, value: SettlingChain) -> None:
             _clamp_actor(motor, value)
             motor.integrate(motor_rates)
         value.integrate(value_rates)
-        if step >= actor_waits:
+        if states_move:
             motor.predict(output=False)
-        value.predict(output=False)
+            value.predict(output=False)
     _clamp_actor(motor, value)
 
 

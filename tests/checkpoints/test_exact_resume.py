@@ -4,7 +4,6 @@ from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
@@ -13,7 +12,7 @@ from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import BitFlippingEnv
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
-from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.common.vec_env import SubprocVecEnv, VecNormalize
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 import sb3_actpc.envs  # noqa: F401, registers the sparse tasks
@@ -175,5 +174,16 @@ def test_a_stop_inside_a_long_train_loses_no_update(tmp_path: Path) -> None:
             assert log_rows(folder / "straight" / "progress.csv") == log_rows(folder / "resumed" / "progress.csv")
 
 
-def test_a_registered_env_is_needed() -> None:
-    assert "SparseReacher-v5" in gym.registry
+def test_environments_in_other_processes_start_again_from_seeded_states(tmp_path: Path) -> None:
+    def make() -> TD3:
+        env = make_vec_env("Pendulum-v1", n_envs=2, vec_env_cls=SubprocVecEnv)
+        return TD3("MlpPolicy", env, buffer_size=200, **deepcopy(SMALL))
+
+    results = []
+    for name in ("one", "two"):
+        with pytest.warns(UserWarning, match="environment 1 .* run in other processes"):
+            results.append(learn_in_two(make, tmp_path / name, 80, 40))
+        results[-1].env.close()
+    assert_same(*results)
+    buffer = results[0].replay_buffer
+    assert buffer.timeouts[:, 0].nonzero()[0].tolist() == [19]
