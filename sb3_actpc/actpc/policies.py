@@ -1,6 +1,7 @@
 """The policy object: four NGC circuits (actor, critic, generator, prior), their targets and their optimisers."""
 
 import copy
+import inspect
 import warnings
 from collections.abc import Iterator
 from typing import Any
@@ -17,6 +18,9 @@ from torch import nn
 from sb3_actpc.ngc import NGCCircuit, WorkingMemory
 
 CIRCUITS = ("actor", "critic", "generator", "prior")
+# what circuit_kwargs, actor_kwargs and so on may set; sizes follow from the task
+_SIZES = {"self", "n_inputs", "n_outputs", "hidden", "output_activation", "n_memory", "n_feedback_inputs"}
+CIRCUIT_KEYWORDS = set(inspect.signature(NGCCircuit.__init__).parameters) - _SIZES
 OBSERVATION_CLIP = 10.0
 PRIOR_NET_ARCH = (512, 256)  # paper: prior of all MuJoCo tasks
 
@@ -289,7 +293,11 @@ class ActPCPolicy(BasePolicy):
     def _circuit_kwargs_of(self, name: str) -> dict[str, Any]:
         default = {"activation": "relu"} if name == "prior" else {}
         own = {k: v for k, v in self._settings_of(name).items() if k not in ("net_arch", "learning_rate", "batch_size")}
-        return {**default, **self.circuit_kwargs, **own}
+        kwargs = {**default, **self.circuit_kwargs, **own}
+        unknown = sorted(set(kwargs) - CIRCUIT_KEYWORDS)
+        if unknown:
+            raise ValueError(f"{name}: a circuit has no keywords {unknown}; choose from {sorted(CIRCUIT_KEYWORDS)}")
+        return kwargs
 
     def _circuit(self, name: str, n_inputs: int, n_outputs: int, **extra: Any) -> NGCCircuit:
         return NGCCircuit(n_inputs, n_outputs, self._net_arch_of(name), **self._circuit_kwargs_of(name), **extra)

@@ -496,6 +496,8 @@ def test_discrete_actions_and_images_get_one_clear_line():
         ({"replay_buffer_class": HerReplayBuffer, "n_steps": 3}, "n_steps=3 does not work with hindsight"),
         ({"settling": "fast"}, "settling='fast'"),
         ({"circuit_kwargs": {"activation": "gelu"}}, "activation='gelu'"),
+        ({"circuit_kwargs": {"n_steps": 3}}, "a circuit has no keywords"),
+        ({"critic_kwargs": {"hidden": [8]}}, "critic: a circuit has no keywords"),
     ],
 )
 def test_a_wrong_keyword_is_named(keywords, named):
