@@ -1,6 +1,7 @@
 """Replay buffers: combined experience replay, the two internal signals, self-imitation and rebuilt working memory."""
 
 import warnings
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -151,7 +152,9 @@ class _SignalReplay(ReplayBuffer):
             actions=self.to_torch(self.actions[rows, envs]),
             next_observations=self._next_observations_at(last, envs, env),
             dones=self.to_torch((self.dones[last, envs] * (1 - self.timeouts[last, envs])).reshape(-1, 1)),
-            rewards=self.to_torch(self._rewards_at(rows, envs, mask, env)),
+            rewards=self.to_torch(
+                self._summed(self.rewards, rows, envs, mask, lambda rewards: self._normalize_reward(rewards, env))
+            ),
             discounts=None if mask is None else self.to_torch(self.gamma ** mask.sum(1, keepdims=True)),
             epistemic=self.to_torch(self._summed(self.epistemic, rows, envs, mask)),
             instrumental=self.to_torch(self._summed(self.instrumental, rows, envs, mask)),
@@ -205,23 +208,20 @@ class _SignalReplay(ReplayBuffer):
         mask = (before == 0).astype(np.float32)
         return window[np.arange(len(rows)), mask.sum(1).astype(int) - 1], mask
 
-    def _rewards_at(
-        self, rows: np.ndarray, envs: np.ndarray, mask: np.ndarray | None, env: VecNormalize | None
+    def _summed(
+        self,
+        values: np.ndarray,
+        rows: np.ndarray,
+        envs: np.ndarray,
+        mask: np.ndarray | None,
+        normalize: Callable[[np.ndarray], np.ndarray] = lambda values: values,
     ) -> np.ndarray:
-        """The task's rewards (of the whole n-step window), normalised one by one before they are summed."""
-        if mask is None or env is None:
-            return self._normalize_reward(self._summed(self.rewards, rows, envs, mask), env)
-        window = (rows[:, None] + np.arange(self.n_steps)) % self.buffer_size
-        normalized = self._normalize_reward(self.rewards[window, envs[:, None]], env)
-        return (normalized * mask * self.gamma ** np.arange(self.n_steps, dtype=np.float32)).sum(1, keepdims=True)
-
-    def _summed(self, values: np.ndarray, rows: np.ndarray, envs: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
-        """``values`` at the rows, or their discounted sum over the n-step window, (B, 1)."""
+        """``values`` at the rows, or their discounted sum over the n-step window, each normalised first, (B, 1)."""
         if mask is None:
-            return values[rows, envs].reshape(-1, 1)
+            return normalize(values[rows, envs].reshape(-1, 1))
         window = (rows[:, None] + np.arange(self.n_steps)) % self.buffer_size
         discounts = self.gamma ** np.arange(self.n_steps, dtype=np.float32)
-        return (values[window, envs[:, None]] * mask * discounts).sum(1, keepdims=True)
+        return (normalize(values[window, envs[:, None]]) * mask * discounts).sum(1, keepdims=True)
 
 
 class CombinedReplayBuffer(_SignalReplay):

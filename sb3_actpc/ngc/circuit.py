@@ -94,23 +94,12 @@ class NGCCircuit(nn.Module):
         _check_choice("dynamics", dynamics, DYNAMICS)
         _check_choice("synaptic_scaling", synaptic_scaling, SYNAPTIC_SCALINGS)
         _check_choice("feedback", feedback, FEEDBACKS)
-        if min(n_inputs, n_outputs, *hidden) < 1 or n_settling_steps < 1 or n_memory < 0:
-            raise ValueError(
-                f"n_inputs={n_inputs}, n_outputs={n_outputs}, hidden={list(hidden)} and n_settling_steps={n_settling_steps} "
-                f"must be at least 1, n_memory={n_memory} at least 0"
-            )
+        _check_sizes([n_inputs, *hidden, n_outputs], n_settling_steps, n_memory, n_feedback_inputs)
         if settling_rate != "auto" and not (isinstance(settling_rate, (int, float)) and 0.0 < settling_rate <= 1.0):
             raise ValueError(f"settling_rate={settling_rate!r} must be 'auto' or a number in (0, 1]")
-        for name, value in {
-            "leak": leak,
-            "feedback_rate": feedback_rate,
-            "weight_bound": weight_bound,
-            "feedback_scale": feedback_scale,
-        }.items():
-            if value < 0.0:
-                raise ValueError(f"{name}={value} must not be negative")
-        if not 0 <= n_feedback_inputs <= n_inputs:
-            raise ValueError(f"n_feedback_inputs={n_feedback_inputs} must lie between 0 and n_inputs={n_inputs}")
+        _check_not_negative(
+            leak=leak, feedback_rate=feedback_rate, weight_bound=weight_bound, feedback_scale=feedback_scale
+        )
         if settling == "scheduled":
             _check_scheduled(
                 feedback=feedback,
@@ -336,6 +325,22 @@ def _uniform(n_out: int, n_in: int, fan_in: int) -> nn.Parameter:
 def _check_choice(name: str, value: str, allowed: Sequence[str]) -> None:
     if value not in allowed:
         raise ValueError(f"{name}={value!r} is unknown; choose one of {list(allowed)}")
+
+
+def _check_sizes(sizes: Sequence[int], n_settling_steps: int, n_memory: int, n_feedback_inputs: int) -> None:
+    if min(sizes) < 1 or n_settling_steps < 1 or n_memory < 0:
+        raise ValueError(
+            f"n_inputs={sizes[0]}, n_outputs={sizes[-1]}, hidden={list(sizes[1:-1])} and n_settling_steps={n_settling_steps} "
+            f"must be at least 1, n_memory={n_memory} at least 0"
+        )
+    if not 0 <= n_feedback_inputs <= sizes[0]:
+        raise ValueError(f"n_feedback_inputs={n_feedback_inputs} must lie between 0 and n_inputs={sizes[0]}")
+
+
+def _check_not_negative(**given: float) -> None:
+    for name, value in given.items():
+        if value < 0.0:
+            raise ValueError(f"{name}={value} must not be negative")
 
 
 def _check_scheduled(**given: Any) -> None:
