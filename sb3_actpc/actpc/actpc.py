@@ -348,11 +348,18 @@ class ActPC(OffPolicyAlgorithm):
             return  # a trained agent acts without them; ``learn`` says what is missing
         demonstrations = demonstrations.select(self.n_demonstrations, self.n_demonstration_transitions)
         demonstrations.check(self.observation_space, self.action_space, self._env_id())
+        if self.env is not None:
+            demonstrations = demonstrations.rewarded_by(self.env)
         assert isinstance(self.action_space, spaces.Box)
         self.expert = DemonstrationReplay(demonstrations, self.observation_space, self.action_space, self.history)
         if self.observation_normalization == "demonstrations" and not self.pretrained:
             observations = self.inputs.observations(self.expert.episodes.observations)
             self.actor.normalizer.fit(self.inputs.features(observations))
+
+    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
+        super().set_env(env, force_reset)
+        if self.expert is not None:  # another environment may pay for other steps
+            self._setup_demonstrations()
 
     @property
     def inputs(self) -> CircuitInputs:

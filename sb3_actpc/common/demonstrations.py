@@ -18,6 +18,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_actpc.common.files import atomic_write
 
@@ -175,6 +176,17 @@ class Demonstrations:
         if self.actions.shape[1] != _flat_size(action_space):
             raise self._error("actions", f"{_flat_size(action_space)} values a row", f"{self.actions.shape[1]}")
         self._check_action_bounds(action_space.low.reshape(-1), action_space.high.reshape(-1))
+
+    def rewarded_by(self, env: VecEnv) -> Demonstrations:
+        """The same transitions with the rewards that ``env`` gives for them, under its own condition and threshold.
+
+        :param env: an environment with a method ``demonstrated_rewards(demonstrations)``, such as this package's MuJoCo
+            tasks; for any other the rewards stay as recorded
+        :return: demonstrations that share every other array
+        """
+        if not env.has_attr("demonstrated_rewards"):
+            return self
+        return dataclasses.replace(self, rewards=env.env_method("demonstrated_rewards", self, indices=[0])[0])
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write a compressed ``.npz`` file, all at once or not at all, without pickles.
