@@ -325,7 +325,7 @@ def record(env_id: str, n_episodes: int, **env_kwargs: object) -> Demonstrations
 @pytest.mark.parametrize("env_id", SPARSE_MUJOCO_IDS)
 def test_demonstrations_recorded_under_one_condition_are_paid_as_live_under_another(env_id: str) -> None:
     """Otherwise the critic would learn two rewards at once: the demonstrations' and the environment's."""
-    thresholds = {"Reacher": 0.2, "Walker2d": 0.005, "Swimmer": 0.02}
+    thresholds = {"Reacher": 0.2, "Walker2d": 1e-4, "Swimmer": 0.02}
     threshold = thresholds.get(task_of(env_id), 0.1)
     recorded = record(env_id, 10)
     for kwargs in [{}] if "Reacher" in env_id else [{"condition": "displacement"}, {"condition": "forward"}]:
