@@ -486,19 +486,20 @@ def resolve(source: str | os.PathLike[str] | Demonstrations) -> Demonstrations:
     raise ValueError(f"demonstrations must be a file path or a Demonstrations object, found {source!r}")
 
 
-def shipped_demonstrations(env_id: str) -> Path:
+def shipped_demonstrations(env_id: str, weak: bool = False) -> Path:
     """The demonstrations file of a sparse task that comes with the package.
 
     :param env_id: Gymnasium id, such as ``SparseHalfCheetah-v5``
+    :param weak: the file of a weaker demonstrator, with about half the return; only the HalfCheetah has one
     :return: its path
     :raises FileNotFoundError: when none is shipped; the message says how to collect them
     """
     name = re.sub(r"-v\d+$", "", env_id.rpartition(":")[2])
-    path = DATA_FOLDER / f"sparse_{name.removeprefix('Sparse').lower()}.npz"
+    path = DATA_FOLDER / f"sparse_{name.removeprefix('Sparse').lower()}{'_weak' if weak else ''}.npz"
     if not path.is_file():
         raise FileNotFoundError(
-            f"no demonstrations of {env_id} are shipped: collect them (sb3-actpc demos collect --env {env_id}) and pass "
-            "--demonstrations FILE, or train without (--demonstrations none)"
+            f"no {'weak ' if weak else ''}demonstrations of {env_id} are shipped: collect them (sb3-actpc demos collect --env "
+            f"{env_id}) and pass --demonstrations FILE, or train without (--demonstrations none)"
         )
     return path
 

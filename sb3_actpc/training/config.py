@@ -46,7 +46,7 @@ class RunConfig:
     :param preset: name of a file of ``hyperparams/``, or a path ending in ``.yml``; by default the name of the algorithm
     :param n_timesteps: environment steps to train for; by default the preset's
     :param seed: seed of the agent and of the training environment
-    :param demonstrations: ``"shipped"`` (the file in the package for a sparse task), ``"none"``, or a path
+    :param demonstrations: ``"shipped"`` or ``"weak"`` (the files in the package for a sparse task), ``"none"``, or a path
     :param overrides: settings that replace the preset's
     :param env_kwargs: keywords of the environment, added to the preset's
     :param eval_freq: environment steps between two evaluations; by default a tenth of the training
@@ -262,12 +262,15 @@ def find_demonstrations(env_id: str, choice: str) -> Path | None:
     """The demonstrations file of a run.
 
     :param env_id: Gymnasium id of the task
-    :param choice: ``"shipped"`` (for a task whose name begins with ``Sparse``), ``"none"``, or a path
+    :param choice: ``"shipped"`` (for a task whose name begins with ``Sparse``), ``"weak"`` (a weaker demonstrator's),
+        ``"none"``, or a path
     :return: the file, or None for none
     :raises FileNotFoundError: when the path does not exist, or a sparse task has no shipped file
     """
     if choice == "none":
         return None
+    if choice == "weak":
+        return shipped_demonstrations(env_id, weak=True)
     if choice != "shipped":
         if not Path(choice).is_file():
             raise FileNotFoundError(f"no demonstrations file at {choice}")
