@@ -533,12 +533,16 @@ class ActPC(OffPolicyAlgorithm):
         inputs, weights = self.inputs, self.reward_weights
         features = inputs.features(replayed.observations)
         memory, next_memory = inputs.memories(replayed.history, replayed.history_mask, features)
+        next_features = bootstrap_features = inputs.features(replayed.next_observations)
+        if replayed.following_observations is not None:
+            next_features = inputs.features(replayed.following_observations)
         internal = weights[1] * replayed.epistemic + weights[2] * replayed.instrumental
         self.diagnostics.follow(internal_reward=internal.mean, task_reward=replayed.rewards.mean)
         batch = Batch(
             features=features,
             actions=replayed.actions,
-            next_features=inputs.features(replayed.next_observations),
+            next_features=next_features,
+            bootstrap_features=bootstrap_features,
             memory=memory,
             next_memory=next_memory,
             rewards=weights[0] * replayed.rewards + internal,
@@ -549,7 +553,7 @@ class ActPC(OffPolicyAlgorithm):
             if any(weights[1:]) and (self._n_updates % EXPERT_SIGNALS_INTERVAL == 1 or not self.expert.has_signals):
                 normalizers = self.epistemic_normalizer, self.instrumental_normalizer
                 self.expert.refresh_signals(self._raw_signals, inputs, *normalizers)
-            batch = batch.join(self.expert.sample(n_expert, inputs, weights, self.gamma))
+            batch = batch.join(self.expert.sample(n_expert, inputs, weights, self.gamma, self.n_steps))
         if min(sizes) == batch_size:
             return batch
         # circuits with a smaller batch take its first rows: the newest, then a fair mixture of the rest
@@ -591,11 +595,11 @@ class ActPC(OffPolicyAlgorithm):
         if self.bootstrap == "literal":
             next_actions = batch.actions
         else:
-            next_actions = self.actor_target.project(batch.next_features, batch.next_memory)
+            next_actions = self.actor_target.project(batch.bootstrap_features, batch.next_memory)
             if self.target_policy_noise:
                 noise = th.randn_like(next_actions) * self.target_policy_noise
                 next_actions = (next_actions + noise.clamp(-self.target_noise_clip, self.target_noise_clip)).clamp(-1.0, 1.0)
-        inputs = th.cat([batch.next_features, next_actions], dim=1)
+        inputs = th.cat([batch.bootstrap_features, next_actions], dim=1)
         first, *others = (critic.project(inputs) for critic in self.critic_target)
         values = reduce(th.minimum, others, first)
         return batch.rewards + (1.0 - batch.dones) * batch.discounts * values
