@@ -35,7 +35,9 @@ SETTLINGS = ("iterative", "scheduled")
 BOOTSTRAPS = ("joint", "literal")
 TARGET_UPDATES = ("polyak", "hard")
 OBSERVATION_NORMALIZATIONS = ("none", "demonstrations")
-SMALLEST_VALUE_SCALE = 0.1  # of the mean absolute action-value that ``scale_pressure`` divides by: values start near 0
+# of the mean absolute action-value that ``scale_pressure`` divides by: one paid step. Where nothing was paid yet, the critic's
+# noise must not be blown up to full strength
+SMALLEST_VALUE_SCALE = 1.0
 EXPERT_SIGNALS_INTERVAL = 1000  # updates between two evaluations of the demonstrations' signals
 
 
@@ -85,7 +87,7 @@ class ActPC(OffPolicyAlgorithm):
     :param signal_normalizer: "max" (running maximum, the paper), "saturating" (r / (r + 1)) or "quantile"
     :param signal_errors: the signals sum the squared errors of "all" layers (the paper) or of the "output" alone
     :param actor_pressure: weight of the critic's pressure on the actor; 0 leaves refresh alone (cloning)
-    :param scale_pressure: divide the pressure by the batch's mean absolute action-value (at least 0.1)
+    :param scale_pressure: divide the pressure by the batch's mean absolute action-value (at least 1: one paid step)
     :param nudge: scale of the critic's clamped error while actor and critic settle as one (the paper's is 1); None for an
         infinitesimal one, or 1 with ``dynamics="state"``
     :param critic_warmup: updates before the critic's pressure reaches the actor

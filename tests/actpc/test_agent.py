@@ -179,12 +179,15 @@ def test_critic_warmup_keeps_the_pressure_off_the_actor():
     assert differ(before, weights_of(model.actor.circuit))
 
 
-def test_scaled_pressure_is_divided_by_the_mean_absolute_action_value():
+@pytest.mark.parametrize("shift", [5.0, 0.0])
+def test_scaled_pressure_is_divided_by_the_mean_absolute_action_value_or_by_one_paid_step(shift):
+    """Near 0, before any reward was seen, dividing by the value would blow the critic's noise up."""
     steps = []
     for scale in (False, True):
         policy_kwargs = {"net_arch": [16, 16], "optimizer_class": th.optim.SGD}
         model = make(scale_pressure=scale, policy_kwargs=policy_kwargs, self_imitation_size=0, learning_starts=100)
         model.learn(50)
+        model.critic[0].synapses.biases[-1].add_(shift)
         np.random.seed(3)
         batch = model._sample_batch(16)
         before = weights_of(model.actor.circuit)
@@ -192,10 +195,10 @@ def test_scaled_pressure_is_divided_by_the_mean_absolute_action_value():
         value = model.critic[0].project(inputs).abs().mean()
         model._n_updates = 1
         model._update_actor(batch)
-        steps.append((value, [new - old for new, old in zip(weights_of(model.actor.circuit), before, strict=True)]))
-    value = steps[1][0]
-    for plain, scaled in zip(steps[0][1], steps[1][1], strict=True):
-        assert th.allclose(plain, scaled * value, rtol=1e-2, atol=1e-7)
+        steps.append([new - old for new, old in zip(weights_of(model.actor.circuit), before, strict=True)])
+    assert (value > 2.0) == (shift > 0.0)
+    for plain, scaled in zip(*steps, strict=True):
+        assert th.allclose(plain, scaled * value.clamp_min(1.0), rtol=1e-2, atol=1e-7)
 
 
 def test_soft_targets_move_by_tau_and_hard_ones_every_c_transitions():
