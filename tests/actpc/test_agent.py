@@ -184,8 +184,9 @@ def test_scaled_pressure_is_divided_by_the_mean_absolute_action_value_or_by_one_
     """Near 0, before any reward was seen, dividing by the value would blow the critic's noise up."""
     steps = []
     for scale in (False, True):
-        policy_kwargs = {"net_arch": [16, 16], "optimizer_class": th.optim.SGD}
-        model = make(scale_pressure=scale, policy_kwargs=policy_kwargs, self_imitation_size=0, learning_starts=100)
+        policy_kwargs = {"net_arch": [16, 16], "optimizer_class": th.optim.SGD}  # its steps are the changes themselves
+        options = {"policy_kwargs": policy_kwargs, "learning_rate": 1.0, "self_imitation_size": 0, "learning_starts": 100}
+        model = make(scale_pressure=scale, **options)
         model.learn(50)
         model.critic[0].synapses.biases[-1].add_(shift)
         np.random.seed(3)
