@@ -209,7 +209,7 @@ def restore(model: OffPolicyAlgorithm, path: str | os.PathLike[str], report: Rep
     :param report: given a line for each damaged checkpoint, and when episodes must start again
     :return: the agent
     :raises FileNotFoundError: when there is no checkpoint
-    :raises ValueError: when it is damaged, does not fit or was written by a newer version
+    :raises ValueError: when it is damaged, does not fit or was written in another version of the format
     """
     restore_model(model, find_bundle(path, report), report)
     return model

@@ -127,14 +127,14 @@ def test_a_checkpoint_of_something_else_is_refused_and_changes_nothing(saved: Pa
     del untouched
 
 
-def test_a_newer_version_is_not_read(tmp_path: Path, saved: Path) -> None:
+def test_another_version_is_not_read(tmp_path: Path, saved: Path) -> None:
     shutil.copytree(saved, tmp_path / "newer")
     file = list_bundles(tmp_path / "newer")[-1] / "manifest.json"
     manifest = json.loads(file.read_text())
     manifest["version"] += 1
     del manifest["sha256"]
     file.write_text(json.dumps({**manifest, "sha256": _manifest_hash(manifest)}))
-    with pytest.raises(ValueError, match="format version 2, this sb3_actpc reads up to 1"):
+    with pytest.raises(ValueError, match="format version 3, this sb3_actpc reads 2"):
         find_bundle(tmp_path / "newer")
 
 
