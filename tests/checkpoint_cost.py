@@ -2,10 +2,10 @@
 
     python tests/checkpoint_cost.py
 
-Measures in turns, since the disk's speed changes: the plain files, a first checkpoint (everything is written), and the next one
-after so many further transitions (what has not changed is shared). Prints the medians of the times and of the ratios, and by
-how much writing a checkpoint raised the peak of memory. Exit code 1 when the first takes more than twice as long as the plain
-files, or memory rose by a tenth of the buffer.
+Measures in turns, since the disk's speed changes: the plain files, a first checkpoint (everything is written), and the next
+one after so many further transitions (what has not changed is shared). Prints the medians of the times and of the ratios,
+and by how much writing a checkpoint raised the peak of memory. Exit code 1 when the first takes more than twice as long as
+the plain files, or memory rose by a tenth of the buffer.
 """
 
 import argparse

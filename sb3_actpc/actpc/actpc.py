@@ -1,7 +1,7 @@
 """ActPC: active predictive coding as a Stable-Baselines3 algorithm (Ororbia & Mali, arXiv 2209.09174, Algorithm 1)."""
 
 import warnings
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from functools import reduce
 from os import PathLike
 from pathlib import Path
@@ -22,7 +22,7 @@ from sb3_actpc.actpc.diagnostics import Diagnostics
 from sb3_actpc.actpc.inputs import Batch, CircuitInputs
 from sb3_actpc.actpc.policies import ActPCActor, ActPCPolicy, CnnPolicy, Critics, MlpPolicy, MultiInputPolicy
 from sb3_actpc.actpc.signals import SIGNAL_ERRORS, make_normalizer, summed_squared_errors
-from sb3_actpc.checkpoints import load_checkpoint, load_weights, save_weights
+from sb3_actpc.checkpoints import between_updates, load_checkpoint, load_weights, save_weights
 from sb3_actpc.common.buffers import _SignalReplay, combined_buffer_class
 from sb3_actpc.common.checks import check_choices, check_finite, check_kinds, check_numbers
 from sb3_actpc.common.demonstrations import Demonstrations, resolve
@@ -275,7 +275,7 @@ class ActPC(OffPolicyAlgorithm):
         self.signal_normalizer = signal_normalizer
         self.epistemic_normalizer = make_normalizer(signal_normalizer)
         self.instrumental_normalizer = make_normalizer(signal_normalizer)
-        self.pretrained = False
+        self.pretrained, self.n_pretraining_updates = False, 0
         if _init_setup_model:
             self._setup_model()
 
@@ -389,11 +389,16 @@ class ActPC(OffPolicyAlgorithm):
                 self.replay_buffer.cut_running_episodes()
         result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
         self._check_observations(self._last_obs)
-        self.pretrain()
+        self.pretrain(between_updates(result[1]))
         return result
 
-    def pretrain(self) -> None:
-        """Train the prior (and, if asked for, the actor) on the demonstrations, once; ``learn`` calls this."""
+    def pretrain(self, before_update: Callable[[], None] = lambda: None) -> None:
+        """
+        Train the prior (and, if asked for, the actor) on the demonstrations, once; ``learn`` calls this.
+
+        :param before_update: called before each update
+        :raises ValueError: when the demonstrations of a loaded agent are not there any more
+        """
         if self.expert is None and self.demonstrations is not None:
             raise ValueError(f"no demonstrations file at {self.demonstrations}: set agent.demonstrations, or put it back")
         if self.pretrained or self.expert is None:
@@ -404,10 +409,14 @@ class ActPC(OffPolicyAlgorithm):
                 "observation_normalization='demonstrations'",
                 stacklevel=2,
             )
-        for _ in range(self.prior_updates if self.alpha_in else 0):  # without a weight the prior has no role
-            self._update_prior(self.policy.batch_size_of("prior", self.batch_size))
-        for _ in range(self.actor_warm_start):
-            self.actor.circuit.apply_changes(self._refresh_changes(), self.actor.circuit.optimizer)
+        n_prior = self.prior_updates if self.alpha_in else 0  # without a weight the prior has no role
+        for update in range(self.n_pretraining_updates, n_prior + self.actor_warm_start):
+            before_update()
+            if update < n_prior:
+                self._update_prior(self.policy.batch_size_of("prior", self.batch_size))
+            else:
+                self.actor.circuit.apply_changes(self._refresh_changes(), self.actor.circuit.optimizer)
+            self.n_pretraining_updates += 1
         self.actor_target.load_state_dict(self.actor.circuit.state_dict())
         self.pretrained = True
 
@@ -668,6 +677,7 @@ class ActPC(OffPolicyAlgorithm):
         expert = self.expert
         return {
             "pretrained": self.pretrained,
+            "n_pretraining_updates": self.n_pretraining_updates,
             "rollout_state": self._rollout_state,
             "rollout_starts": self._rollout_starts,
             "normalizers": [dict(vars(self.epistemic_normalizer)), dict(vars(self.instrumental_normalizer))],
@@ -689,8 +699,8 @@ class ActPC(OffPolicyAlgorithm):
             )
         if self.expert is not None:
             self.expert.epistemic, self.expert.instrumental, self.expert.has_signals = signals
-        self.pretrained, self._rollout_state = state["pretrained"], state["rollout_state"]
-        self._rollout_starts = state["rollout_starts"]
+        self.pretrained, self.n_pretraining_updates = state["pretrained"], state["n_pretraining_updates"]
+        self._rollout_state, self._rollout_starts = state["rollout_state"], state["rollout_starts"]
         normalizers = self.epistemic_normalizer, self.instrumental_normalizer
         for normalizer, values in zip(normalizers, state["normalizers"], strict=True):
             vars(normalizer).update(values)

@@ -1,7 +1,7 @@
 """The folder of a checkpoint: written under a temporary name, hashed while written, renamed when whole, checked when read.
 
-Every checkpoint is whole by itself. What has not changed since the one before is not written again: it is a second name (a hard
-link) of the same file, found by comparing that file with the memory, whatever the algorithm did with its buffer.
+Every checkpoint is whole by itself. What has not changed since the one before is not written again: it is a second name (a
+hard link) of the same file, found by comparing that file with the memory, whatever the algorithm did with its buffer.
 """
 
 from __future__ import annotations

@@ -292,7 +292,7 @@ def _train(
     report(f"{config.env}: {config.algo}, {plan.n_timesteps} steps{since}, into {folder}")
     if not has_checkpoint:
         callback.begin(model)
-    _learn(model, plan.n_timesteps, _callbacks(folder, plan, callback, report), config.progress)
+    _learn(model, plan.n_timesteps, _callbacks(folder, plan, callback, report), config.progress, goes_on=has_checkpoint)
     seconds = callback.wall_seconds
     result = {
         **callback.last_summary,
@@ -325,12 +325,14 @@ def _callbacks(
     return [CheckpointCallback(folder / CHECKPOINTS, plan.checkpoint_freq, at_end=False, report=report), evaluation]
 
 
-def _learn(model: OffPolicyAlgorithm, n_timesteps: int, callbacks: list[BaseCallback], progress: bool) -> None:
+def _learn(
+    model: OffPolicyAlgorithm, n_timesteps: int, callbacks: list[BaseCallback], progress: bool, goes_on: bool
+) -> None:
     # what progress_bar=True does, but closed when training stops early
     bar = [ProgressBarCallback()] if progress else []
     left = n_timesteps - model.num_timesteps
     try:
-        model.learn(max(left, 0), callback=[*callbacks, *bar], reset_num_timesteps=model.num_timesteps == 0)
+        model.learn(max(left, 0), callback=[*callbacks, *bar], reset_num_timesteps=not goes_on)
     finally:
         for callback in callbacks:
             if isinstance(callback, CheckpointCallback):

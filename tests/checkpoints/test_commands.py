@@ -9,6 +9,7 @@ import threading
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import yaml
 from stable_baselines3 import SAC, TD3
@@ -18,6 +19,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from sb3_actpc import ActPC
 from sb3_actpc.checkpoints import EXIT_STOPPED, CheckpointCallback, TrainingStopped, continue_learning, list_bundles, restore
 from sb3_actpc.cli import main
+from sb3_actpc.common.demonstrations import Demonstrations
 from tests.actpc.envs import CountingEnv
 from tests.checkpoints.runs import assert_equal, log_rows
 from tests.checkpoints.test_exact_resume import make_actpc
@@ -45,10 +47,9 @@ def small_preset(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     Path("small.yml").write_text(yaml.safe_dump({"default": settings}), encoding="utf-8")
 
 
-def signal_at(step: int, number: int, monkeypatch: pytest.MonkeyPatch, in_update: bool = False) -> None:
-    """Send this process a real signal once, at an environment step or in the updates after it."""
+def signal_at(step: int, number: int, monkeypatch: pytest.MonkeyPatch, name: str = "_store_transition") -> None:
+    """Send this process a real signal once, in the first call of a method from an environment step on."""
     sent = []
-    name = "_update_critic" if in_update else "_store_transition"
     original = getattr(ActPC, name)
 
     def send(self: ActPC, *arguments: Any) -> Any:
@@ -68,7 +69,7 @@ def test_a_stopped_run_goes_on_as_if_it_never_was(
     handlers = [signal.getsignal(one) for one in (signal.SIGTERM, signal.SIGINT)]
     assert main([*TRAIN, "--output", "straight"]) == 0
     with monkeypatch.context() as patch:
-        signal_at(97, number, patch, in_update)
+        signal_at(97, number, patch, "_update_critic" if in_update else "_store_transition")
         assert main([*TRAIN, "--output", "stopped"]) == EXIT_STOPPED
     assert "saved in stopped/checkpoints/" in (message := capsys.readouterr().err)
     assert "sb3-actpc train --resume stopped" in message
@@ -85,6 +86,27 @@ def test_a_stopped_run_goes_on_as_if_it_never_was(
     assert seconds == sorted(seconds)
     assert not Path("stopped/checkpoints").exists()  # nothing is left to resume
     assert main(["train", "--resume", "stopped"]) == 2
+
+
+def test_a_run_stopped_in_its_pretraining_goes_on_as_if_it_never_was(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    settings = yaml.safe_load(Path("small.yml").read_text(encoding="utf-8"))["default"]
+    Path("small.yml").write_text(yaml.safe_dump({"default": {**settings, "n_timesteps": 90, "prior_updates": 6}}))
+    rows = np.random.default_rng(0).uniform(-1.0, 1.0, (30, 10))
+    nothing = np.zeros(30)
+    Demonstrations(rows, rows[:, :2], rows, nothing, nothing, np.array([0]), "SparseReacher-v5").save("demonstrations.npz")
+    train = ["demonstrations.npz" if word == "none" else word for word in TRAIN]
+    assert main([*train, "--output", "straight"]) == 0
+    with monkeypatch.context() as patch:
+        signal_at(0, signal.SIGINT, patch, "_update_prior")
+        assert main([*train, "--output", "stopped"]) == EXIT_STOPPED
+    assert "stopped by SIGINT at step 0" in capsys.readouterr().err
+    assert main(["train", "--resume", "stopped", "--no-progress"]) == 0
+    assert log_rows(Path("straight/evaluations.csv")) == log_rows(Path("stopped/evaluations.csv"))
+    assert log_rows(Path("straight/progress.csv")) == log_rows(Path("stopped/progress.csv"))
+    one, two = (ActPC.load(f"{name}/model.zip") for name in ("straight", "stopped"))
+    assert_equal(one.policy.state_dict(), two.policy.state_dict(), "policy")
 
 
 def test_a_damaged_checkpoint_is_named_and_the_one_before_used(

@@ -1,5 +1,7 @@
 """A run that is stopped and resumed is, bit for bit, the run that was never stopped."""
 
+import os
+import signal
 from copy import deepcopy
 from pathlib import Path
 from typing import Any
@@ -17,6 +19,7 @@ from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 import sb3_actpc.envs  # noqa: F401, registers the sparse tasks
 from sb3_actpc import ActPC
+from sb3_actpc.checkpoints import list_bundles, restore
 from tests.actpc.envs import CountingEnv
 from tests.actpc.test_agent import demonstrations
 from tests.checkpoints.runs import assert_equal, assert_same, learn_in_two, learn_straight, log_rows
@@ -172,6 +175,33 @@ def test_a_stop_inside_a_long_train_loses_no_update(tmp_path: Path) -> None:
         assert_same(straight, resumed)
         if algorithm is ActPC:
             assert log_rows(folder / "straight" / "progress.csv") == log_rows(folder / "resumed" / "progress.csv")
+
+
+@pytest.mark.parametrize("stop_after", [1, 3, 5, 8])
+def test_a_stop_in_the_pretraining_loses_no_update(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stop_after: int) -> None:
+    """Five updates of the prior, then five of the actor."""
+
+    def make() -> ActPC:
+        noise = NormalActionNoise(np.zeros(2), np.ones(2))
+        return make_actpc(CountingEnv, 2, demonstrations=demonstrations(), actor_warm_start=5, action_noise=noise)
+
+    straight = learn_straight(make, tmp_path / "straight", 60)
+    name, number = ("_update_prior", stop_after) if stop_after <= 5 else ("_refresh_changes", stop_after - 5)
+    original, calls = getattr(ActPC, name), []
+
+    def send_signal(self: ActPC, *arguments: Any) -> Any:
+        calls.append(name)
+        if len(calls) == number:
+            os.kill(os.getpid(), signal.SIGTERM)
+        return original(self, *arguments)
+
+    monkeypatch.setattr(ActPC, name, send_signal)
+    resumed = learn_in_two(make, tmp_path / "resumed", 60, stop_at=0)
+    stopped = make()
+    restore(stopped, list_bundles(tmp_path / "resumed" / "checkpoints")[0])
+    assert stopped.n_pretraining_updates == stop_after
+    assert_same(straight, resumed)
+    assert log_rows(tmp_path / "straight" / "progress.csv") == log_rows(tmp_path / "resumed" / "progress.csv")
 
 
 def test_environments_in_other_processes_start_again_from_seeded_states(tmp_path: Path) -> None:
