@@ -20,21 +20,18 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from sb3_actpc.actpc.demonstration_replay import DemonstrationReplay
 from sb3_actpc.actpc.diagnostics import Diagnostics
 from sb3_actpc.actpc.inputs import Batch, CircuitInputs
+from sb3_actpc.actpc.keywords import check_keywords
 from sb3_actpc.actpc.policies import ActPCActor, ActPCPolicy, CnnPolicy, Critics, MlpPolicy, MultiInputPolicy
-from sb3_actpc.actpc.signals import SIGNAL_ERRORS, make_normalizer, summed_squared_errors
+from sb3_actpc.actpc.signals import make_normalizer, summed_squared_errors
 from sb3_actpc.checkpoints import between_updates, load_checkpoint, load_weights, save_weights
 from sb3_actpc.common.buffers import _SignalReplay, combined_buffer_class
-from sb3_actpc.common.checks import check_choices, check_finite, check_kinds, check_numbers
+from sb3_actpc.common.checks import check_finite, named_in_errors
 from sb3_actpc.common.demonstrations import Demonstrations, resolve
 from sb3_actpc.common.episodes import Episodes, map_observations, sample_union
 from sb3_actpc.ngc import HebbianChanges, NGCCircuit, settle_coupled
 
 SelfActPC = TypeVar("SelfActPC", bound="ActPC")
 
-SETTLINGS = ("iterative", "scheduled")
-BOOTSTRAPS = ("joint", "literal")
-TARGET_UPDATES = ("polyak", "hard")
-OBSERVATION_NORMALIZATIONS = ("none", "demonstrations")
 SMALLEST_VALUE_SCALE = 0.1  # of the mean absolute action-value that ``scale_pressure`` divides by: values start near 0
 EXPERT_SIGNALS_INTERVAL = 1000  # updates between two evaluations of the demonstrations' signals
 
@@ -183,36 +180,7 @@ class ActPC(OffPolicyAlgorithm):
         seed: int | None = None,
         _init_setup_model: bool = True,
     ) -> None:
-        given = dict(locals())
-        check_kinds(
-            given,
-            numbers="tau gamma learning_starts refresh_weight demonstration_fraction alpha_ep alpha_in actor_pressure "
-            "target_policy_noise target_noise_clip",
-            whole="buffer_size batch_size n_steps gradient_steps prior_updates actor_warm_start self_imitation_size "
-            "critic_warmup n_critics target_update_interval memory_history stats_window_size verbose",
-            optional="alpha_ext nudge n_demonstrations n_demonstration_transitions seed",
-            mappings="circuit_kwargs actor_kwargs critic_kwargs generator_kwargs prior_kwargs policy_kwargs "
-            "replay_buffer_kwargs",
-        )
-        if not callable(learning_rate):
-            check_kinds(given, numbers="learning_rate")
-        check_choices(
-            given,
-            settling=SETTLINGS,
-            signal_errors=SIGNAL_ERRORS,
-            bootstrap=BOOTSTRAPS,
-            target_update=TARGET_UPDATES,
-            observation_normalization=OBSERVATION_NORMALIZATIONS,
-        )
-        check_numbers(
-            given,
-            at_least_0="prior_updates actor_warm_start refresh_weight self_imitation_size actor_pressure critic_warmup "
-            "target_policy_noise target_noise_clip",
-            at_least_1="n_critics target_update_interval memory_history",
-            fraction="demonstration_fraction",
-        )
-        if nudge is not None and not 0.0 < nudge <= 1.0:
-            raise ValueError(f"nudge={nudge!r} must be above 0 and at most 1")
+        check_keywords(locals(), self.policy_aliases)
         super().__init__(
             policy,
             env,
@@ -296,7 +264,8 @@ class ActPC(OffPolicyAlgorithm):
         }
         self.policy_kwargs = self._merged_policy_kwargs()
         self.n_steps = 1  # the buffer knows; SB3 would warn that a custom one does not
-        super()._setup_model()
+        with named_in_errors(f"buffer_size={self.buffer_size}, replay_buffer_kwargs={asked[1]!r}", ValueError):
+            super()._setup_model()
         self.replay_buffer_kwargs, self.policy_kwargs, self.n_steps = asked[1:]
         self._create_aliases()
         self._setup_demonstrations()
@@ -309,11 +278,10 @@ class ActPC(OffPolicyAlgorithm):
             **{f"{name}_kwargs": getattr(self, f"{name}_kwargs") for name in ("actor", "critic", "generator", "prior")},
         }
         merged = {**own, **self.policy_kwargs}
-        given = {**(self.circuit_kwargs or {}), **merged.get("circuit_kwargs", {})}
-        if given.get("settling", self.settling) != self.settling:
-            raise ValueError(
-                f"circuit_kwargs has settling={given['settling']!r} but the agent's is {self.settling!r}; pass settling="
-            )
+        given = {**(self.circuit_kwargs or {}), **(merged.get("circuit_kwargs") or {})}
+        chosen = given.get("settling", self.settling)
+        if not isinstance(chosen, str) or chosen != self.settling:
+            raise ValueError(f"circuit_kwargs has settling={chosen!r} but the agent's is {self.settling!r}; pass settling=")
         merged["circuit_kwargs"] = {**given, "settling": self.settling}
         return merged
 

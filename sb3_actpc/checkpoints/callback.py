@@ -35,8 +35,9 @@ class CheckpointCallback(BaseCallback):
     Saves everything that the training of any SB3 off-policy algorithm depends on, every ``save_freq`` steps and when the
     process is told to stop (SIGTERM, SIGINT); the latter raises :class:`~sb3_actpc.checkpoints.TrainingStopped`.
 
-    A checkpoint is taken between two rollouts (``train_freq`` steps), or between two updates of a ``train()`` or a pre-training
-    (see :func:`between_updates`) that a signal interrupts. The handlers that were there before come back when ``learn`` ends; after an error, call :meth:`close`.
+    A checkpoint is taken between two rollouts (``train_freq`` steps), or between two updates of a ``train()`` or a
+    pre-training (see :func:`between_updates`) that a signal interrupts. The handlers that were there before come back when
+    ``learn`` ends; after an error, call :meth:`close`.
 
     To go on, see :func:`restore` and :func:`continue_learning`.
 
