@@ -1,12 +1,12 @@
 """A run that is stopped and resumed is, bit for bit, the run that was never stopped."""
 
-import multiprocessing
 import os
 import signal
 from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
@@ -21,16 +21,13 @@ from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 import sb3_actpc.envs  # noqa: F401, registers the sparse tasks
 from sb3_actpc import ActPC
 from sb3_actpc.checkpoints import list_bundles, restore
+from sb3_actpc.checkpoints.simulators import _physics_arrays
 from tests.actpc.envs import CountingEnv
 from tests.actpc.test_agent import demonstrations
-from tests.checkpoints.runs import assert_equal, assert_same, learn_in_two, learn_straight, log_rows
+from tests.checkpoints.runs import START_METHOD, assert_equal, assert_same, learn_in_two, learn_straight, log_rows
 
 SMALL: dict[str, Any] = {"policy_kwargs": {"net_arch": [16, 16]}, "learning_starts": 10, "batch_size": 16, "seed": 3}
 ACTPC: dict[str, Any] = {**SMALL, "settling": "scheduled", "prior_updates": 5, "buffer_size": 200, "device": "cpu"}
-
-
-# a forked process has imported everything already
-START_METHOD = "fork" if "fork" in multiprocessing.get_all_start_methods() else "spawn"
 
 
 def make_actpc(env: Any, n_envs: int = 1, normalize: bool = False, **keywords: Any) -> ActPC:
@@ -130,6 +127,20 @@ def test_the_simulator_goes_on_in_the_middle_of_an_episode(tmp_path: Path, env_i
         return make_actpc(env_id, learning_starts=20, normalize=True)
 
     check(make, tmp_path, stop_at + 30, stop_at)
+
+
+@pytest.mark.parametrize("env_id", ["SparseReacher-v5", "HalfCheetah-v5"])
+def test_only_memory_that_belongs_to_the_simulator_is_stored(env_id: str) -> None:
+    """MuJoCo has one buffer for all arrays of fixed size; its arena, from which the others come, lies elsewhere."""
+    env = gym.make(env_id)
+    env.reset(seed=0)
+    data = env.unwrapped.data
+    arrays = _physics_arrays(data)
+    assert {"qpos", "qvel", "qacc_warmstart", "ctrl", "xpos", "cfrc_ext"} <= arrays.keys()
+    of_the_struct = {"energy", "solver_fwdinv"}
+    starts = [array.ctypes.data for name, array in arrays.items() if name not in of_the_struct]
+    assert max(starts) - min(starts) < data.nbuffer
+    env.close()
 
 
 class OpaqueEnv(CountingEnv):
