@@ -362,7 +362,7 @@ def test_presets_are_plain_and_an_entry_replaces_the_default() -> None:
     assert load_preset("p.yml", "Other-v0") == {"gamma": 0.9, "tau": 0.01}
     assert load_preset("p.yml", ENV_ID) == {"policy_kwargs": {"optimizer_kwargs": {"eps": 1e-5}}}
     Path("p.yml").write_text("default: !!python/object/apply:os.getcwd []", encoding="utf-8")
-    with pytest.raises(ValueError, match="not a YAML file"):
+    with pytest.raises(ValueError, match="not YAML of plain values"):
         load_preset("p.yml", ENV_ID)
 
 

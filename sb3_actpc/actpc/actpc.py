@@ -1,7 +1,7 @@
 """ActPC: active predictive coding as a Stable-Baselines3 algorithm (Ororbia & Mali, arXiv 2209.09174, Algorithm 1)."""
 
 import warnings
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from functools import reduce
 from os import PathLike
 from pathlib import Path
@@ -20,21 +20,18 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from sb3_actpc.actpc.demonstration_replay import DemonstrationReplay
 from sb3_actpc.actpc.diagnostics import Diagnostics
 from sb3_actpc.actpc.inputs import Batch, CircuitInputs
+from sb3_actpc.actpc.keywords import check_keywords
 from sb3_actpc.actpc.policies import ActPCActor, ActPCPolicy, CnnPolicy, Critics, MlpPolicy, MultiInputPolicy
-from sb3_actpc.actpc.signals import SIGNAL_ERRORS, make_normalizer, summed_squared_errors
-from sb3_actpc.checkpoints import load_checkpoint, load_weights, save_weights
+from sb3_actpc.actpc.signals import make_normalizer, summed_squared_errors
+from sb3_actpc.checkpoints import between_updates, load_checkpoint, load_weights, save_weights
 from sb3_actpc.common.buffers import _SignalReplay, combined_buffer_class
-from sb3_actpc.common.checks import check_choices, check_finite, check_kinds, check_numbers
+from sb3_actpc.common.checks import check_finite, named_in_errors
 from sb3_actpc.common.demonstrations import Demonstrations, resolve
 from sb3_actpc.common.episodes import Episodes, map_observations, sample_union
 from sb3_actpc.ngc import HebbianChanges, NGCCircuit, settle_coupled
 
 SelfActPC = TypeVar("SelfActPC", bound="ActPC")
 
-SETTLINGS = ("iterative", "scheduled")
-BOOTSTRAPS = ("joint", "literal")
-TARGET_UPDATES = ("polyak", "hard")
-OBSERVATION_NORMALIZATIONS = ("none", "demonstrations")
 # of the mean absolute action-value that ``scale_pressure`` divides by: one paid step. Where nothing was paid yet, the critic's
 # noise must not be blown up to full strength
 SMALLEST_VALUE_SCALE = 1.0
@@ -185,36 +182,7 @@ class ActPC(OffPolicyAlgorithm):
         seed: int | None = None,
         _init_setup_model: bool = True,
     ) -> None:
-        given = dict(locals())
-        check_kinds(
-            given,
-            numbers="tau gamma learning_starts refresh_weight demonstration_fraction alpha_ep alpha_in actor_pressure "
-            "target_policy_noise target_noise_clip",
-            whole="buffer_size batch_size n_steps gradient_steps prior_updates actor_warm_start self_imitation_size "
-            "critic_warmup n_critics target_update_interval memory_history stats_window_size verbose",
-            optional="alpha_ext nudge n_demonstrations n_demonstration_transitions seed",
-            mappings="circuit_kwargs actor_kwargs critic_kwargs generator_kwargs prior_kwargs policy_kwargs "
-            "replay_buffer_kwargs",
-        )
-        if not callable(learning_rate):
-            check_kinds(given, numbers="learning_rate")
-        check_choices(
-            given,
-            settling=SETTLINGS,
-            signal_errors=SIGNAL_ERRORS,
-            bootstrap=BOOTSTRAPS,
-            target_update=TARGET_UPDATES,
-            observation_normalization=OBSERVATION_NORMALIZATIONS,
-        )
-        check_numbers(
-            given,
-            at_least_0="prior_updates actor_warm_start refresh_weight self_imitation_size actor_pressure critic_warmup "
-            "target_policy_noise target_noise_clip",
-            at_least_1="n_critics target_update_interval memory_history",
-            fraction="demonstration_fraction",
-        )
-        if nudge is not None and not 0.0 < nudge <= 1.0:
-            raise ValueError(f"nudge={nudge!r} must be above 0 and at most 1")
+        check_keywords(locals(), self.policy_aliases)
         super().__init__(
             policy,
             env,
@@ -277,7 +245,7 @@ class ActPC(OffPolicyAlgorithm):
         self.signal_normalizer = signal_normalizer
         self.epistemic_normalizer = make_normalizer(signal_normalizer)
         self.instrumental_normalizer = make_normalizer(signal_normalizer)
-        self.pretrained = False
+        self.pretrained, self.n_pretraining_updates = False, 0
         if _init_setup_model:
             self._setup_model()
 
@@ -298,7 +266,8 @@ class ActPC(OffPolicyAlgorithm):
         }
         self.policy_kwargs = self._merged_policy_kwargs()
         self.n_steps = 1  # the buffer knows; SB3 would warn that a custom one does not
-        super()._setup_model()
+        with named_in_errors(f"buffer_size={self.buffer_size}, replay_buffer_kwargs={asked[1]!r}", ValueError):
+            super()._setup_model()
         self.replay_buffer_kwargs, self.policy_kwargs, self.n_steps = asked[1:]
         self._create_aliases()
         self._setup_demonstrations()
@@ -311,11 +280,10 @@ class ActPC(OffPolicyAlgorithm):
             **{f"{name}_kwargs": getattr(self, f"{name}_kwargs") for name in ("actor", "critic", "generator", "prior")},
         }
         merged = {**own, **self.policy_kwargs}
-        given = {**(self.circuit_kwargs or {}), **merged.get("circuit_kwargs", {})}
-        if given.get("settling", self.settling) != self.settling:
-            raise ValueError(
-                f"circuit_kwargs has settling={given['settling']!r} but the agent's is {self.settling!r}; pass settling="
-            )
+        given = {**(self.circuit_kwargs or {}), **(merged.get("circuit_kwargs") or {})}
+        chosen = given.get("settling", self.settling)
+        if not isinstance(chosen, str) or chosen != self.settling:
+            raise ValueError(f"circuit_kwargs has settling={chosen!r} but the agent's is {self.settling!r}; pass settling=")
         merged["circuit_kwargs"] = {**given, "settling": self.settling}
         return merged
 
@@ -398,11 +366,16 @@ class ActPC(OffPolicyAlgorithm):
                 self.replay_buffer.cut_running_episodes()
         result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
         self._check_observations(self._last_obs)
-        self.pretrain()
+        self.pretrain(between_updates(result[1]))
         return result
 
-    def pretrain(self) -> None:
-        """Train the prior (and, if asked for, the actor) on the demonstrations, once; ``learn`` calls this."""
+    def pretrain(self, before_update: Callable[[], None] = lambda: None) -> None:
+        """
+        Train the prior (and, if asked for, the actor) on the demonstrations, once; ``learn`` calls this.
+
+        :param before_update: called before each update
+        :raises ValueError: when the demonstrations of a loaded agent are not there any more
+        """
         if self.expert is None and self.demonstrations is not None:
             raise ValueError(f"no demonstrations file at {self.demonstrations}: set agent.demonstrations, or put it back")
         if self.pretrained or self.expert is None:
@@ -413,10 +386,14 @@ class ActPC(OffPolicyAlgorithm):
                 "observation_normalization='demonstrations'",
                 stacklevel=2,
             )
-        for _ in range(self.prior_updates if self.alpha_in else 0):  # without a weight the prior has no role
-            self._update_prior(self.policy.batch_size_of("prior", self.batch_size))
-        for _ in range(self.actor_warm_start):
-            self.actor.circuit.apply_changes(self._refresh_changes(), self.actor.circuit.optimizer)
+        n_prior = self.prior_updates if self.alpha_in else 0  # without a weight the prior has no role
+        for update in range(self.n_pretraining_updates, n_prior + self.actor_warm_start):
+            before_update()
+            if update < n_prior:
+                self._update_prior(self.policy.batch_size_of("prior", self.batch_size))
+            else:
+                self.actor.circuit.apply_changes(self._refresh_changes(), self.actor.circuit.optimizer)
+            self.n_pretraining_updates += 1
         self.actor_target.load_state_dict(self.actor.circuit.state_dict())
         self.pretrained = True
 
@@ -681,6 +658,7 @@ class ActPC(OffPolicyAlgorithm):
         expert = self.expert
         return {
             "pretrained": self.pretrained,
+            "n_pretraining_updates": self.n_pretraining_updates,
             "rollout_state": self._rollout_state,
             "rollout_starts": self._rollout_starts,
             "normalizers": [dict(vars(self.epistemic_normalizer)), dict(vars(self.instrumental_normalizer))],
@@ -702,8 +680,8 @@ class ActPC(OffPolicyAlgorithm):
             )
         if self.expert is not None:
             self.expert.epistemic, self.expert.instrumental, self.expert.has_signals = signals
-        self.pretrained, self._rollout_state = state["pretrained"], state["rollout_state"]
-        self._rollout_starts = state["rollout_starts"]
+        self.pretrained, self.n_pretraining_updates = state["pretrained"], state["n_pretraining_updates"]
+        self._rollout_state, self._rollout_starts = state["rollout_state"], state["rollout_starts"]
         normalizers = self.epistemic_normalizer, self.instrumental_normalizer
         for normalizer, values in zip(normalizers, state["normalizers"], strict=True):
             vars(normalizer).update(values)

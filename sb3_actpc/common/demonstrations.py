@@ -534,7 +534,8 @@ def _read_arrays(content: bytes, source: str) -> dict[str, np.ndarray]:
     with archive:
         version = _read_array(archive, "format_version", source)
         if version.shape != () or version.dtype.kind not in "iu" or version < 1:
-            raise _field_error(source, "format_version", "a whole number of at least 1", repr(version))
+            found = f"type {version.dtype}, shape {version.shape}" if version.shape else repr(version.item())
+            raise _field_error(source, "format_version", "a whole number of at least 1", found)
         if version > FORMAT_VERSION:
             raise _field_error(source, "format_version", f"at most {FORMAT_VERSION} (update sb3-actpc)", str(version))
         return {name: _read_array(archive, name, source) for name in _STORED_FIELDS}
@@ -546,7 +547,7 @@ def _read_array(archive: zipfile.ZipFile, name: str, source: str) -> np.ndarray:
     try:
         return np.lib.format.read_array(io.BytesIO(archive.read(f"{name}.npy")), allow_pickle=False)
     except _CORRUPT_FILE_ERRORS as error:
-        raise _field_error(source, name, "a readable array", f"{type(error).__name__}: {error}") from None
+        raise _field_error(source, name, "a readable array", f"{type(error).__name__}: {str(error)[:200]}") from None
 
 
 def _read_json(stored: dict[str, np.ndarray], name: str, source: str) -> Any:

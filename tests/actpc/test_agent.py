@@ -529,7 +529,7 @@ def test_discrete_actions_and_images_get_one_clear_line():
         ({"settling": "fast"}, "settling='fast'"),
         ({"circuit_kwargs": {"activation": "gelu"}}, "activation='gelu'"),
         ({"circuit_kwargs": {"n_steps": 3}}, "a circuit has no keywords"),
-        ({"critic_kwargs": {"hidden": [8]}}, "critic: a circuit has no keywords"),
+        ({"critic_kwargs": {"hidden": [8]}}, "critic_kwargs: a circuit has no keywords"),
     ],
 )
 def test_a_wrong_keyword_is_named(keywords, named):
