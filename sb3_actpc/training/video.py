@@ -82,7 +82,7 @@ def _render_episode(model: Any, env_id: str, env_kwargs: dict[str, Any], seed: i
     import gymnasium as gym
     from mujoco import FatalError
 
-    from sb3_actpc.training.run import make_env
+    from sb3_actpc.training.environments import make_env
 
     env = None
     try:
