@@ -8,6 +8,7 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.type_aliases import GymEnv
+from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 from stable_baselines3.td3.policies import TD3Policy
 
 from sb3_actpc.baselines.keywords import with_keywords_of
@@ -68,6 +69,7 @@ class HER(DDPGDemo):
         self.prioritized = prioritized
         self.random_action_start, self.random_action_decay = random_action_start, random_action_decay
         self.random_action_end = random_action_end
+        self._has_episode = False
         super().__init__(
             policy,
             env,
@@ -102,6 +104,20 @@ class HER(DDPGDemo):
             scaled = np.where(random[:, None], self.policy.scale_action(drawn), scaled)
             actions = self.policy.unscale_action(scaled)
         return actions, scaled
+
+    def train(self, gradient_steps: int, batch_size: int = 100) -> None:
+        """
+        DDPG's updates; none before the first episode has ended, since hindsight needs one.
+
+        :param gradient_steps: how many
+        :param batch_size: B
+        """
+        buffer = self.replay_buffer
+        if isinstance(buffer, HerReplayBuffer) and not self._has_episode and buffer.n_demonstrated(batch_size) < batch_size:  # type: ignore[attr-defined]
+            self._has_episode = bool((buffer.ep_length > 0).any())
+            if not self._has_episode:
+                return
+        super().train(gradient_steps, batch_size)
 
     def _critic_loss(self, values: th.Tensor, targets: th.Tensor) -> th.Tensor:
         """The squared errors by importance weight; the priorities follow the errors of the first critic."""

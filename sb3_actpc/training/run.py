@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import importlib.metadata
 import json
@@ -211,7 +212,7 @@ def build_model(plan: RunPlan, config: RunConfig, env: VecEnv) -> BaseAlgorithm:
     :return: the agent, not trained
     :raises ValueError: when a setting has a wrong value
     """
-    kwargs = dict(plan.algorithm_kwargs)
+    kwargs = copy.deepcopy(plan.algorithm_kwargs)  # SB3 adds keys of its own to the dictionaries it is given
     if "learning_rate" in kwargs:
         kwargs["learning_rate"] = parse_schedule(kwargs["learning_rate"])
     if plan.uses_demonstrations:
