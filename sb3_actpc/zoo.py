@@ -10,6 +10,9 @@ What rl_zoo3 gets is a settings file with one entry, made from the preset, becau
 * knows nothing of demonstrations: the file's path is a setting like any other;
 * logs the success rate only where it is told to (``monitor_kwargs``), and its plots need it;
 * begins a continued run (``-i model.zip``) with the random warm-up again: ``learning_starts`` is then 0.
+
+rl_zoo3 gives its training and its evaluation environments one seed, so that an agent is evaluated on the starts that it
+trained on; here the evaluation has another, as in ``sb3-actpc train``.
 """
 
 from __future__ import annotations
@@ -34,6 +37,7 @@ from sb3_actpc.training.config import (
     load_preset,
 )
 from sb3_actpc.training.environments import check_env_id, make_env, register_tasks
+from sb3_actpc.training.run import EVALUATION_SEED_OFFSET
 
 SCRIPTS = {
     "train": "rl_zoo3.train:train",
@@ -67,6 +71,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     if command.startswith(("plot", "all")):
         return _plot(SCRIPTS[command], arguments)
     register_algorithms()
+    if {"-h", "--help"} & set(arguments):
+        return _run(SCRIPTS[command], ["--help"])
     if command == "enjoy":
         return _run(SCRIPTS[command], _playing_arguments(arguments))
     with tempfile.TemporaryDirectory(prefix="sb3_actpc_zoo_") as folder:
@@ -80,6 +86,8 @@ def register_algorithms() -> None:
     :raises ImportError: when rl_zoo3 is not installed
     """
     zoo, hyperparams = _import("rl_zoo3"), _import("rl_zoo3.hyperparams_opt")
+    if "actpc" in zoo.ALGOS:
+        return
     for name in ALGORITHMS:
         zoo.ALGOS[name] = load_algorithm(name)
     samplers, converters = hyperparams.HYPERPARAMS_SAMPLER, hyperparams.HYPERPARAMS_CONVERTER
@@ -89,6 +97,22 @@ def register_algorithms() -> None:
         converters.setdefault(name, converters[like])
     for name in ("td3", "ddpg", "her"):
         samplers[name] = _with_one_learning_rate(samplers[name])
+    _evaluate_on_other_seeds(_import("rl_zoo3.exp_manager").ExperimentManager)
+
+
+def _evaluate_on_other_seeds(manager: Any) -> None:
+    """:param manager: rl_zoo3's class, whose method that makes environments is replaced"""
+    create_envs = manager.create_envs
+
+    def create_envs_with_other_seeds(self: Any, n_envs: int, eval_env: bool = False, no_log: bool = False) -> Any:
+        seed = self.seed
+        self.seed = (seed + EVALUATION_SEED_OFFSET) % 2**32 if eval_env else seed
+        try:
+            return create_envs(self, n_envs, eval_env=eval_env, no_log=no_log)
+        finally:
+            self.seed = seed
+
+    manager.create_envs = create_envs_with_other_seeds
 
 
 def sample_actpc_params(trial: Any, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> dict[str, Any]:

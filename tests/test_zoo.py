@@ -45,7 +45,16 @@ SCRIPT = {
 }
 CODE = """
 import json, sys
+import rl_zoo3.exp_manager
 from sb3_actpc.zoo import main
+
+make_vec_env = rl_zoo3.exp_manager.make_vec_env
+
+def make_and_tell(*arguments, **keywords):
+    print(f"made with seed {keywords['seed']}")
+    return make_vec_env(*arguments, **keywords)
+
+rl_zoo3.exp_manager.make_vec_env = make_and_tell
 for name, arguments in json.loads(sys.argv[1]).items():
     print(f"@@@ {name}", flush=True)
     main(arguments)
@@ -106,6 +115,18 @@ def test_trained_agents_are_played(ran: tuple[Path, dict[str, str]], command: st
     """Without their environment, with a learning rate of 0, and with rl-zoo3's other replacements."""
     assert "Episode Length 50" in ran[1][command]
     assert "Success rate" in ran[1][command]
+
+
+def test_the_evaluation_starts_elsewhere_than_the_training(ran: tuple[Path, dict[str, str]]) -> None:
+    seeds = [int(line.rpartition(" ")[2]) for line in ran[1]["train"].splitlines() if line.startswith("made with seed")]
+    assert sorted(seeds) == [1, 1_000_001]
+
+
+def test_help_is_rl_zoo3s_with_our_algorithms() -> None:
+    pytest.importorskip("rl_zoo3")
+    command = [sys.executable, "-m", "sb3_actpc.zoo", "train", "--help"]
+    shown = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=120, check=True).stdout
+    assert "--optimize-hyperparameters" in shown and "actpc" in shown and "sac_rlpd" in shown
 
 
 def test_a_continued_run_does_not_begin_with_random_actions_again(ran: tuple[Path, dict[str, str]]) -> None:

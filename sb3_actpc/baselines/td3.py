@@ -78,14 +78,16 @@ class TD3Demo(DemonstratedAlgorithm, TD3):
         unknown = sorted(set(given) - set(NETWORK_KEYWORDS))
         if unknown:
             raise ValueError(f"{name}_kwargs has unknown keys {unknown}: choose from {', '.join(NETWORK_KEYWORDS)}")
-        kind = given.get("optimizer", "adam")
-        if kind not in OPTIMIZERS:
-            raise ValueError(f"{name}_kwargs: optimizer={kind!r} is unknown; choose one of {sorted(OPTIMIZERS)}")
+        if given.get("optimizer", "adam") not in OPTIMIZERS:
+            raise ValueError(f"{name}_kwargs: optimizer={given['optimizer']!r} is unknown; choose one of {sorted(OPTIMIZERS)}")
         check_kinds({"learning_rate": 0.0, "tau": self.tau, **given}, numbers="learning_rate tau")
         network: BaseModel = getattr(self, name)
+        kind, options = self.policy.optimizer_class, self.policy.optimizer_kwargs
+        if "optimizer" in given:
+            kind, options = OPTIMIZERS[given["optimizer"]], {}
         rate = given.get("learning_rate", self.lr_schedule(1.0))
-        options = given.get("optimizer_kwargs", {})
-        network.optimizer = OPTIMIZERS[kind](network.parameters(), lr=rate, **options)  # type: ignore[call-arg]
+        options = {**options, **given.get("optimizer_kwargs", {})}
+        network.optimizer = kind(network.parameters(), lr=rate, **options)  # type: ignore[call-arg]
 
     def _tau_of(self, given: dict[str, Any] | None) -> float:
         return (given or {}).get("tau", self.tau)
