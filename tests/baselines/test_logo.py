@@ -8,6 +8,7 @@ import torch as th
 from gymnasium import spaces
 from sb3_contrib import TRPO
 from stable_baselines3.common.buffers import RolloutBuffer
+from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_actpc.baselines import LOGO
 from sb3_actpc.baselines.logo import Guidance, generalized_advantages
@@ -159,3 +160,39 @@ def test_wrong_settings_are_named(options: dict, message: str) -> None:
 def test_spaces_that_the_discriminator_cannot_take_are_refused() -> None:
     with pytest.raises(ValueError, match="LOGO's discriminator needs Box spaces"):
         LOGO("MlpPolicy", "CartPole-v1", demonstrations=record("Pendulum-v1"), n_steps=16, batch_size=16)
+
+
+def test_rows_of_two_environments_keep_together(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Observations, actions, probabilities, rewards and advantages of a row are of one step of one environment."""
+    env = make_vec_env("Pendulum-v1", n_envs=2, seed=5)
+    model = LOGO("MlpPolicy", env, demonstrations=record("Pendulum-v1"), **{**SMALL, "n_steps": 24})
+    prepared: list[Guidance] = []
+    given: list[th.Tensor] = []
+    prepare, advantages = LOGO._prepare_guidance, generalized_advantages
+
+    def watched(self: LOGO, shown: th.Tensor) -> Guidance:
+        buffer = self.rollout_buffer
+        guidance = prepare(self, shown)
+        with th.no_grad():
+            _, log_probs, _ = self.policy.evaluate_actions(guidance.observations, guidance.actions)
+            assert log_probs == pytest.approx(guidance.log_probs, abs=1e-5)
+            for env in range(2):
+                for step in (0, 7, 23):
+                    seen = np.concatenate([buffer.observations[step, env], buffer.actions[step, env].clip(-2, 2)])
+                    reward = th.nn.functional.softplus(-self.discriminator(th.as_tensor(seen)[None]))
+                    assert given[-1][step, env].item() == pytest.approx(reward.item(), abs=1e-5)
+                    row = env * 24 + step
+                    assert guidance.observations[row].numpy() == pytest.approx(buffer.observations[step, env])
+        prepared.append(guidance)
+        return guidance
+
+    def watched_advantages(rewards: th.Tensor, *others: object) -> th.Tensor:
+        given.append(rewards)
+        result = th.arange(48.0).reshape(24, 2)  # step * 2 + environment, to find them again
+        return result if advantages(rewards, *others).shape == result.shape else rewards
+
+    monkeypatch.setattr(LOGO, "_prepare_guidance", watched)
+    monkeypatch.setattr("sb3_actpc.baselines.logo.generalized_advantages", watched_advantages)
+    model.learn(48)
+    expected = th.cat([th.arange(0.0, 48.0, 2.0), th.arange(1.0, 48.0, 2.0)])
+    assert prepared[0].advantages == pytest.approx((expected - expected.mean()) / expected.std(), abs=1e-5)
