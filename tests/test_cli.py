@@ -313,7 +313,7 @@ def test_a_graphics_backend_that_does_not_work_is_set_aside(monkeypatch: pytest.
     ("arguments", "message"),
     [
         (["train", "--env", "SparseNothing-v0"], "SparseNothing"),
-        (["train", "--env", ENV_ID, "--algo", "td3"], "no preset 'td3'"),
+        (["train", "--env", ENV_ID, "--algo", "silent"], "no preset 'silent'"),
         (["train", "--env", ENV_ID, "--algo", "unknown"], "unknown algorithm 'unknown'"),
         (TRAIN, "sb3-actpc demos collect --env SparseLine-v0"),
         ([*TRAIN, "--demonstrations", "no.npz"], "no.npz"),

@@ -26,7 +26,8 @@ from sb3_actpc.actpc.signals import make_normalizer, summed_squared_errors
 from sb3_actpc.checkpoints import between_updates, load_checkpoint, load_weights, save_weights
 from sb3_actpc.common.buffers import _SignalReplay, combined_buffer_class
 from sb3_actpc.common.checks import check_finite, named_in_errors
-from sb3_actpc.common.demonstrations import Demonstrations, resolve
+from sb3_actpc.common.demonstration_buffers import fit_demonstrations
+from sb3_actpc.common.demonstrations import Demonstrations
 from sb3_actpc.common.episodes import Episodes, map_observations, sample_union
 from sb3_actpc.ngc import HebbianChanges, NGCCircuit, settle_coupled
 
@@ -59,7 +60,7 @@ class ActPC(OffPolicyAlgorithm):
     :param train_freq: environment steps (or episodes) between updates
     :param gradient_steps: updates each time; -1 for as many as steps were collected
     :param action_noise: exploration noise added to the action; the paper has none
-    :param replay_buffer_class: None, or one of SB3's classes (its ActPC counterpart is used)
+    :param replay_buffer_class: None, or one of SB3's classes or its name (its ActPC counterpart is used)
     :param replay_buffer_kwargs: keywords of the buffer
     :param optimize_memory_usage: as in SB3
     :param n_steps: length of n-step returns
@@ -136,7 +137,7 @@ class ActPC(OffPolicyAlgorithm):
         train_freq: int | tuple[int, str] = 1,
         gradient_steps: int = 1,
         action_noise: ActionNoise | None = None,
-        replay_buffer_class: type[ReplayBuffer] | None = None,
+        replay_buffer_class: type[ReplayBuffer] | str | None = None,
         replay_buffer_kwargs: dict[str, Any] | None = None,
         optimize_memory_usage: bool = False,
         n_steps: int = 1,
@@ -195,7 +196,7 @@ class ActPC(OffPolicyAlgorithm):
             train_freq,
             gradient_steps,
             action_noise=action_noise,
-            replay_buffer_class=replay_buffer_class,
+            replay_buffer_class=replay_buffer_class,  # type: ignore[arg-type]
             replay_buffer_kwargs=replay_buffer_kwargs,
             optimize_memory_usage=optimize_memory_usage,
             n_steps=n_steps,
@@ -310,16 +311,17 @@ class ActPC(OffPolicyAlgorithm):
             if idle:
                 raise ValueError(f"{' and '.join(idle)} need demonstrations=; pass a file or leave them out")
             return
+        if self.env is None and isinstance(self.observation_space, spaces.Dict):
+            return  # only a goal task can turn the demonstrations into its own: ``set_env`` tries again
+        limits = self.n_demonstrations, self.n_demonstration_transitions
         try:
-            demonstrations = resolve(self.demonstrations)
+            demonstrations = fit_demonstrations(
+                self.demonstrations, self.env, self.observation_space, self.action_space, *limits
+            )
         except FileNotFoundError:
             if not self.pretrained:
                 raise
             return  # a trained agent acts without them; ``learn`` says what is missing
-        demonstrations = demonstrations.select(self.n_demonstrations, self.n_demonstration_transitions)
-        demonstrations.check(self.observation_space, self.action_space, self._env_id())
-        if self.env is not None:
-            demonstrations = demonstrations.rewarded_by(self.env)
         assert isinstance(self.action_space, spaces.Box)
         self.expert = DemonstrationReplay(demonstrations, self.observation_space, self.action_space, self.history)
         if self.observation_normalization == "demonstrations" and not self.pretrained:
@@ -328,19 +330,13 @@ class ActPC(OffPolicyAlgorithm):
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         super().set_env(env, force_reset)
-        if self.expert is not None:  # another environment may pay for other steps
+        if self.demonstrations is not None:  # another environment may pay for other steps
             self._setup_demonstrations()
 
     @property
     def inputs(self) -> CircuitInputs:
         """Turns observations into what the circuits see."""
         return CircuitInputs(self.actor, self._vec_normalize_env)
-
-    def _env_id(self) -> str | None:
-        if self.env is None or not self.env.has_attr("spec"):
-            return None
-        spec = self.env.get_attr("spec", indices=0)[0]
-        return None if spec is None else spec.id
 
     @property
     def reward_weights(self) -> tuple[float, float, float]:

@@ -316,16 +316,28 @@ def _split_steps(joined: dict[str, Any] | None) -> list[tuple[Any, np.ndarray, f
     return list(zip(rows, joined["actions"], rewards, strict=True))
 
 
+_COUNTERPARTS: dict[type[ReplayBuffer], type[ReplayBuffer]] = {
+    ReplayBuffer: CombinedReplayBuffer,
+    NStepReplayBuffer: CombinedNStepReplayBuffer,
+    DictReplayBuffer: CombinedDictReplayBuffer,
+    HerReplayBuffer: CombinedHerReplayBuffer,
+}
+
+
 def combined_buffer_class(
-    given: type[ReplayBuffer] | None, observation_space: spaces.Space, n_steps: int = 1
+    given: type[ReplayBuffer] | str | None, observation_space: spaces.Space, n_steps: int = 1
 ) -> type[ReplayBuffer]:
     """
-    :param given: the class the user asked for, or None
+    :param given: the class the user asked for, or its name, or None
     :param observation_space: Dict or not
     :param n_steps: length of n-step returns
     :return: the ActPC buffer that does what ``given`` does
     :raises ValueError: for a class that does not keep ActPC's signals
     """
+    if isinstance(given, str):
+        if given not in (names := {kind.__name__: kind for kind in _COUNTERPARTS}):
+            raise ValueError(f"replay_buffer_class={given!r} is unknown; choose one of {list(names)}")
+        given = names[given]
     if given is not None and not (isinstance(given, type) and issubclass(given, ReplayBuffer)):
         raise ValueError(f"replay_buffer_class={given!r} must be None or a subclass of SB3's ReplayBuffer")
     if n_steps > 1 and given is not None and issubclass(given, HerReplayBuffer):
@@ -336,15 +348,9 @@ def combined_buffer_class(
         return CombinedNStepReplayBuffer if n_steps > 1 else CombinedReplayBuffer
     if issubclass(given, _SignalReplay):
         return given
-    same: dict[type[ReplayBuffer], type[ReplayBuffer]] = {
-        ReplayBuffer: CombinedReplayBuffer,
-        NStepReplayBuffer: CombinedNStepReplayBuffer,
-        DictReplayBuffer: CombinedDictReplayBuffer,
-        HerReplayBuffer: CombinedHerReplayBuffer,
-    }
-    if given in same:
-        return same[given]
+    if given in _COUNTERPARTS:
+        return _COUNTERPARTS[given]
     raise ValueError(
         f"replay_buffer_class={given.__name__} does not keep ActPC's signals; pass None, one of "
-        f"{[c.__name__ for c in same]} or a subclass of {[c.__name__ for c in set(same.values())]}"
+        f"{[c.__name__ for c in _COUNTERPARTS]} or a subclass of {[c.__name__ for c in set(_COUNTERPARTS.values())]}"
     )

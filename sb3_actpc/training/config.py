@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import difflib
 import importlib
 import inspect
@@ -13,14 +14,24 @@ from pathlib import Path
 from typing import Any
 
 import yaml
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_actpc.common.checks import check_device
 from sb3_actpc.common.demonstrations import shipped_demonstrations
+from sb3_actpc.envs import sparse_env_id
 
 # name on the command line -> "module:class", imported only when it is used
-ALGORITHMS = {"actpc": "sb3_actpc.actpc:ActPC"}
+ALGORITHMS = {
+    "actpc": "sb3_actpc.actpc:ActPC",
+    "ddpg": "sb3_actpc.baselines:DDPGDemo",
+    "her": "sb3_actpc.baselines:HER",
+    "logo": "sb3_actpc.baselines:LOGO",
+    "ppo": "stable_baselines3:PPO",
+    "sac_rlpd": "sb3_actpc.baselines:RLPD",
+    "td3": "sb3_actpc.baselines:TD3Demo",
+}
 
 PACKAGE_FOLDER = Path(__file__).resolve().parents[1]
 # inside an installed wheel, or beside the package in a source checkout
@@ -116,9 +127,10 @@ class RunPlan:
     :param algorithm_kwargs: constructor keywords of the algorithm
     :param demonstrations: demonstrations file, or None
     :param checkpoint_freq: environment steps between two checkpoints; 0 for none
+    :param normalize: keywords of SB3's ``VecNormalize`` around the training environment, or None
     """
 
-    algorithm: type[OffPolicyAlgorithm]
+    algorithm: type[BaseAlgorithm]
     policy: str
     n_timesteps: int
     n_envs: int
@@ -128,11 +140,17 @@ class RunPlan:
     algorithm_kwargs: dict[str, Any]
     demonstrations: Path | None
     checkpoint_freq: int = 0
+    normalize: dict[str, Any] | None = None
+
+    @property
+    def learns_off_policy(self) -> bool:
+        """Whether there is a replay buffer, and so whether checkpoints can be taken."""
+        return issubclass(self.algorithm, OffPolicyAlgorithm)
 
     @property
     def uses_demonstrations(self) -> bool:
         """Whether the algorithm is given the demonstrations (TD3, say, has no keyword for them)."""
-        return self.demonstrations is not None and "demonstrations" in _constructor_parameters(self.algorithm)
+        return self.demonstrations is not None and "demonstrations" in constructor_parameters(self.algorithm)
 
 
 def resolve_run(config: RunConfig) -> RunPlan:
@@ -154,13 +172,16 @@ def resolve_run(config: RunConfig) -> RunPlan:
     if not isinstance(policy, str):
         raise ValueError(f"policy must be a name, found {policy!r}")
     noise = _pop_noise(settings)
+    normalize = _pop_normalize(settings)
+    if noise is not None and "action_noise" not in constructor_parameters(algorithm):
+        raise ValueError(f"{algorithm.__name__} takes no action noise: leave noise_type and noise_std out")
     for name in ("n_timesteps", "n_envs"):
         settings.pop(name, None)
     if isinstance(settings.get("train_freq"), list):
         settings["train_freq"] = tuple(settings["train_freq"])
     check_keywords(algorithm, settings)
     eval_freq = config.eval_freq or max(1, n_timesteps // 10)
-    return RunPlan(
+    plan = RunPlan(
         algorithm=algorithm,
         policy=policy,
         n_timesteps=n_timesteps,
@@ -171,10 +192,16 @@ def resolve_run(config: RunConfig) -> RunPlan:
         algorithm_kwargs=settings,
         demonstrations=find_demonstrations(config.env, config.demonstrations),
         checkpoint_freq=eval_freq if config.checkpoint_freq is None else config.checkpoint_freq,
+        normalize=normalize,
     )
+    if plan.learns_off_policy:
+        return plan
+    if config.checkpoint_freq:
+        raise ValueError(f"{config.algo} learns on policy and keeps no checkpoints: leave --checkpoint-freq out, or give 0")
+    return dataclasses.replace(plan, checkpoint_freq=0)
 
 
-def load_algorithm(name: str) -> type[OffPolicyAlgorithm]:
+def load_algorithm(name: str) -> type[BaseAlgorithm]:
     """Import an algorithm of the table.
 
     :param name: key of ``ALGORITHMS``
@@ -255,14 +282,14 @@ def parse_assignments(assignments: Iterable[str]) -> dict[str, Any]:
     return values
 
 
-def check_keywords(algorithm: type[OffPolicyAlgorithm], settings: Mapping[str, Any]) -> None:
+def check_keywords(algorithm: type[BaseAlgorithm], settings: Mapping[str, Any]) -> None:
     """Check that a class takes these settings.
 
     :param algorithm: the class
     :param settings: constructor keywords
     :raises ValueError: naming the first one that it does not take, or that has an option of its own
     """
-    known = _constructor_parameters(algorithm)
+    known = constructor_parameters(algorithm)
     for name in settings:
         if name in _OPTION_OF:
             raise ValueError(f"{name!r} is not set here: use {_OPTION_OF[name]}")
@@ -276,8 +303,8 @@ def find_demonstrations(env_id: str, choice: str) -> Path | None:
     """The demonstrations file of a run.
 
     :param env_id: Gymnasium id of the task
-    :param choice: ``"shipped"`` (for a task whose name begins with ``Sparse``), ``"weak"`` (a weaker demonstrator's),
-        ``"none"``, or a path
+    :param choice: ``"shipped"`` (for a task whose name begins with ``Sparse``, or its goal version), ``"weak"`` (a weaker
+        demonstrator's), ``"none"``, or a path
     :return: the file, or None for none
     :raises FileNotFoundError: when the path does not exist, or a sparse task has no shipped file
     """
@@ -289,6 +316,7 @@ def find_demonstrations(env_id: str, choice: str) -> Path | None:
         if not Path(choice).is_file():
             raise FileNotFoundError(f"no demonstrations file at {choice}")
         return Path(choice)
+    env_id = sparse_env_id(env_id)
     return shipped_demonstrations(env_id) if env_id.rpartition(":")[2].startswith("Sparse") else None
 
 
@@ -315,6 +343,17 @@ def _pop_noise(settings: dict[str, Any]) -> tuple[str, float] | None:
     return noise_type, float(noise_std)
 
 
+def _pop_normalize(settings: dict[str, Any]) -> dict[str, Any] | None:
+    """As in rl-zoo3: true, false, or keywords of ``VecNormalize``; the discount of returns is the algorithm's."""
+    given = settings.pop("normalize", None)
+    if given is None or given is False:
+        return None
+    if given is not True and not isinstance(given, Mapping):
+        raise ValueError(f"normalize must be true, false or keywords of VecNormalize, found {given!r}")
+    own = {"gamma": settings["gamma"]} if "gamma" in settings else {}
+    return {**own, **(given if isinstance(given, Mapping) else {})}
+
+
 def _whole_number(name: str, value: Any, largest: float = inf) -> int:
     is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
     if not is_number or not 1 <= value < inf or value != int(value) or value > largest:
@@ -334,5 +373,10 @@ def _with_floats(value: Any) -> Any:
     return value
 
 
-def _constructor_parameters(algorithm: type[OffPolicyAlgorithm]) -> list[str]:
+def constructor_parameters(algorithm: type[BaseAlgorithm]) -> list[str]:
+    """Keywords that a class takes.
+
+    :param algorithm: the class
+    :return: their names
+    """
     return [name for name in inspect.signature(algorithm).parameters if not name.startswith("_")]

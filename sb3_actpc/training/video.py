@@ -105,7 +105,7 @@ def _rendering(env_id: str, env_kwargs: dict[str, Any]) -> Iterator[Any]:
     import gymnasium as gym
     from mujoco import FatalError
 
-    from sb3_actpc.training.run import make_env
+    from sb3_actpc.training.environments import make_env
 
     env = None
     try:
