@@ -18,7 +18,7 @@ from stable_baselines3.common.save_util import recursive_getattr
 from sb3_actpc.checkpoints import CheckpointCallback, TrainingStopped, continue_learning, restore
 from sb3_actpc.checkpoints.state import buffer_arrays
 
-WALL_TIME = {"time/fps", "time/time_elapsed", "wall_seconds"}
+WALL_TIME = {"time/fps", "time/time_elapsed", "seconds", "evaluation_seconds"}
 MakeModel = Callable[[], OffPolicyAlgorithm]
 
 

@@ -76,12 +76,12 @@ def test_a_stopped_run_goes_on_as_if_it_never_was(
     assert not Path("stopped/result.json").exists()
     assert main([*TRAIN, "--output", "stopped"]) == 2  # it is not overwritten
     assert main(["train", "--resume", "stopped", "--no-progress"]) == 0
-    assert log_rows(Path("straight/evaluations.csv")) == log_rows(Path("stopped/evaluations.csv"))
-    assert log_rows(Path("straight/progress.csv")) == log_rows(Path("stopped/progress.csv"))
+    for name in ("progress.csv", "episodes.csv", "diagnostics.csv"):
+        assert log_rows(Path("straight", name)) == log_rows(Path("stopped", name)) != []
     one, two = (ActPC.load(f"{name}/model.zip") for name in ("straight", "stopped"))
     assert_equal(one.policy.state_dict(), two.policy.state_dict(), "policy")
-    with open("stopped/evaluations.csv", encoding="utf-8") as file:
-        seconds = [float(row["wall_seconds"]) for row in csv.DictReader(file)]
+    with open("stopped/progress.csv", encoding="utf-8") as file:
+        seconds = [float(row["seconds"]) for row in csv.DictReader(file)]
     assert seconds == sorted(seconds)
     assert not Path("stopped/checkpoints").exists()  # nothing is left to resume
     assert main(["train", "--resume", "stopped"]) == 2
@@ -97,7 +97,7 @@ def test_a_damaged_checkpoint_is_named_and_the_one_before_used(
     (list_bundles("stopped/checkpoints")[-1] / "state.json").write_bytes(b"{")
     assert main(["train", "--resume", "stopped", "--no-progress"]) == 0
     assert "damaged checkpoint skipped: stopped/checkpoints/000003_step_98: state.json" in capsys.readouterr().out
-    assert log_rows(Path("straight/evaluations.csv")) == log_rows(Path("stopped/evaluations.csv"))
+    assert log_rows(Path("straight/progress.csv")) == log_rows(Path("stopped/progress.csv"))
 
 
 def test_a_run_with_checkpoints_is_left_alone_and_the_next_gets_another_folder(monkeypatch: pytest.MonkeyPatch) -> None:
