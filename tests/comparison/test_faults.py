@@ -18,7 +18,7 @@ from tests.checkpoints.runs import log_rows
 from tests.comparison.tasks import ROOT, TASK, bring_to_end, small_runs, write_preset
 
 OUT = Path("out")
-PATIENCE = 120.0  # seconds
+PATIENCE = 300.0  # seconds
 FILES = ("progress.csv", "episodes.csv")
 
 

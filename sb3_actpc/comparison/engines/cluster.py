@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import io
 import os
+import socket
 import tempfile
 import threading
 import uuid
@@ -17,6 +18,7 @@ from sb3_actpc.comparison.execution import LOST, STOPPED, Outcome, execute_run
 from sb3_actpc.comparison.lock import LOCK
 from sb3_actpc.comparison.table import PlannedRun
 
+CONNECTION_TIME = 10.0  # seconds
 _PROBE = ".shared-"  # a file by which a node sees whether it shares the folders
 
 
@@ -40,6 +42,7 @@ class RayEngine:
         self.n_workers, self.threads = n_workers, threads
         self._is_mine = not self.ray.is_initialized()
         if self._is_mine:
+            _check_address(address)
             options = {"include_dashboard": False} if address is None else {}
             self.ray.init(address=address, log_to_driver=False, **options)
         self._task = self.ray.remote(num_cpus=threads, max_retries=0)(_execute)
@@ -188,6 +191,23 @@ def unpack_folder(archive: bytes, folder: Path) -> None:
     for path in folder.rglob("*"):
         if path.is_file() and path.resolve() not in kept and path.name != LOCK:
             path.unlink()
+
+
+def _check_address(address: str | None) -> None:
+    """Ray itself would try for minutes.
+
+    :raises ConnectionError: when nobody answers at ``host:port``
+    """
+    host, separator, port = (address or "").rpartition(":")
+    if not separator or "/" in host or not port.isdigit():  # "auto", or a URL of Ray's
+        return
+    try:
+        socket.create_connection((host, int(port)), timeout=CONNECTION_TIME).close()
+    except OSError as error:
+        raise ConnectionError(
+            f"no Ray cluster answers at address={address!r} ({error.strerror or error}): give that of `ray start --head`, or "
+            "leave it out to start one on this machine"
+        ) from error
 
 
 def _import_ray() -> Any:
