@@ -22,7 +22,7 @@ from sb3_actpc.training import resume_run, train_run
 from sb3_actpc.training.record import CONFIG, RESULT, read_config, read_result, write_result
 from sb3_actpc.training.run import CHECKPOINTS
 
-ERROR = "error.json"
+ERROR, LOG = "error.json", "log.txt"
 FINISHED, FAILED, UNFINISHED, NEW = "finished", "failed", "unfinished", "new"
 STOPPED, LOST, DISK_FULL = "stopped", "lost", "disk full"  # outcomes that leave a run unfinished
 _FULL = (errno.ENOSPC, errno.EDQUOT)

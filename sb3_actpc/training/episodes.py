@@ -29,9 +29,9 @@ EPISODE_COLUMNS = (
 class EpisodeLog(BaseCallback):
     """Appends a row to ``episodes.csv`` when a training episode ends, exploration noise and all.
 
-    ``sparse_return`` is the sum of the environment's rewards, ``dense_return`` that of ``info["dense_reward"]`` (of the
-    reward where the environment does not report it), ``success`` is ``info["is_success"]`` at the end (empty where it is not
-    reported), ``timesteps`` and ``seconds`` are those of the training until then. ``actions_crc32`` is the CRC-32 of all
+    ``sparse_return`` is the sum of the environment's rewards, ``dense_return`` that of ``info["dense_reward"]`` (the
+    same again where the environment does not report it), ``success`` is ``info["is_success"]`` at the end (empty where it is
+    not reported), ``timesteps`` and ``seconds`` are those of the training until then. ``actions_crc32`` is the CRC-32 of all
     actions of the training so far: two runs that have the same number have taken the same actions.
 
     :param folder: run folder
@@ -79,11 +79,10 @@ class EpisodeLog(BaseCallback):
 
     def _on_step(self) -> bool:
         self._actions = zlib.crc32(np.ascontiguousarray(self.locals["actions"]).tobytes(), self._actions)
-        rewards, dones = self.locals["rewards"], self.locals["dones"]
         for index, info in enumerate(self.locals["infos"]):
-            self._dense_returns[index] += float(info.get("dense_reward", rewards[index]))
-            if dones[index]:
-                self._append(info, self._dense_returns[index])
+            self._dense_returns[index] += float(info.get("dense_reward", 0.0))
+            if self.locals["dones"][index]:
+                self._append(info, self._dense_returns[index] if "dense_reward" in info else info["episode"]["r"])
                 self._dense_returns[index] = 0.0
         return True
 

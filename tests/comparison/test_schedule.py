@@ -103,17 +103,17 @@ def test_a_damaged_config_starts_the_run_again() -> None:
     assert "config.json: not a JSON file: the run starts again" in engine.lines[0]
 
 
-@pytest.mark.parametrize("content", [b"", b"{", b"[]", b'{"env": 1}', b"\xff"])
-def test_a_corrupt_result_is_written_again_without_training(content: bytes) -> None:
+def test_a_corrupt_result_is_written_again_without_training() -> None:
     [run] = small_runs(OUT)
     bring_to_end([run], OUT)
     before = (run.folder / "result.json").read_bytes()
-    (run.folder / "result.json").write_bytes(content)
-    assert run_status(run.folder) == UNFINISHED
-    summary, engine, display = bring_to_end([run], OUT)
-    assert summary.finished == [run] and engine.begun == []
-    assert "written again from the run's other files" in display.lines[0]
-    assert (run.folder / "result.json").read_bytes() == before
+    for content in (b"", b"{", b"[]", b'{"env": 1}', b"\xff", before[:-40]):
+        (run.folder / "result.json").write_bytes(content)
+        assert run_status(run.folder) == UNFINISHED
+        summary, engine, display = bring_to_end([run], OUT)
+        assert summary.finished == [run] and engine.begun == []
+        assert "written again from the run's other files" in display.lines[0]
+        assert (run.folder / "result.json").read_bytes() == before
 
 
 def test_a_result_of_a_run_that_has_not_ended_is_removed_and_the_run_goes_on() -> None:
@@ -280,6 +280,21 @@ def test_the_tally_counts_steps_and_estimates_the_time_left() -> None:
     assert tally.summary() == "3 of 5 runs done, 1 running, 2 steps/s, 40 s left"
     tally.end(runs[0].id, FINISHED)
     assert (tally.n_finished, tally.n_running) == (4, 0)
+
+
+def test_the_estimate_comes_from_what_was_measured_and_counts_what_is_left() -> None:
+    from sb3_actpc.comparison.estimate import GUESSED, MEASURED, estimate_runs, steps_done
+
+    finished, stopped, new = [*small_runs(OUT, seeds=2), *small_runs(OUT, ["second"])]
+    bring_to_end([finished], OUT)
+    interrupt_after(stopped, 33)
+    result = json.loads((finished.folder / "result.json").read_text(encoding="utf-8"))
+    (finished.folder / "result.json").write_text(json.dumps({**result, "wall_seconds": 600.0}), encoding="utf-8")
+    estimates = estimate_runs([finished, stopped, new])
+    assert steps_done(stopped.folder) == 33
+    # 600 seconds for 60 steps: 10 for each of the 27 that are left
+    assert (estimates[stopped.id].seconds, estimates[stopped.id].source) == (270.0, MEASURED)
+    assert (estimates[new.id].seconds, estimates[new.id].source) == (60 * 15.0 / 1000.0, GUESSED)
 
 
 def test_durations_are_for_people() -> None:

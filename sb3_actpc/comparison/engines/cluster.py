@@ -10,11 +10,12 @@ import tempfile
 import threading
 import uuid
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from sb3_actpc.comparison.engines.base import Event
-from sb3_actpc.comparison.execution import LOST, STOPPED, Outcome, execute_run
+from sb3_actpc.comparison.execution import LOG, LOST, STOPPED, Outcome, execute_run
 from sb3_actpc.comparison.lock import LOCK
 from sb3_actpc.comparison.table import PlannedRun
 
@@ -151,14 +152,20 @@ def _execute(job: str, probe: str, packed: bytes, board: Any) -> tuple[str, str,
             board.write.remote(run.id, steps)
 
     if Path(probe).is_file():
-        outcome = execute_run(run, print, on_steps)
+        outcome = _execute_with_log(run, on_steps)
         return outcome.status, outcome.message, None
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         unpack_folder(packed, folder)
         local = dataclasses.replace(run, config=dataclasses.replace(run.config, output=str(folder)))
-        outcome = execute_run(local, print, on_steps)
+        outcome = _execute_with_log(local, on_steps)
         return outcome.status, outcome.message, pack_folder(folder)
+
+
+def _execute_with_log(run: PlannedRun, on_steps: Callable[[int], None]) -> Outcome:
+    """With what it reports in the run's folder, as the local engine has it."""
+    with open(run.folder / LOG, "a", encoding="utf-8") as log:
+        return execute_run(run, lambda line: print(line, file=log, flush=True), on_steps)
 
 
 def pack_folder(folder: Path) -> bytes:

@@ -11,10 +11,9 @@ import threading
 from typing import IO
 
 from sb3_actpc.comparison.engines.base import Event
-from sb3_actpc.comparison.execution import LOST, STOPPED, Outcome
+from sb3_actpc.comparison.execution import LOG, LOST, STOPPED, Outcome
 from sb3_actpc.comparison.table import PlannedRun
 
-LOG = "log.txt"  # what a run prints, in its folder
 SAVING_TIME = 60.0  # seconds that a worker gets to save its checkpoint
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMEXPR_NUM_THREADS")
 
