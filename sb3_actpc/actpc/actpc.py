@@ -35,7 +35,9 @@ SETTLINGS = ("iterative", "scheduled")
 BOOTSTRAPS = ("joint", "literal")
 TARGET_UPDATES = ("polyak", "hard")
 OBSERVATION_NORMALIZATIONS = ("none", "demonstrations")
-SMALLEST_VALUE_SCALE = 0.1  # of the mean absolute action-value that ``scale_pressure`` divides by: values start near 0
+# of the mean absolute action-value that ``scale_pressure`` divides by: one paid step. Where nothing was paid yet, the critic's
+# noise must not be blown up to full strength
+SMALLEST_VALUE_SCALE = 1.0
 EXPERT_SIGNALS_INTERVAL = 1000  # updates between two evaluations of the demonstrations' signals
 
 
@@ -85,7 +87,7 @@ class ActPC(OffPolicyAlgorithm):
     :param signal_normalizer: "max" (running maximum, the paper), "saturating" (r / (r + 1)) or "quantile"
     :param signal_errors: the signals sum the squared errors of "all" layers (the paper) or of the "output" alone
     :param actor_pressure: weight of the critic's pressure on the actor; 0 leaves refresh alone (cloning)
-    :param scale_pressure: divide the pressure by the batch's mean absolute action-value (at least 0.1)
+    :param scale_pressure: divide the pressure by the batch's mean absolute action-value (at least 1: one paid step)
     :param nudge: scale of the critic's clamped error while actor and critic settle as one (the paper's is 1); None for an
         infinitesimal one, or 1 with ``dynamics="state"``
     :param critic_warmup: updates before the critic's pressure reaches the actor
@@ -533,12 +535,16 @@ class ActPC(OffPolicyAlgorithm):
         inputs, weights = self.inputs, self.reward_weights
         features = inputs.features(replayed.observations)
         memory, next_memory = inputs.memories(replayed.history, replayed.history_mask, features)
+        next_features = bootstrap_features = inputs.features(replayed.next_observations)
+        if replayed.following_observations is not None:
+            next_features = inputs.features(replayed.following_observations)
         internal = weights[1] * replayed.epistemic + weights[2] * replayed.instrumental
         self.diagnostics.follow(internal_reward=internal.mean, task_reward=replayed.rewards.mean)
         batch = Batch(
             features=features,
             actions=replayed.actions,
-            next_features=inputs.features(replayed.next_observations),
+            next_features=next_features,
+            bootstrap_features=bootstrap_features,
             memory=memory,
             next_memory=next_memory,
             rewards=weights[0] * replayed.rewards + internal,
@@ -549,7 +555,7 @@ class ActPC(OffPolicyAlgorithm):
             if any(weights[1:]) and (self._n_updates % EXPERT_SIGNALS_INTERVAL == 1 or not self.expert.has_signals):
                 normalizers = self.epistemic_normalizer, self.instrumental_normalizer
                 self.expert.refresh_signals(self._raw_signals, inputs, *normalizers)
-            batch = batch.join(self.expert.sample(n_expert, inputs, weights, self.gamma))
+            batch = batch.join(self.expert.sample(n_expert, inputs, weights, self.gamma, self.n_steps))
         if min(sizes) == batch_size:
             return batch
         # circuits with a smaller batch take its first rows: the newest, then a fair mixture of the rest
@@ -591,11 +597,11 @@ class ActPC(OffPolicyAlgorithm):
         if self.bootstrap == "literal":
             next_actions = batch.actions
         else:
-            next_actions = self.actor_target.project(batch.next_features, batch.next_memory)
+            next_actions = self.actor_target.project(batch.bootstrap_features, batch.next_memory)
             if self.target_policy_noise:
                 noise = th.randn_like(next_actions) * self.target_policy_noise
                 next_actions = (next_actions + noise.clamp(-self.target_noise_clip, self.target_noise_clip)).clamp(-1.0, 1.0)
-        inputs = th.cat([batch.next_features, next_actions], dim=1)
+        inputs = th.cat([batch.bootstrap_features, next_actions], dim=1)
         first, *others = (critic.project(inputs) for critic in self.critic_target)
         values = reduce(th.minimum, others, first)
         return batch.rewards + (1.0 - batch.dones) * batch.discounts * values

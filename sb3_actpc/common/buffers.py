@@ -159,6 +159,7 @@ class _SignalReplay(ReplayBuffer):
             epistemic=self.to_torch(self._summed(self.epistemic, rows, envs, mask)),
             instrumental=self.to_torch(self._summed(self.instrumental, rows, envs, mask)),
             **self._history_at(rows, envs, env),
+            following_observations=None if mask is None else self._next_observations_at(rows, envs, env),
         )
 
     def _observations_at(self, rows: np.ndarray, envs: np.ndarray, env: VecNormalize | None) -> TensorObservations:
