@@ -21,6 +21,7 @@ from sb3_actpc.envs.robosuite_layouts import (
     CAN_BIN_LOW,
     TABLE_HEIGHT,
     RobosuiteTask,
+    quaternion_product,
     robosuite_task,
 )
 
@@ -31,6 +32,7 @@ GAIN = 2.0
 LONGEST_DETOUR = 30
 OPEN, CLOSE = -1.0, 1.0
 POINTING_DOWN = np.array([1.0, 0.0, 0.0, 0.0])
+CONJUGATE = np.array([-1.0, -1.0, -1.0, 1.0])
 # the can's centre above the bins' walls; where it stands on the bin's floor
 CARRYING_HEIGHT = 1.05
 CAN_STANDING_HEIGHT = 0.86
@@ -253,7 +255,7 @@ class ScriptedOperator:
     def _target_yaw(self, view: View) -> float:
         """The cube's angle modulo a quarter turn, nearest to the gripper's at the start; for the round can, the gripper's own."""
         if self.task.name == "PickPlaceCan":
-            return yaw_of(multiply(view.eef_quat, -POINTING_DOWN))
+            return yaw_of(multiply(view.eef_quat, POINTING_DOWN * CONJUGATE))
         if self._yaw is None or self.stage == "reach":
             start = 0.0 if self._yaw is None else self._yaw
             quarter = np.pi / 2.0
@@ -343,8 +345,7 @@ def _operators(
 
 def multiply(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """Product of two quaternions (x, y, z, w), (4,): the rotation ``second``, then ``first``."""
-    (a, b), (v, w) = (first[3], second[3]), (first[:3], second[:3])
-    return np.append(a * w + b * v + np.cross(v, w), a * b - v @ w)
+    return quaternion_product(first[None], second[None])[0]
 
 
 def about_z(angle: float) -> np.ndarray:
@@ -360,7 +361,7 @@ def yaw_of(quat: np.ndarray) -> float:
 
 def rotation_between(start: np.ndarray, end: np.ndarray) -> np.ndarray:
     """Rotation vector (3,), in radians, that turns one orientation into another, both (x, y, z, w)."""
-    difference = multiply(end, start * [-1.0, -1.0, -1.0, 1.0])
+    difference = multiply(end, start * CONJUGATE)
     difference = difference if difference[3] >= 0.0 else -difference
     sine = float(np.linalg.norm(difference[:3]))
     if sine < 1e-12:

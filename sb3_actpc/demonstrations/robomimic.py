@@ -28,6 +28,8 @@ from sb3_actpc.demonstrations.recording import Columns, join_episodes
 from sb3_actpc.envs.robosuite_layouts import ACTION_DIM, OBSERVATIONS, PROPRIOCEPTION, RobosuiteTask, robosuite_task
 
 ROBOSUITE_TYPE = 1  # robomimic's EnvType
+# metres: the median over an episode of how much an object's two recorded distances from the gripper differ
+OBJECT_TOLERANCE = 0.005
 
 
 def read_robomimic(
@@ -36,8 +38,8 @@ def read_robomimic(
     """Read a robomimic file.
 
     Episodes end where they first succeed, as they do in the environment. Rewards that are missing or not 0 and 1 are
-    computed from the observed object (the latter are kept as dense rewards). Objects' states in the order of robosuite 1.4
-    are put into that of 1.5. Where the file has no ``next_obs``, the last observation of an episode follows itself.
+    computed from the observed object (the latter are kept as dense rewards). The object's state is built from its recorded
+    pose as the environment builds it, whether robosuite 1.4 or 1.5 recorded it. Where the file has no ``next_obs``, the last observation of an episode follows itself.
 
     :param path: the file
     :param env_id: the task it must be of, ``SparseLift-v0`` or ``SparsePickPlaceCan-v0``
@@ -143,29 +145,33 @@ def _read_parts(group: Any, kind: str, task: RobosuiteTask, obs: str, length: in
         except ValueError as error:
             hint = "" if name in OBSERVATIONS["robomimic"] or name in group[kind] else " (obs='robomimic' needs fewer keys)"
             raise ValueError(f"{error}{hint}") from None
-    parts["object"] = _as_in_robosuite_1_5(parts["object"], parts["robot0_eef_pos"], task, f"{source}: {kind}")
+    parts["object"] = _object_states(parts["object"], parts["robot0_eef_pos"], parts["robot0_eef_quat"], task, f"{source}: {kind}")
     return parts
 
 
-def _as_in_robosuite_1_5(states: np.ndarray, eef: np.ndarray, task: RobosuiteTask, source: str) -> np.ndarray:
-    """Objects' states, (N, object_dim), in the order of robosuite 1.5, which differs from that of 1.4."""
-    if task.name == "Lift":
-        candidates = [states, np.concatenate([states[:, :7], -states[:, 7:]], axis=1)]
-    else:
-        candidates = [states, np.concatenate([states[:, 7:], states[:, :7]], axis=1)]
+def _object_states(
+    recorded: np.ndarray, eef_positions: np.ndarray, eef_quats: np.ndarray, task: RobosuiteTask, source: str
+) -> np.ndarray:
+    """The object's states, (N, object_dim), as the environment gives them.
+
+    The recorded ones may be in the order of robosuite 1.4 (Lift: the offset has the other sign; can: the absolute pose comes
+    first), and in robosuite 1.5 the can's pose in the gripper's frame lags behind by one step: only the absolute pose is
+    taken, and the order is that in which the distances to the gripper agree.
+    """
     columns = task.object_columns()
-    for candidate in candidates:
-        offsets, relative = candidate[:, columns["pos"]] - eef, candidate[:, columns["to_eef_pos"]]
-        if task.name == "Lift":
-            error = np.abs(offsets - relative)
-        else:  # given in the gripper's frame
-            error = np.abs(np.linalg.norm(offsets, axis=1) - np.linalg.norm(relative, axis=1))
-        if error.max() < 1e-3:
-            return candidate
-    raise ValueError(
-        f"{source}: key 'object' must hold {', '.join(columns)} in the order of robosuite 1.4 or 1.5, found numbers that do not "
-        "agree with robot0_eef_pos"
-    )
+    orders = [recorded] if task.name == "Lift" else [recorded, np.concatenate([recorded[:, 7:], recorded[:, :7]], axis=1)]
+    errors = []
+    for states in orders:
+        distances = np.linalg.norm(states[:, columns["pos"]] - eef_positions, axis=1)
+        errors.append(np.median(np.abs(distances - np.linalg.norm(states[:, columns["to_eef_pos"]], axis=1))))
+    best = int(np.argmin(errors))
+    if errors[best] > OBJECT_TOLERANCE:
+        raise ValueError(
+            f"{source}: key 'object' must hold the object's {', '.join(columns)} in the order of robosuite 1.4 or 1.5, found "
+            f"numbers that do not agree with robot0_eef_pos (by {errors[best]:.3f} m)"
+        )
+    states = orders[best]
+    return task.object_states(states[:, columns["pos"]], states[:, columns["quat"]], eef_positions, eef_quats)
 
 
 def _env_args(task: RobosuiteTask) -> dict[str, Any]:

@@ -77,6 +77,30 @@ class RobosuiteTask:
         ends = np.cumsum(list(self.object_parts.values())).tolist()
         return {part: slice(end - size, end) for (part, size), end in zip(self.object_parts.items(), ends, strict=True)}
 
+    def object_states(
+        self, positions: np.ndarray, quats: np.ndarray, eef_positions: np.ndarray, eef_quats: np.ndarray
+    ) -> np.ndarray:
+        """The object's states from its poses and the gripper's; quaternions are (x, y, z, w).
+
+        The can is seen in the gripper's frame, with a quaternion whose w is not negative; the cube's position relative to the
+        gripper is in the world's frame.
+
+        :param positions: (N, 3) of the object
+        :param quats: (N, 4)
+        :param eef_positions: (N, 3) of the gripper
+        :param eef_quats: (N, 4)
+        :return: (N, object_dim), in the order of robosuite 1.5
+        """
+        offsets = positions - eef_positions
+        if self.name == "Lift":
+            return np.concatenate([positions, quats, offsets], axis=1)
+        inverse = eef_quats * [-1.0, -1.0, -1.0, 1.0]
+        turned = quaternion_product(inverse, np.concatenate([offsets, np.zeros_like(offsets[:, :1])], axis=1))
+        relative_positions = quaternion_product(turned, eef_quats)[:, :3]
+        relative_quats = quaternion_product(inverse, quats)
+        relative_quats = np.where(relative_quats[:, 3:] < 0.0, -relative_quats, relative_quats)
+        return np.concatenate([relative_positions, relative_quats, positions, quats], axis=1)
+
     def is_success(self, object_states: np.ndarray, eef_positions: np.ndarray) -> np.ndarray:
         """robosuite's success, from observed quantities.
 
@@ -108,6 +132,17 @@ ROBOSUITE_TASKS: dict[str, RobosuiteTask] = {
         RobosuiteTask("SparsePickPlaceCan-v0", "PickPlaceCan", {"to_eef_pos": 3, "to_eef_quat": 4, "pos": 3, "quat": 4}),
     )
 }
+
+
+def quaternion_product(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Products of quaternions (x, y, z, w): the rotation ``second``, then ``first``.
+
+    :param first: (N, 4)
+    :param second: (N, 4)
+    :return: (N, 4)
+    """
+    (v, a), (w, b) = (first[:, :3], first[:, 3:]), (second[:, :3], second[:, 3:])
+    return np.concatenate([a * w + b * v + np.cross(v, w), a * b - (v * w).sum(axis=1, keepdims=True)], axis=1)
 
 
 def robosuite_task(env_id: str) -> RobosuiteTask:

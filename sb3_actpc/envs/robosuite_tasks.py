@@ -5,7 +5,8 @@ The tasks are those of Ororbia & Mali (arXiv 2209.09174): a Panda arm under oper
 
 An environment here *contains* a robosuite environment. It differs from robosuite's own loop in what is reported, not in the
 physics: the horizon is a truncation, success a termination; observations and success are read from the poses at the end of
-the control step (robosuite's lag behind by one simulation step, 2 ms); the random numbers are Gymnasium's.
+the control step (robosuite's lag behind by one simulation step, 2 ms, and the can's pose in the gripper's frame by one control
+step); the random numbers are Gymnasium's.
 """
 
 from __future__ import annotations
@@ -167,6 +168,8 @@ class SparseRobosuiteEnv(gym.Env[np.ndarray, np.ndarray], utils.EzPickle):
         joints = self.data.qpos[robot._ref_joint_pos_indexes]
         eef_quat = np.roll(self.data.body(robot.robot_model.eef_name["right"]).xquat, -1)  # (w, x, y, z) to (x, y, z, w)
         eef_position = self.data.site_xpos[robot.eef_site_id["right"]]
+        body = self._object_body()
+        position, quat = self.data.xpos[body], np.roll(self.data.xquat[body], -1)
         return {
             "robot0_joint_pos_cos": np.cos(joints),
             "robot0_joint_pos_sin": np.sin(joints),
@@ -175,11 +178,11 @@ class SparseRobosuiteEnv(gym.Env[np.ndarray, np.ndarray], utils.EzPickle):
             "robot0_eef_quat": eef_quat,
             "robot0_gripper_qpos": self.data.qpos[robot._ref_gripper_joint_pos_indexes["right"]],
             "robot0_gripper_qvel": self.data.qvel[robot._ref_gripper_joint_vel_indexes["right"]],
-            "object": self._object_state(eef_position, eef_quat),
+            "object": self.task.object_states(position[None], quat[None], eef_position[None], eef_quat[None])[0],
         }
 
-    def _object_state(self, eef_position: np.ndarray, eef_quat: np.ndarray) -> np.ndarray:
-        """(object_dim,), in the order of robosuite 1.5."""
+    def _object_body(self) -> int:
+        """Index of the object's body in the model."""
         raise NotImplementedError
 
 
@@ -194,10 +197,8 @@ class SparseLiftEnv(SparseRobosuiteEnv):
     def _randomize_model(self) -> None:
         resize_cube(self._simulation, self.np_random.uniform(*CUBE_HALF_EDGES, size=3))
 
-    def _object_state(self, eef_position: np.ndarray, eef_quat: np.ndarray) -> np.ndarray:
-        body = self._simulation.cube_body_id
-        position = self.data.xpos[body]
-        return np.concatenate([position, np.roll(self.data.xquat[body], -1), position - eef_position])
+    def _object_body(self) -> int:
+        return self._simulation.cube_body_id
 
     def checkpoint_state(self) -> dict[str, Any]:
         """As above, and the cube's half edges in metres, (3,)."""
@@ -218,13 +219,8 @@ class SparsePickPlaceCanEnv(SparseRobosuiteEnv):
 
     env_id = "SparsePickPlaceCan-v0"
 
-    def _object_state(self, eef_position: np.ndarray, eef_quat: np.ndarray) -> np.ndarray:
-        transforms = importlib.import_module("robosuite.utils.transform_utils")
-        body = self._simulation.obj_body_id[self._simulation.obj_to_use]
-        position, quat = self.data.xpos[body], np.roll(self.data.xquat[body], -1)
-        world_in_gripper = transforms.pose_inv(transforms.pose2mat((eef_position, eef_quat)))
-        relative = transforms.pose_in_A_to_pose_in_B(transforms.pose2mat((position, quat)), world_in_gripper)
-        return np.concatenate([*transforms.mat2pose(relative), position, quat])
+    def _object_body(self) -> int:
+        return self._simulation.obj_body_id[self._simulation.obj_to_use]
 
 
 def make_simulation(name: str, **kwargs: Any) -> Any:

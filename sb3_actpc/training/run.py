@@ -20,7 +20,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.noise import ActionNoise, NormalActionNoise, OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
 from sb3_actpc.checkpoints import CheckpointCallback, list_bundles, restore
 from sb3_actpc.common.demonstrations import Demonstrations
@@ -33,7 +33,7 @@ from sb3_actpc.training.report import plot_learning_curve
 EVALUATION_SEED_OFFSET = 1_000_000
 MAX_EVALUATION_ENVS = 10
 CHECKPOINTS = "checkpoints"  # folder in the run's folder
-_RECORDED_PACKAGES = ("sb3-actpc", "stable-baselines3", "torch", "gymnasium", "mujoco", "numpy")
+_RECORDED_PACKAGES = ("sb3-actpc", "stable-baselines3", "torch", "gymnasium", "mujoco", "robosuite", "numpy")
 
 
 def train_run(config: RunConfig, report: Callable[[str], None] = lambda line: None) -> dict[str, Any]:
@@ -75,7 +75,7 @@ def resume_run(folder: Path, report: Callable[[str], None] = lambda line: None, 
 def _run(config: RunConfig, plan: RunPlan, report: Callable[[str], None], resumed: Path | None) -> dict[str, Any]:
     th.set_num_threads(config.threads)
     eval_envs = make_eval_envs(config.env, plan.env_kwargs, config.eval_episodes)
-    train_env = make_vec_env(config.env, n_envs=plan.n_envs, seed=config.seed, env_kwargs=plan.env_kwargs)
+    train_env = make_train_env(config.env, plan.n_envs, config.seed, plan.env_kwargs)
     try:
         return _train(config, plan, train_env, eval_envs, report, resumed)
     finally:
@@ -178,6 +178,26 @@ def make_env(env_id: str, env_kwargs: Mapping[str, Any], render_mode: str | None
         return gym.make(env_id, **options)
     except TypeError as error:
         raise ValueError(f"{env_id}: {error}") from error
+
+
+def make_train_env(env_id: str, n_envs: int, seed: int, env_kwargs: Mapping[str, Any]) -> VecEnv:
+    """Make the training environments: in this process, or, several of robosuite's, each in its own.
+
+    A step of a robosuite task takes longer than an update, one of a MuJoCo task less than the way to another process.
+
+    :param env_id: Gymnasium id
+    :param n_envs: how many
+    :param seed: of the first one; the others count on from it
+    :param env_kwargs: keywords of the environments
+    :return: the environments
+    """
+    from sb3_actpc.envs import ROBOSUITE_IDS
+
+    in_processes = n_envs > 1 and env_id.rpartition(":")[2] in ROBOSUITE_IDS
+    kind: type[VecEnv] = SubprocVecEnv if in_processes else DummyVecEnv
+    # a worker that has not imported this package finds the task by its module
+    name = f"sb3_actpc.envs:{env_id}" if in_processes and ":" not in env_id else env_id
+    return make_vec_env(name, n_envs=n_envs, seed=seed, env_kwargs=dict(env_kwargs), vec_env_cls=kind)  # type: ignore[arg-type]
 
 
 def make_eval_envs(env_id: str, env_kwargs: Mapping[str, Any], n_episodes: int) -> list[gym.Env[Any, Any]]:
