@@ -74,7 +74,10 @@ def assert_equal(first: Demonstrations, second: Demonstrations, atol: float = 0.
 # ------------------------------------------------------------------ layouts
 
 
-@pytest.mark.parametrize(("env_id", "obs", "size"), [(LIFT, "paper", 42), (CAN, "paper", 46), (LIFT, "robomimic", 19), (CAN, "robomimic", 23)])
+@pytest.mark.parametrize(
+    ("env_id", "obs", "size"),
+    [(LIFT, "paper", 42), (CAN, "paper", 46), (LIFT, "robomimic", 19), (CAN, "robomimic", 23)],
+)
 def test_observations_have_the_published_sizes(env_id: str, obs: str, size: int) -> None:
     task = ROBOSUITE_TASKS[env_id]
     assert task.obs_dim(obs) == size
@@ -242,15 +245,24 @@ BAD_FILES: dict[str, tuple[Callable[[h5py.File], object], str]] = {
     "no data": (lambda f: f.pop("data"), r"expected a group 'data'"),
     "no demos": (lambda f: [f["data"].pop(name) for name in list(f["data"])], r"expected demonstrations data/demo_0"),
     "actions missing": (lambda f: f["data/demo_1"].pop("actions"), r"demo_1: key 'actions' is missing"),
-    "action size": (lambda f: replace(f, "data/demo_1/actions", np.zeros((3, 6))), r"demo_1: key 'actions' .*\(any, 7\).*\(3, 6\)"),
-    "action range": (lambda f: replace(f, "data/demo_1/actions", np.full((3, 7), 2.0)), r"demo_1: key 'actions' must lie in \[-1, 1\]"),
+    "action size": (
+        lambda f: replace(f, "data/demo_1/actions", np.zeros((3, 6))),
+        r"demo_1: key 'actions' .*\(N, 7\).*\(3, 6\)",
+    ),
+    "action range": (
+        lambda f: replace(f, "data/demo_1/actions", np.full((3, 7), 2.0)),
+        r"demo_1: key 'actions' must lie in \[-1, 1\]",
+    ),
     "no rows": (lambda f: replace(f, "data/demo_1/actions", np.zeros((0, 7))), r"demo_1: key 'actions' must have the shape"),
     "obs missing": (lambda f: f["data/demo_1"].pop("obs"), r"demo_1: key 'obs' is missing"),
     "obs key missing": (
         lambda f: f["data/demo_2/obs"].pop("robot0_joint_vel"),
         r"demo_2: obs: key 'robot0_joint_vel' is missing.*obs='robomimic' needs fewer keys",
     ),
-    "length": (lambda f: replace(f, "data/demo_2/obs/object", np.zeros((4, 10))), r"demo_2: obs: key 'object' .*\(5, 10\).*\(4, 10\)"),
+    "length": (
+        lambda f: replace(f, "data/demo_2/obs/object", np.zeros((4, 10))),
+        r"demo_2: obs: key 'object' .*\(5, 10\).*\(4, 10\)",
+    ),
     "nan": (with_nan, r"demo_1: obs: key 'robot0_joint_vel' must be finite, found nan at index \(2, 3\)"),
     "text": (lambda f: replace(f, "data/demo_0/rewards", np.array([b"x"] * 4)), r"demo_0: key 'rewards' must hold numbers"),
     "object": (
@@ -413,7 +425,8 @@ def test_a_mixed_set_has_six_operators_of_three_levels(tmp_path: Path, capsys: p
     assert [key[0] for key in keys[:6]] == ["worse", "worse", "okay", "okay", "better", "better"]
     assert [key[1] for key in keys[6:8]] == ["worse_operator_1", "worse_operator_2"]
     write_robomimic(mixed, tmp_path / "mixed.hdf5")
-    assert read_robomimic(tmp_path / "mixed.hdf5", LIFT, filter_key="okay_operator_2").metadata["demos"] == ["demo_3", "demo_9"]
+    picked = read_robomimic(tmp_path / "mixed.hdf5", LIFT, filter_key="okay_operator_2")
+    assert picked.metadata["demos"] == ["demo_3", "demo_9"]
     assert main([*command, "--episodes", "10", "--output", str(output)]) == 2
     assert "must be a multiple of its 6 operators: ask for 12" in capsys.readouterr().err
 
@@ -437,7 +450,8 @@ def test_50_successful_episodes_are_shipped(env_id: str) -> None:
     assert (shipped.episode_returns == 1.0).all()
     task: RobosuiteTask = ROBOSUITE_TASKS[env_id]
     layout = task.layout("paper")
-    solved = task.is_success(shipped.next_observations[:, layout["object"]], shipped.next_observations[:, layout["robot0_eef_pos"]])
+    after = shipped.next_observations
+    solved = task.is_success(after[:, layout["object"]], after[:, layout["robot0_eef_pos"]])
     np.testing.assert_array_equal(solved, shipped.terminations)
     sizes = [shipped_demonstrations(one).stat().st_size for one in ROBOSUITE_IDS]
     assert sum(sizes) < 6e6
@@ -454,7 +468,8 @@ def write_states(path: Path, n: int = 6, size: int = 32, env_name: str = "Lift",
     with h5py.File(path, "w") as file:
         data = file.create_group("data")
         data.attrs["env"] = env_name
-        data.attrs["env_info"] = json.dumps({"env_name": env_name, "robots": "Panda", "controller_configs": {"type": "OSC_POSE"}})
+        recorded = {"env_name": env_name, "robots": "Panda", "controller_configs": {"type": "OSC_POSE"}}
+        data.attrs["env_info"] = json.dumps(recorded)
         demo = data.create_group("demo_1")
         demo["states"], demo["actions"] = states, np.full((n, 7), 1.5)
 
@@ -493,7 +508,7 @@ def test_bad_files_of_robosuites_are_named(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.usefixtures("with_robosuite")
 def test_human_demonstrations_of_robosuite_lift_the_cube() -> None:
-    """Three people's demonstrations, MIT licence, in the wheel of robosuite 1.4.1 on PyPI (194 MB, kept in the user's cache)."""
+    """Three of a person's demonstrations (MIT licence) in the wheel of robosuite 1.4.1 on PyPI: 194 MB, kept in the cache."""
     read = read_robosuite(human_file(), LIFT)
     assert read.episode_returns.tolist() == [1.0, 1.0, 1.0]
     assert read.actions.min() == -1.0 and read.actions.max() == 1.0  # clipped: they reach 3.75

@@ -49,7 +49,7 @@ def _add_collect(commands: Subparsers) -> None:
         metavar="P",
         help="of scripted operators, from 0 to 1, or 'mixed' for six operators of three levels (default: 1)",
     )
-    collect.add_argument("--obs", metavar="LAYOUT", help="observations of a robosuite task, paper or robomimic (default: paper)")
+    collect.add_argument("--obs", metavar="LAYOUT", help="of a robosuite task, paper or robomimic (default: paper)")
     collect.add_argument("--algo", default="ppo", metavar="{ppo,td3,sac}", help="the expert's algorithm (default: ppo)")
     collect.add_argument("--steps", type=int, help="the expert's training steps (default: 2000 full episodes)")
     collect.add_argument("--target-return", type=float, help="stop training at this mean dense return (default: never)")
@@ -70,7 +70,7 @@ def _add_convert(commands: Subparsers) -> None:
     convert = commands.add_parser(
         "convert",
         help="HDF5 of robomimic or robosuite to .npz, or .npz to robomimic's HDF5",
-        description="Reads robomimic's low-dimensional files and robosuite's demo.hdf5 (its states are replayed in the simulator), "
+        description="Reads robomimic's low-dimensional files and robosuite's demo.hdf5 (its states are replayed), "
         "or writes a .npz file as a robomimic file.",
     )
     convert.add_argument("file", type=Path, metavar="FILE", help=".hdf5 or .npz")
@@ -84,8 +84,8 @@ def _add_download(commands: Subparsers) -> None:
     download = commands.add_parser(
         "download",
         help="fetch robomimic's human demonstrations and convert them",
-        description="Fetches robomimic's file of low-dimensional observations (MIT licence, 30 to 130 MB), checks it and converts "
-        "it. Without a network: download the address it names elsewhere, and use `sb3-actpc demos convert`.",
+        description="Fetches robomimic's file of low-dimensional observations (MIT licence, 30 to 130 MB), checks it and "
+        "converts it. Without a network: download the address it names elsewhere, and use `sb3-actpc demos convert`.",
     )
     download.add_argument("--env", required=True, metavar="ID", help=f"one of {', '.join(ROBOSUITE_IDS)}")
     download.add_argument(
@@ -187,7 +187,7 @@ def _convert(args: argparse.Namespace) -> int:
     if args.file.suffix == ".npz":
         output = args.output or args.file.with_suffix(".hdf5")
         if output.suffix not in HDF5_SUFFIXES:
-            raise ValueError(f"--output {output} must end in {' or '.join(HDF5_SUFFIXES)}: an .npz file becomes a robomimic file")
+            raise ValueError(f"--output {output} must end in {' or '.join(HDF5_SUFFIXES)}: it will be a robomimic file")
         demonstrations = Demonstrations.load(args.file)
         write_robomimic(demonstrations, output)
     else:

@@ -520,7 +520,7 @@ def _read_arrays(content: bytes, source: str) -> dict[str, np.ndarray]:
     except _CORRUPT_FILE_ERRORS as error:
         if content.startswith(HDF5_SIGNATURE):
             raise ValueError(
-                f"{source}: expected a demonstrations .npz file, found an HDF5 file: make one of it with `sb3-actpc demos convert`"
+                f"{source}: expected a demonstrations .npz file, found HDF5: convert it with `sb3-actpc demos convert`"
             ) from None
         raise ValueError(f"{source}: expected a demonstrations .npz file, found {len(content)} bytes ({error})") from None
     with archive:

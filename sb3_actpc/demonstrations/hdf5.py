@@ -76,13 +76,15 @@ def read_array(group: Any, key: str, source: str, size: int | None = None, lengt
         raise ValueError(f"{source}: key {key!r} cannot be read ({error})") from None
     if values.dtype.kind not in "biuf":
         raise ValueError(f"{source}: key {key!r} must hold numbers, found type {values.dtype}")
-    wanted = "any" if length is None else length
-    shape = (wanted,) if size is None else (wanted, size)
-    if values.shape[1:] != shape[1:] or values.ndim != len(shape) or values.shape[0] != (length or max(1, len(values))):
-        raise ValueError(f"{source}: key {key!r} must have the shape {shape}, found {values.shape}")
+    columns = () if size is None else (size,)
+    wanted = (max(1, len(values)) if length is None else length, *columns) if values.ndim else None
+    if values.shape != wanted:
+        shape = ", ".join(str(n) for n in ("N" if length is None else length, *columns))
+        raise ValueError(f"{source}: key {key!r} must have the shape ({shape}), found {values.shape}")
     bad = np.argwhere(~np.isfinite(values))
     if len(bad):
-        raise ValueError(f"{source}: key {key!r} must be finite, found {values[tuple(bad[0])]} at index {tuple(bad[0].tolist())}")
+        index = tuple(bad[0].tolist())
+        raise ValueError(f"{source}: key {key!r} must be finite, found {values[index]} at index {index}")
     return values.astype(np.float64)
 
 

@@ -27,8 +27,8 @@ from sb3_actpc.envs.robosuite_layouts import (
 
 METRES_PER_ACTION = 0.05
 RADIANS_PER_ACTION = 0.5
-# the arm covers about a third of the commanded distance in one control step, so twice the error still does not overshoot
-GAIN = 2.0
+# the arm covers about a third of the commanded distance in one control step, so three times the error does not overshoot
+GAIN = 3.0
 LONGEST_DETOUR = 30
 OPEN, CLOSE = -1.0, 1.0
 POINTING_DOWN = np.array([1.0, 0.0, 0.0, 0.0])
@@ -176,8 +176,9 @@ class ScriptedOperator:
 
     def _reach(self, view: View) -> tuple[np.ndarray, float, bool]:
         """Over the object, the fingers open and turned along it."""
-        target = view.object_position + self._aim + [0.0, 0.0, self._hover_height]
-        aligned = np.linalg.norm((target - view.eef_position)[:2]) < self.skill.tolerance and self._turn_left(view) < 10.0 * self.skill.tolerance
+        target = view.object_position + self._aim + np.array([0.0, 0.0, self._hover_height])
+        distance, tolerance = np.linalg.norm((target - view.eef_position)[:2]), self.skill.tolerance
+        aligned = distance < tolerance and self._turn_left(view) < 10.0 * tolerance
         return target, OPEN, bool(aligned and view.eef_position[2] < target[2] + 0.03)
 
     def _descend(self, view: View) -> tuple[np.ndarray, float, bool]:
@@ -185,8 +186,8 @@ class ScriptedOperator:
         distance = np.linalg.norm((target - view.eef_position)[:2])
         if distance > self.skill.tolerance + 0.02:
             self._enter("reach")
-        elif distance > self.skill.tolerance + 0.002:  # do not push it over
-            target = np.array([*target[:2], view.eef_position[2]])
+        elif distance > self.skill.tolerance + 0.005:  # wait above it, do not push it over
+            target = target + np.array([0.0, 0.0, 0.05])
         depth = 0.01 if self.task.name == "Lift" else 0.02
         return target, OPEN, bool(self.stage == "descend" and view.eef_position[2] < view.object_position[2] + depth)
 
@@ -197,17 +198,17 @@ class ScriptedOperator:
 
     def _lift(self, view: View) -> tuple[np.ndarray, float, bool]:
         height = CARRYING_HEIGHT if self.task.name == "PickPlaceCan" else TABLE_HEIGHT + self._lift_height
-        target = view.eef_position + [0.0, 0.0, height + 0.03 - view.object_position[2]]
+        target = view.eef_position + np.array([0.0, 0.0, height + 0.03 - view.object_position[2]])
         return target, CLOSE, bool(self.task.name == "PickPlaceCan" and view.object_position[2] > height)
 
     def _carry(self, view: View) -> tuple[np.ndarray, float, bool]:
         to_bin = (CAN_BIN_LOW + CAN_BIN_HIGH)[:2] / 2.0 - view.object_position[:2]
-        target = view.eef_position + [*to_bin, CARRYING_HEIGHT - view.object_position[2]]
+        target = view.eef_position + np.array([*to_bin, CARRYING_HEIGHT - view.object_position[2]])
         return target, CLOSE, bool(np.linalg.norm(to_bin) < 0.05)
 
     def _lower(self, view: View) -> tuple[np.ndarray, float, bool]:
         to_bin = (CAN_BIN_LOW + CAN_BIN_HIGH)[:2] / 2.0 - view.object_position[:2]
-        target = view.eef_position + [*to_bin, CAN_STANDING_HEIGHT - view.object_position[2]]
+        target = view.eef_position + np.array([*to_bin, CAN_STANDING_HEIGHT - view.object_position[2]])
         return target, CLOSE, bool(view.object_position[2] < CAN_STANDING_HEIGHT + 0.02)
 
     def _release(self, view: View) -> tuple[np.ndarray, float, bool]:
@@ -215,7 +216,7 @@ class ScriptedOperator:
         up = 0.2 if view.finger_gap > 0.07 else 0.0
         if self._steps() > 40:
             self._enter("reach")
-        return view.eef_position + [0.0, 0.0, up], OPEN, False
+        return view.eef_position + np.array([0.0, 0.0, up]), OPEN, False
 
     # ------------------------------------------------------------------ parts
 
@@ -253,7 +254,7 @@ class ScriptedOperator:
         return np.clip(GAIN * error / RADIANS_PER_ACTION, -self.skill.speed, self.skill.speed)
 
     def _target_yaw(self, view: View) -> float:
-        """The cube's angle modulo a quarter turn, nearest to the gripper's at the start; for the round can, the gripper's own."""
+        """The cube's angle modulo a quarter turn, nearest to the gripper's first one; for the round can, the gripper's own."""
         if self.task.name == "PickPlaceCan":
             return yaw_of(multiply(view.eef_quat, POINTING_DOWN * CONJUGATE))
         if self._yaw is None or self.stage == "reach":

@@ -39,7 +39,8 @@ def read_robomimic(
 
     Episodes end where they first succeed, as they do in the environment. Rewards that are missing or not 0 and 1 are
     computed from the observed object (the latter are kept as dense rewards). The object's state is built from its recorded
-    pose as the environment builds it, whether robosuite 1.4 or 1.5 recorded it. Where the file has no ``next_obs``, the last observation of an episode follows itself.
+    pose as the environment builds it, whether robosuite 1.4 or 1.5 recorded it. Where the file has no ``next_obs``, the last
+    observation of an episode follows itself.
 
     :param path: the file
     :param env_id: the task it must be of, ``SparseLift-v0`` or ``SparsePickPlaceCan-v0``
@@ -96,7 +97,8 @@ def write_robomimic(demonstrations: Demonstrations, path: str | os.PathLike[str]
 def _filtered(data: Any, filter_key: str, source: str) -> list[str]:
     masks = data.file.get("mask", {})
     if filter_key not in masks:
-        raise ValueError(f"{source}: no mask {filter_key!r}: choose one of {', '.join(sorted(masks)) or 'none, there is no mask'}")
+        known = ", ".join(sorted(masks)) or "none, the file has no masks"
+        raise ValueError(f"{source}: no mask {filter_key!r}: choose one of {known}")
     names = [name.decode() if isinstance(name, bytes) else str(name) for name in masks[filter_key][()]]
     unknown = [name for name in names if name not in data]
     if unknown or not names:
@@ -109,8 +111,8 @@ def _read_episode(group: Any, task: RobosuiteTask, obs: str, source: str) -> Col
     length = len(actions)
     too_large = np.argwhere(np.abs(actions) > 1.0 + ACTION_TOLERANCE)
     if len(too_large):
-        row, column = too_large[0]
-        raise ValueError(f"{source}: key 'actions' must lie in [-1, 1], found {actions[row, column]} at {(int(row), int(column))}")
+        index = tuple(too_large[0].tolist())
+        raise ValueError(f"{source}: key 'actions' must lie in [-1, 1], found {actions[index]} at index {index}")
     parts = _read_parts(group, "obs", task, obs, length, source)
     if "next_obs" in group:
         next_parts = _read_parts(group, "next_obs", task, obs, length, source)
@@ -145,7 +147,8 @@ def _read_parts(group: Any, kind: str, task: RobosuiteTask, obs: str, length: in
         except ValueError as error:
             hint = "" if name in OBSERVATIONS["robomimic"] or name in group[kind] else " (obs='robomimic' needs fewer keys)"
             raise ValueError(f"{error}{hint}") from None
-    parts["object"] = _object_states(parts["object"], parts["robot0_eef_pos"], parts["robot0_eef_quat"], task, f"{source}: {kind}")
+    gripper = parts["robot0_eef_pos"], parts["robot0_eef_quat"]
+    parts["object"] = _object_states(parts["object"], *gripper, task, f"{source}: {kind}")
     return parts
 
 
@@ -180,8 +183,8 @@ def _env_args(task: RobosuiteTask) -> dict[str, Any]:
     except PackageNotFoundError:
         robosuite_version = "1.5.2"
     arm = {"type": "OSC_POSE", "input_max": 1, "input_min": -1, "input_type": "delta", "input_ref_frame": "base"}
-    arm |= {"output_max": [0.05] * 3 + [0.5] * 3, "output_min": [-0.05] * 3 + [-0.5] * 3, "kp": 150, "damping_ratio": 1}  # type: ignore[dict-item]
-    arm |= {"impedance_mode": "fixed", "kp_limits": [0, 300], "damping_ratio_limits": [0, 10], "gripper": {"type": "GRIP"}}  # type: ignore[dict-item]
+    arm |= {"output_max": [0.05] * 3 + [0.5] * 3, "output_min": [-0.05] * 3 + [-0.5] * 3, "kp": 150, "damping_ratio": 1}
+    arm |= {"impedance_mode": "fixed", "kp_limits": [0, 300], "damping_ratio_limits": [0, 10], "gripper": {"type": "GRIP"}}
     controller = {"type": "BASIC", "body_parts": {"right": {**arm, "uncouple_pos_ori": True, "ramp_ratio": 0.2}}}
     kwargs = {"robots": ["Panda"], "controller_configs": controller, "control_freq": 20, "reward_shaping": False}
     return {"env_name": task.name, "env_version": robosuite_version, "type": ROBOSUITE_TYPE, "env_kwargs": kwargs}

@@ -46,7 +46,7 @@ class SparseRobosuiteEnv(gym.Env[np.ndarray, np.ndarray], utils.EzPickle):
         gripper's position, quaternion and finger positions, and the object's state); float32
     :param horizon: control steps after which an episode is truncated
     :param render_mode: ``"rgb_array"``, or None
-    :param camera: the camera that :meth:`render` looks through, ``"frontview"``, ``"agentview"`` or ``"sideview"`` among others
+    :param camera: what :meth:`render` looks through: ``"frontview"``, ``"agentview"``, ``"sideview"`` among others
     :raises ImportError: when robosuite is not installed
     :raises ValueError: when a keyword has a value that is not allowed
     """
@@ -105,7 +105,8 @@ class SparseRobosuiteEnv(gym.Env[np.ndarray, np.ndarray], utils.EzPickle):
         observation = self._observe()
         is_success = bool(self._simulation._check_success())
         is_truncated = not is_success and self._elapsed_steps >= self.horizon
-        return observation, float(is_success), is_success, is_truncated, {"dense_reward": dense_reward, "is_success": is_success}
+        info = {"dense_reward": dense_reward, "is_success": is_success}
+        return observation, float(is_success), is_success, is_truncated, info
 
     def observe_state(self, state: np.ndarray) -> np.ndarray:
         """Put the simulation into a recorded state and observe it.
@@ -122,7 +123,7 @@ class SparseRobosuiteEnv(gym.Env[np.ndarray, np.ndarray], utils.EzPickle):
         mujoco.mj_forward(self.model, self.data)
         return self._observe()
 
-    def render(self) -> np.ndarray | None:  # type: ignore[override]
+    def render(self) -> np.ndarray | None:
         """The camera's view, (384, 384, 3) uint8; None without a render mode.
 
         :raises RuntimeError: (or what the OpenGL library raises) when the machine cannot render
@@ -226,7 +227,7 @@ class SparsePickPlaceCanEnv(SparseRobosuiteEnv):
 def make_simulation(name: str, **kwargs: Any) -> Any:
     """A robosuite environment of the Panda with soft resets, shaped rewards and neither renderer nor time limit.
 
-    robosuite's own observations are off: they are computed in Python at every simulation step and take longer than the physics.
+    robosuite's own observations are off, unless ``use_object_obs`` is asked for: ours are read from the simulation.
 
     :param name: ``"Lift"`` or ``"PickPlaceCan"``
     :param kwargs: robosuite's keywords, in the place of ours
