@@ -46,7 +46,7 @@ class SparseRobosuiteEnv(gym.Env[np.ndarray, np.ndarray], utils.EzPickle):
         gripper's position, quaternion and finger positions, and the object's state); float32
     :param horizon: control steps after which an episode is truncated
     :param render_mode: ``"rgb_array"``, or None
-    :param camera: what :meth:`render` looks through: ``"frontview"``, ``"agentview"``, ``"sideview"`` among others
+    :param camera: what :meth:`render` looks through: ``"agentview"``, ``"frontview"``, ``"sideview"`` among others
     :raises ImportError: when robosuite is not installed
     :raises ValueError: when a keyword has a value that is not allowed
     """
@@ -58,7 +58,7 @@ class SparseRobosuiteEnv(gym.Env[np.ndarray, np.ndarray], utils.EzPickle):
     checkpoint_skipped: ClassVar[tuple[str, ...]] = ("_simulation", "_renderer", "_layout", "task")
 
     def __init__(
-        self, obs: str = "paper", horizon: int = 500, render_mode: str | None = None, camera: str = "frontview"
+        self, obs: str = "paper", horizon: int = 500, render_mode: str | None = None, camera: str = "agentview"
     ) -> None:
         self.task: RobosuiteTask = robosuite_task(self.env_id)
         self._layout = self.task.layout(obs)

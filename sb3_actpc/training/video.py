@@ -1,4 +1,4 @@
-"""A video of one episode, where the machine can render."""
+"""A video of one episode, or a strip of pictures, where the machine can render."""
 
 from __future__ import annotations
 
@@ -10,8 +10,11 @@ from typing import Any
 
 import numpy as np
 
+from sb3_actpc.common.files import atomic_write
+
 GL_BACKENDS = ("egl", "osmesa")
-VIDEO_SUFFIXES = (".mp4", ".gif")
+VIDEO_SUFFIXES = (".mp4", ".gif", ".png")
+STRIP_LENGTH = 6
 # of one episode; software rendering takes a twentieth of a second for each
 MAX_FRAMES = 300
 # in a process of its own: a broken graphics driver may end the process
@@ -46,10 +49,10 @@ def check_video_path(path: Path) -> None:
     """Check that a video can have this name.
 
     :param path: file to write
-    :raises ValueError: when the suffix is neither ``.mp4`` nor ``.gif``
+    :raises ValueError: when the suffix is none of ``VIDEO_SUFFIXES``
     """
     if path.suffix.lower() not in VIDEO_SUFFIXES:
-        raise ValueError(f"the video must end in {' or '.join(VIDEO_SUFFIXES)}, found {str(path)!r}")
+        raise ValueError(f"the video must end in {', '.join(VIDEO_SUFFIXES[:-1])} or {VIDEO_SUFFIXES[-1]}, found {str(path)!r}")
 
 
 def record_video(model: Any, env_id: str, env_kwargs: dict[str, Any], path: Path, seed: int) -> int:
@@ -58,7 +61,7 @@ def record_video(model: Any, env_id: str, env_kwargs: dict[str, Any], path: Path
     :param model: SB3 algorithm or policy
     :param env_id: Gymnasium id
     :param env_kwargs: keywords of the environment
-    :param path: file to write, ``.mp4`` or ``.gif``
+    :param path: file to write: ``.mp4``, ``.gif``, or ``.png`` for ``STRIP_LENGTH`` pictures side by side, at half the size
     :param seed: seed of the episode
     :return: number of frames, each (height, width, 3) uint8
     :raises RenderingUnavailable: when rendering does not work here
@@ -69,13 +72,25 @@ def record_video(model: Any, env_id: str, env_kwargs: dict[str, Any], path: Path
     import imageio.v2 as imageio
 
     path.parent.mkdir(parents=True, exist_ok=True)
-    if path.suffix.lower() == ".gif":
+    if path.suffix.lower() == ".png":
+        with atomic_write(path) as file:
+            imageio.imwrite(file, picture_strip(frames), format="png")
+    elif path.suffix.lower() == ".gif":
         # viewers slow down a GIF with delays below 20 ms
         stride = max(1, round(frames_per_second / 25))
         imageio.mimsave(path, frames[::stride], duration=1000 * stride / frames_per_second, loop=0)
     else:
         imageio.mimsave(path, frames, fps=frames_per_second, macro_block_size=2)
     return len(frames)
+
+
+def picture_strip(frames: list[np.ndarray]) -> np.ndarray:
+    """
+    :param frames: (height, width, 3) uint8 each
+    :return: ``STRIP_LENGTH`` of them from the first to the last, side by side, (height / 2, STRIP_LENGTH * width / 2, 3)
+    """
+    chosen = np.linspace(0, len(frames) - 1, STRIP_LENGTH).round().astype(int)
+    return np.concatenate([frames[index][::2, ::2] for index in chosen], axis=1)
 
 
 def _render_episode(model: Any, env_id: str, env_kwargs: dict[str, Any], seed: int) -> tuple[list[Any], float]:
