@@ -52,7 +52,7 @@ def check_video_path(path: Path) -> None:
     :raises ValueError: when the suffix is none of ``VIDEO_SUFFIXES``
     """
     if path.suffix.lower() not in VIDEO_SUFFIXES:
-        raise ValueError(f"the video must end in {', '.join(VIDEO_SUFFIXES[:-1])} or {VIDEO_SUFFIXES[-1]}, found {str(path)!r}")
+        raise ValueError(f"the video must end in .mp4, .gif or .png, found {str(path)!r}")
 
 
 def record_video(model: Any, env_id: str, env_kwargs: dict[str, Any], path: Path, seed: int) -> int:
@@ -74,7 +74,7 @@ def record_video(model: Any, env_id: str, env_kwargs: dict[str, Any], path: Path
     path.parent.mkdir(parents=True, exist_ok=True)
     if path.suffix.lower() == ".png":
         with atomic_write(path) as file:
-            imageio.imwrite(file, picture_strip(frames), format="png")
+            file.write(imageio.imwrite("<bytes>", picture_strip(frames), format="png"))
     elif path.suffix.lower() == ".gif":
         # viewers slow down a GIF with delays below 20 ms
         stride = max(1, round(frames_per_second / 25))
