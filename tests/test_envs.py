@@ -1,5 +1,6 @@
 """The sparse MuJoCo tasks pay what they say, and are otherwise their base tasks."""
 
+import dataclasses
 import pickle
 import warnings
 
@@ -11,6 +12,7 @@ from stable_baselines3.common.env_checker import check_env as sb3_check_env
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
+from sb3_actpc.common.demonstrations import Demonstrations
 from sb3_actpc.envs import SPARSE_MUJOCO_IDS, dense_env_id, register_envs
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*out of date.*", "ignore:.*infinity.*")
@@ -296,3 +298,75 @@ def test_dense_env_id_names_the_base_task_or_lists_the_known_ids() -> None:
     for unknown in ("Hopper-v5", "SparseAnt-v5", "SparseHopper-v3", ""):
         with pytest.raises(ValueError, match=r"choose one of SparseReacher-v5, .*SparseSwimmer-v4"):
             dense_env_id(unknown)
+
+
+def record(env_id: str, n_episodes: int, **env_kwargs: object) -> Demonstrations:
+    """Random episodes as they are paid live, falls and time limits included."""
+    env = gym.make(env_id, max_episode_steps=50, **env_kwargs)
+    env.action_space.seed(0)
+    rows: list[tuple] = []
+    starts = []
+    for episode in range(n_episodes):
+        starts.append(len(rows))
+        observation, _ = env.reset(seed=episode)
+        done = False
+        while not done:
+            action = env.action_space.sample()
+            next_observation, reward, terminated, truncated, info = env.step(action)
+            rows.append((observation, action, next_observation, reward, terminated, info["dense_reward"]))
+            observation, done = next_observation, terminated or truncated
+    env.close()
+    observations, actions, next_observations, rewards, terminations, dense_rewards = map(np.array, zip(*rows, strict=True))
+    return Demonstrations(
+        observations, actions, next_observations, rewards, terminations, np.array(starts), env_id, dense_rewards
+    )
+
+
+@pytest.mark.parametrize("env_id", SPARSE_MUJOCO_IDS)
+def test_demonstrations_recorded_under_one_condition_are_paid_as_live_under_another(env_id: str) -> None:
+    """Otherwise the critic would learn two rewards at once: the demonstrations' and the environment's."""
+    thresholds = {"Reacher": 0.2, "Walker2d": 1e-4, "Swimmer": 0.02}
+    threshold = thresholds.get(task_of(env_id), 0.1)
+    recorded = record(env_id, 10)
+    for kwargs in [{}] if "Reacher" in env_id else [{"condition": "displacement"}, {"condition": "forward"}]:
+        live = record(env_id, 10, threshold=threshold, **kwargs)
+        env = make_vec_env(env_id, env_kwargs={"threshold": threshold, **kwargs})
+        rewarded = recorded.rewarded_by(env)
+        env.close()
+        assert np.array_equal(rewarded.rewards, live.rewards)
+        assert 0 < rewarded.rewards.sum() < len(rewarded)
+        assert rewarded.observations is recorded.observations
+
+
+def test_demonstrations_without_dense_rewards_keep_their_own() -> None:
+    recorded = dataclasses.replace(record("SparseHopper-v5", 2), dense_rewards=None)
+    env = make_vec_env("SparseHopper-v5", env_kwargs={"condition": "forward"})
+    assert np.array_equal(recorded.rewarded_by(env).rewards, recorded.rewards)
+    env.close()
+
+
+def test_demonstrations_of_a_task_without_conditions_keep_their_rewards() -> None:
+    recorded = record("SparseHopper-v5", 1)
+    env = make_vec_env("Pendulum-v1")
+    assert recorded.rewarded_by(env) is recorded
+    env.close()
+
+
+@pytest.mark.parametrize("env_id", SPARSE_MUJOCO_IDS)
+def test_the_demonstrator_is_drawn_where_it_was(env_id: str) -> None:
+    """Angles and travelled distance; the Swimmer's and the start's sideways position are in no recording."""
+    recorded = record(env_id, 1)
+    env = gym.make(env_id)
+    env.reset(seed=0)
+    simulator = env.unwrapped
+    start = simulator.data.qpos.copy()
+    drawn = simulator.demonstrated_positions(recorded)
+    assert drawn.shape == (len(recorded), simulator.model.nq)
+    n_unobserved = 0 if "Reacher" in env_id else 2 if "Swimmer" in env_id else 1
+    for action, row in zip(recorded.actions, drawn, strict=True):
+        env.step(action)
+        turns = np.round((simulator.data.qpos - row) / (2 * np.pi)) * 2 * np.pi if "Reacher" in env_id else 0.0
+        assert np.allclose(simulator.data.qpos[n_unobserved:], (row + turns)[n_unobserved:], atol=1e-4)
+        if n_unobserved:
+            assert row[0] == pytest.approx(simulator.data.qpos[0] - start[0], abs=1e-4)
+    env.close()

@@ -18,6 +18,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_actpc.common.files import atomic_write
 
@@ -176,6 +177,17 @@ class Demonstrations:
         if self.actions.shape[1] != _flat_size(action_space):
             raise self._error("actions", f"{_flat_size(action_space)} values a row", f"{self.actions.shape[1]}")
         self._check_action_bounds(action_space.low.reshape(-1), action_space.high.reshape(-1))
+
+    def rewarded_by(self, env: VecEnv) -> Demonstrations:
+        """The same transitions with the rewards that ``env`` gives for them, under its own condition and threshold.
+
+        :param env: an environment with a method ``demonstrated_rewards(demonstrations)``, such as this package's MuJoCo
+            tasks; for any other the rewards stay as recorded
+        :return: demonstrations that share every other array
+        """
+        if not env.has_attr("demonstrated_rewards"):
+            return self
+        return dataclasses.replace(self, rewards=env.env_method("demonstrated_rewards", self, indices=[0])[0])
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write a compressed ``.npz`` file, all at once or not at all, without pickles.
@@ -475,19 +487,20 @@ def resolve(source: str | os.PathLike[str] | Demonstrations) -> Demonstrations:
     raise ValueError(f"demonstrations must be a file path or a Demonstrations object, found {source!r}")
 
 
-def shipped_demonstrations(env_id: str) -> Path:
+def shipped_demonstrations(env_id: str, weak: bool = False) -> Path:
     """The demonstrations file of a sparse task that comes with the package.
 
     :param env_id: Gymnasium id, such as ``SparseHalfCheetah-v5``
+    :param weak: the file of a weaker demonstrator, with about half the return; only the HalfCheetah has one
     :return: its path
     :raises FileNotFoundError: when none is shipped; the message says how to collect them
     """
     name = re.sub(r"-v\d+$", "", env_id.rpartition(":")[2])
-    path = DATA_FOLDER / f"sparse_{name.removeprefix('Sparse').lower()}.npz"
+    path = DATA_FOLDER / f"sparse_{name.removeprefix('Sparse').lower()}{'_weak' if weak else ''}.npz"
     if not path.is_file():
         raise FileNotFoundError(
-            f"no demonstrations of {env_id} are shipped: collect them (sb3-actpc demos collect --env {env_id}) and pass "
-            "--demonstrations FILE, or train without (--demonstrations none)"
+            f"no {'weak ' if weak else ''}demonstrations of {env_id} are shipped: collect them (sb3-actpc demos collect --env "
+            f"{env_id}) and pass --demonstrations FILE, or train without (--demonstrations none)"
         )
     return path
 
@@ -526,7 +539,8 @@ def _read_arrays(content: bytes, source: str) -> dict[str, np.ndarray]:
     with archive:
         version = _read_array(archive, "format_version", source)
         if version.shape != () or version.dtype.kind not in "iu" or version < 1:
-            raise _field_error(source, "format_version", "a whole number of at least 1", repr(version))
+            found = f"type {version.dtype}, shape {version.shape}" if version.shape else repr(version.item())
+            raise _field_error(source, "format_version", "a whole number of at least 1", found)
         if version > FORMAT_VERSION:
             raise _field_error(source, "format_version", f"at most {FORMAT_VERSION} (update sb3-actpc)", str(version))
         return {name: _read_array(archive, name, source) for name in _STORED_FIELDS}
@@ -538,7 +552,7 @@ def _read_array(archive: zipfile.ZipFile, name: str, source: str) -> np.ndarray:
     try:
         return np.lib.format.read_array(io.BytesIO(archive.read(f"{name}.npy")), allow_pickle=False)
     except _CORRUPT_FILE_ERRORS as error:
-        raise _field_error(source, name, "a readable array", f"{type(error).__name__}: {error}") from None
+        raise _field_error(source, name, "a readable array", f"{type(error).__name__}: {str(error)[:200]}") from None
 
 
 def _read_json(stored: dict[str, np.ndarray], name: str, source: str) -> Any:

@@ -9,6 +9,7 @@ from sb3_actpc.envs.robosuite_layouts import ROBOSUITE_TASKS
 
 SPARSE_MUJOCO_TASKS: tuple[str, ...] = ("Reacher", "HalfCheetah", "Walker2d", "Hopper", "Swimmer")
 SPARSE_MUJOCO_IDS: tuple[str, ...] = tuple(f"Sparse{task}-{v}" for v in ("v5", "v4") for task in SPARSE_MUJOCO_TASKS)
+GOAL_MUJOCO_IDS: tuple[str, ...] = tuple(env_id.replace("Sparse", "Goal", 1) for env_id in SPARSE_MUJOCO_IDS)
 ROBOSUITE_IDS: tuple[str, ...] = tuple(ROBOSUITE_TASKS)
 SPARSE_IDS: tuple[str, ...] = SPARSE_MUJOCO_IDS + ROBOSUITE_IDS
 
@@ -28,9 +29,28 @@ def register_envs() -> None:
             entry_point=f"sb3_actpc.envs.sparse_mujoco:{task}{env_version.upper()}Env",
             max_episode_steps=50 if task == "SparseReacher" else 1000,
         )
+    for env_id in GOAL_MUJOCO_IDS:
+        if env_id in registry:
+            continue
+        task, env_version = sparse_env_id(env_id).split("-")
+        register(
+            id=env_id,
+            entry_point="sb3_actpc.envs.goal_mujoco:make_goal_env",
+            max_episode_steps=50 if task == "SparseReacher" else 1000,
+            kwargs={"task": f"{task}{env_version.upper()}Env"},
+        )
     for env_id in ROBOSUITE_IDS:
         if env_id not in registry:
             register(id=env_id, entry_point=f"sb3_actpc.envs.robosuite_tasks:{env_id.split('-')[0]}Env")
+
+
+def sparse_env_id(env_id: str) -> str:
+    """Id of the sparse task behind a goal task.
+
+    :param env_id: any id, for example ``"GoalHopper-v5"``
+    :return: for example ``"SparseHopper-v5"``; an id that is not one of ``GOAL_MUJOCO_IDS`` is returned as it is
+    """
+    return env_id.replace("Goal", "Sparse", 1) if env_id in GOAL_MUJOCO_IDS else env_id
 
 
 def dense_env_id(env_id: str) -> str:
@@ -47,4 +67,13 @@ def dense_env_id(env_id: str) -> str:
 
 register_envs()
 
-__all__ = ["ROBOSUITE_IDS", "SPARSE_IDS", "SPARSE_MUJOCO_IDS", "SPARSE_MUJOCO_TASKS", "dense_env_id", "register_envs"]
+__all__ = [
+    "GOAL_MUJOCO_IDS",
+    "ROBOSUITE_IDS",
+    "SPARSE_IDS",
+    "SPARSE_MUJOCO_IDS",
+    "SPARSE_MUJOCO_TASKS",
+    "dense_env_id",
+    "register_envs",
+    "sparse_env_id",
+]

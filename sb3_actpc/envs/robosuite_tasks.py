@@ -26,7 +26,6 @@ from gymnasium import spaces, utils
 from sb3_actpc.envs.robosuite_layouts import ACTION_DIM, RobosuiteTask, robosuite_task
 
 CONTROL_FREQUENCY = 20
-FRAME_SIZE = (384, 384)
 # of robosuite 1.5.2 (environments/manipulation/lift.py): half edges in metres, density in kg/m^3
 CUBE_HALF_EDGES = (0.020, 0.022)
 CUBE_DENSITY = 1000.0
@@ -47,6 +46,8 @@ class SparseRobosuiteEnv(gym.Env[np.ndarray, np.ndarray], utils.EzPickle):
     :param horizon: control steps after which an episode is truncated
     :param render_mode: ``"rgb_array"``, or None
     :param camera: what :meth:`render` looks through: ``"agentview"``, ``"frontview"``, ``"sideview"`` among others
+    :param width: of the rendered pictures, in pixels
+    :param height: likewise
     :raises ImportError: when robosuite is not installed
     :raises ValueError: when a keyword has a value that is not allowed
     """
@@ -58,16 +59,24 @@ class SparseRobosuiteEnv(gym.Env[np.ndarray, np.ndarray], utils.EzPickle):
     checkpoint_skipped: ClassVar[tuple[str, ...]] = ("_simulation", "_renderer", "_layout", "task")
 
     def __init__(
-        self, obs: str = "paper", horizon: int = 500, render_mode: str | None = None, camera: str = "agentview"
+        self,
+        obs: str = "paper",
+        horizon: int = 500,
+        render_mode: str | None = None,
+        camera: str = "agentview",
+        width: int = 384,
+        height: int = 384,
     ) -> None:
         self.task: RobosuiteTask = robosuite_task(self.env_id)
         self._layout = self.task.layout(obs)
-        if isinstance(horizon, bool) or not isinstance(horizon, int) or horizon < 1:
-            raise ValueError(f"horizon={horizon!r} must be a whole number of at least 1: give the steps of an episode")
+        for name, value in (("horizon", horizon), ("width", width), ("height", height)):
+            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+                raise ValueError(f"{name}={value!r} must be a whole number of at least 1: give one, or leave it out")
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode={render_mode!r} is not available: choose 'rgb_array' or None")
-        utils.EzPickle.__init__(self, obs, horizon, render_mode, camera)
+        utils.EzPickle.__init__(self, obs, horizon, render_mode, camera, width, height)
         self.obs, self.horizon, self.render_mode, self.camera = obs, horizon, render_mode, camera
+        self.width, self.height = width, height
         self.observation_space = spaces.Box(-np.inf, np.inf, (self.task.obs_dim(obs),), np.float32)
         self.action_space = spaces.Box(-1.0, 1.0, (ACTION_DIM,), np.float32)
         self._simulation = make_simulation(self.task.name)
@@ -124,14 +133,15 @@ class SparseRobosuiteEnv(gym.Env[np.ndarray, np.ndarray], utils.EzPickle):
         return self._observe()
 
     def render(self) -> np.ndarray | None:
-        """The camera's view, (384, 384, 3) uint8; None without a render mode.
+        """The camera's view, (height, width, 3) uint8; None without a render mode.
 
         :raises RuntimeError: (or what the OpenGL library raises) when the machine cannot render
         """
         if self.render_mode is None:
             return None
         if self._renderer is None:
-            self._renderer = mujoco.Renderer(self.model, *FRAME_SIZE)
+            self.model.vis.global_.offwidth, self.model.vis.global_.offheight = self.width, self.height
+            self._renderer = mujoco.Renderer(self.model, self.height, self.width)
         options = mujoco.MjvOption()
         options.geomgroup[0] = 0  # collision shapes
         self._renderer.update_scene(self.data, camera=self.camera, scene_option=options)

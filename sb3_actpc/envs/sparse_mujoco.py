@@ -12,8 +12,10 @@ keywords are unchanged. The base task's reward is ``info["dense_reward"]``. Time
 :func:`sb3_actpc.envs.register_envs`, and reported as truncation.
 """
 
+from __future__ import annotations
+
 import math
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from gymnasium import utils
@@ -30,6 +32,9 @@ from gymnasium.envs.mujoco import (
     walker2d_v4,
     walker2d_v5,
 )
+
+if TYPE_CHECKING:
+    from sb3_actpc.common.demonstrations import Demonstrations
 
 LOCOMOTION_CONDITIONS: tuple[str, ...] = ("displacement", "forward")
 
@@ -65,6 +70,22 @@ class _SparseMujocoEnv(MujocoEnv, utils.EzPickle):
         info.update(dense_reward=float(dense_reward), is_success=is_success)
         return observation, reward, bool(terminated), truncated, info
 
+    def demonstrated_rewards(self, demonstrations: Demonstrations) -> np.ndarray:
+        """The rewards that this environment, with its own condition and threshold, gives for recorded transitions.
+
+        :param demonstrations: N transitions of the same task, recorded under any condition
+        :return: (N,) float32; the recorded ones where the recording does not tell
+        """
+        raise NotImplementedError
+
+    def demonstrated_positions(self, demonstrations: Demonstrations) -> np.ndarray:
+        """Generalised positions after every recorded transition, to draw the demonstrator with.
+
+        :param demonstrations: N transitions of the same task
+        :return: (N, nq) float64
+        """
+        raise NotImplementedError
+
     def _sparse_reward(self, info: dict[str, Any]) -> tuple[float, bool]:
         """Sparse reward and success of the state just reached."""
         raise NotImplementedError
@@ -97,6 +118,24 @@ class SparseReacherEnv(_SparseMujocoEnv):
         super().__init__(**kwargs)
         utils.EzPickle.__init__(self, threshold=threshold, miss_reward=miss_reward, **kwargs)
 
+    def demonstrated_rewards(self, demonstrations: Demonstrations) -> np.ndarray:
+        """The rewards under this threshold, from the distance to the target, which is observed.
+
+        :param demonstrations: N transitions of the Reacher
+        :return: (N,) float32
+        """
+        distances = np.linalg.norm(demonstrations.next_observations[:, 8:], axis=1)  # fingertip minus target
+        return np.where(distances <= self.threshold, 1.0, self.miss_reward).astype(np.float32)
+
+    def demonstrated_positions(self, demonstrations: Demonstrations) -> np.ndarray:
+        """Both joint angles and the target's position.
+
+        :param demonstrations: N transitions of the Reacher
+        :return: (N, 4) float64
+        """
+        cosines, sines, targets = np.split(demonstrations.next_observations[:, :6].astype(np.float64), 3, axis=1)
+        return np.concatenate([np.arctan2(sines, cosines), targets], axis=1)
+
     def _sparse_reward(self, info: dict[str, Any]) -> tuple[float, bool]:
         distance = np.linalg.norm(self.get_body_com("fingertip") - self.get_body_com("target"))
         is_near = bool(distance <= self.threshold)
@@ -121,6 +160,9 @@ class SparseLocomotionEnv(_SparseMujocoEnv):
     default_velocity: ClassVar[float]
     """Metres per second, our choice: the paper gives none. Of the steps of uniformly random actions (10 episodes of -v5) it
     pays 0 % (HalfCheetah, Walker2d), 4 % (Hopper) and 18 % (Swimmer, whose first segment swings along x)."""
+
+    _ctrl_cost_weight: float  # of the base task, as the next
+    _forward_reward_weight: float
 
     def __init__(self, condition: str = "displacement", threshold: float | None = None, **kwargs: Any) -> None:
         if condition not in LOCOMOTION_CONDITIONS:
@@ -152,6 +194,46 @@ class SparseLocomotionEnv(_SparseMujocoEnv):
         self._start_x = float(self.data.qpos[0])
         self._has_passed = False
         return observation, info
+
+    def demonstrated_rewards(self, demonstrations: Demonstrations) -> np.ndarray:
+        """The rewards under this condition, from the forward velocity within the base task's reward.
+
+        :param demonstrations: N transitions of the base task with its default weights
+        :return: (N,) float32; the recorded rewards where ``dense_rewards`` is None
+        """
+        if demonstrations.dense_rewards is None:
+            return demonstrations.rewards
+        velocities = self._demonstrated_velocities(demonstrations)
+        if self.condition == "forward":
+            return (velocities > self.velocity).astype(np.float32)
+        return (self._travelled(velocities, demonstrations) > self.distance).astype(np.float32)
+
+    def demonstrated_positions(self, demonstrations: Demonstrations) -> np.ndarray:
+        """The observed positions, and the distance travelled along x (the Swimmer's y, not observed either, stays 0).
+
+        :param demonstrations: N transitions of the base task with its default weights and ``dense_rewards``
+        :return: (N, nq) float64
+        """
+        assert self.model is not None
+        positions = np.zeros((len(demonstrations), self.model.nq))
+        positions[:, 0] = self._travelled(self._demonstrated_velocities(demonstrations), demonstrations)
+        n_observed = demonstrations.next_observations.shape[1] - self.model.nv
+        positions[:, -n_observed:] = demonstrations.next_observations[:, :n_observed]
+        return positions
+
+    def _travelled(self, velocities: np.ndarray, demonstrations: Demonstrations) -> np.ndarray:
+        """x - x_0 in metres after each transition, (N,) float64."""
+        bounds = demonstrations.episode_bounds
+        return np.concatenate([np.cumsum(velocities[start:end]) * self.dt for start, end in bounds])
+
+    def _demonstrated_velocities(self, demonstrations: Demonstrations) -> np.ndarray:
+        """Forward velocities in metres per second, (N,) float64: the base reward without control cost and health."""
+        assert demonstrations.dense_rewards is not None
+        costs = self._ctrl_cost_weight * np.square(demonstrations.actions, dtype=np.float64).sum(axis=1)
+        healthy = getattr(self, "_healthy_reward", 0.0)
+        if demonstrations.env_id.endswith("v5"):  # -v4 pays it also on the step that falls
+            healthy = healthy * ~demonstrations.terminations
+        return (demonstrations.dense_rewards + costs - healthy) / self._forward_reward_weight
 
     def _sparse_reward(self, info: dict[str, Any]) -> tuple[float, bool]:
         is_far = bool(self.data.qpos[0] - self._start_x > self.distance)

@@ -37,6 +37,54 @@ class Predictor(Protocol):
         """Actions, (n, action_dim), and the next recurrent state, for n observations."""
 
 
+class NormalizedPredictor:
+    """A policy that learned from the observations of SB3's ``VecNormalize``, for those of the bare environment.
+
+    :param model: the policy
+    :param normalize: normalises n observations, (n, obs_dim)
+    """
+
+    FILE = "normalization.npz"  # in a run's folder
+
+    def __init__(self, model: Predictor, normalize: Callable[[np.ndarray], np.ndarray]) -> None:
+        self.model, self.normalize = model, normalize
+
+    def predict(
+        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = False
+    ) -> tuple[Any, Any]:
+        """See :class:`Predictor`."""
+        return self.model.predict(self.normalize(observation), state, episode_start, deterministic)
+
+    @classmethod
+    def wrap(cls, model: BaseAlgorithm) -> Predictor:
+        """The agent itself, or with the present statistics of its environment where that normalises observations."""
+        wrapper = model.get_vec_normalize_env()
+        return model if wrapper is None or not wrapper.norm_obs else cls(model, wrapper.normalize_obs)  # type: ignore[arg-type]
+
+    @classmethod
+    def save(cls, model: BaseAlgorithm, folder: Path) -> None:
+        """Write the statistics, where there are any, into the run's folder."""
+        wrapper = model.get_vec_normalize_env()
+        if wrapper is None or not wrapper.norm_obs:
+            return
+        statistics: Any = wrapper.obs_rms
+        spread = np.sqrt(statistics.var + wrapper.epsilon)
+        with atomic_write(folder / cls.FILE) as file:
+            np.savez(file, mean=statistics.mean, spread=spread, limit=np.array(wrapper.clip_obs))
+
+    @classmethod
+    def wrap_saved(cls, model: Predictor, folder: Path) -> Predictor:
+        """The agent itself, or with the statistics that :meth:`save` wrote into the run's folder.
+
+        :raises ValueError: when the file is damaged
+        """
+        if not (folder / cls.FILE).is_file():
+            return model
+        with np.load(folder / cls.FILE, allow_pickle=False) as stored:
+            mean, spread, limit = stored["mean"], stored["spread"], float(stored["limit"])
+        return cls(model, lambda rows: np.clip((rows - mean) / spread, -limit, limit).astype(np.float32))
+
+
 @dataclass(frozen=True)
 class EpisodeStatistics:
     """What happened in n episodes; each array is (n,) float64.
@@ -201,7 +249,8 @@ class EvaluationCallback(BaseCallback):
 
     def _evaluate(self) -> None:
         started = time.perf_counter()
-        statistics = play_episodes(self.model, self.envs, self.eval_episodes, self.seed)
+        statistics = play_episodes(NormalizedPredictor.wrap(self.model), self.envs, self.eval_episodes, self.seed)
+        NormalizedPredictor.save(self.model, self.folder)
         with atomic_write(self.folder / "model.zip") as file:
             self.model.save(cast(BufferedIOBase, file))
         now = time.perf_counter()

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import importlib.metadata
 import json
 import platform
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,23 +16,23 @@ import gymnasium as gym
 import numpy as np
 import torch as th
 import yaml
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, ProgressBarCallback
-from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.noise import ActionNoise, NormalActionNoise, OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_actpc.checkpoints import CheckpointCallback, list_bundles, restore
 from sb3_actpc.common.demonstrations import Demonstrations
 from sb3_actpc.common.files import atomic_write
-from sb3_actpc.training.config import RunConfig, RunPlan, load_algorithm, parse_schedule, resolve_run
-from sb3_actpc.training.evaluation import EvaluationCallback, play_episodes
+from sb3_actpc.training.config import RunConfig, RunPlan, load_algorithm, parse_schedule, read_yaml, resolve_run
+from sb3_actpc.training.environments import check_env_id, make_eval_envs, make_train_env
+from sb3_actpc.training.evaluation import EvaluationCallback, NormalizedPredictor, Predictor, play_episodes
 from sb3_actpc.training.report import plot_learning_curve
 
 # the evaluation's episodes start from other states than the training's
 EVALUATION_SEED_OFFSET = 1_000_000
-MAX_EVALUATION_ENVS = 10
 CHECKPOINTS = "checkpoints"  # folder in the run's folder
 _RECORDED_PACKAGES = ("sb3-actpc", "stable-baselines3", "torch", "gymnasium", "mujoco", "robosuite", "numpy")
 
@@ -39,7 +40,8 @@ _RECORDED_PACKAGES = ("sb3-actpc", "stable-baselines3", "torch", "gymnasium", "m
 def train_run(config: RunConfig, report: Callable[[str], None] = lambda line: None) -> dict[str, Any]:
     """Train one agent; its folder then holds the model, the settings, the evaluations, the plot and the result.
 
-    Works with any SB3 off-policy algorithm of ``ALGORITHMS``. Sets the number of torch threads of the process.
+    Works with any algorithm of ``ALGORITHMS``; those that learn on policy keep no checkpoints. Sets the number of torch
+    threads of the process.
 
     :param config: what to train
     :param report: given a line of text when the run starts and after each evaluation
@@ -68,6 +70,8 @@ def resume_run(folder: Path, report: Callable[[str], None] = lambda line: None, 
     if not (folder / "config.yml").is_file():
         raise FileNotFoundError(f"no run in {folder}: config.yml is missing")
     config, plan = _read_plan(folder, progress)
+    if not plan.learns_off_policy:
+        raise ValueError(f"{config.algo} learns on policy and keeps no checkpoints: start the run again, in another folder")
     check_env_id(config.env)
     return _run(config, plan, report, folder)
 
@@ -75,7 +79,7 @@ def resume_run(folder: Path, report: Callable[[str], None] = lambda line: None, 
 def _run(config: RunConfig, plan: RunPlan, report: Callable[[str], None], resumed: Path | None) -> dict[str, Any]:
     th.set_num_threads(config.threads)
     eval_envs = make_eval_envs(config.env, plan.env_kwargs, config.eval_episodes)
-    train_env = make_train_env(config.env, plan.n_envs, config.seed, plan.env_kwargs)
+    train_env = make_train_env(config.env, plan.env_kwargs, plan.n_envs, config.seed, plan.normalize)
     try:
         return _train(config, plan, train_env, eval_envs, report, resumed)
     finally:
@@ -114,11 +118,11 @@ def evaluate_run(folder: Path, n_episodes: int = 10, seed: int = 0) -> dict[str,
     }
 
 
-def load_run(folder: Path) -> tuple[dict[str, Any], OffPolicyAlgorithm]:
+def load_run(folder: Path) -> tuple[dict[str, Any], Predictor]:
     """The recorded settings and the model of a run. The model is unpickled: open only runs that you trust.
 
     :param folder: run folder
-    :return: the content of ``config.yml``, and the model on the CPU
+    :return: the content of ``config.yml``, and the model on the CPU, with its normalisation of observations where it has one
     :raises FileNotFoundError: when the folder, ``config.yml`` or ``model.zip`` does not exist
     :raises ValueError: when one of the two cannot be read
     """
@@ -126,14 +130,12 @@ def load_run(folder: Path) -> tuple[dict[str, Any], OffPolicyAlgorithm]:
         if not (folder / name).is_file():
             raise FileNotFoundError(f"no run in {folder}: {name} is missing")
     record = _read_config(folder, {"env", "env_kwargs", "algo", "seed"})
-    return record, load_algorithm(record["algo"]).load(folder / "model.zip", device="cpu")
+    model = load_algorithm(record["algo"]).load(folder / "model.zip", device="cpu")
+    return record, NormalizedPredictor.wrap_saved(model, folder)
 
 
 def _read_config(folder: Path, needed: set[str]) -> dict[str, Any]:
-    try:
-        record = yaml.safe_load((folder / "config.yml").read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ValueError(f"{folder / 'config.yml'}: not a YAML file") from error
+    record = read_yaml((folder / "config.yml").read_bytes(), str(folder / "config.yml"))
     if not isinstance(record, dict) or not needed <= record.keys():
         raise ValueError(f"{folder / 'config.yml'}: expected the settings of a run ({', '.join(sorted(needed))})")
     return record
@@ -158,75 +160,9 @@ def _read_plan(folder: Path, progress: bool) -> tuple[RunConfig, RunPlan]:
         algorithm_kwargs=settings,
         demonstrations=None if record["demonstrations"] is None else Path(record["demonstrations"]),
         checkpoint_freq=record["checkpoint_freq"],
+        normalize=record.get("normalize"),
     )
     return config, plan
-
-
-def make_env(env_id: str, env_kwargs: Mapping[str, Any], render_mode: str | None = None) -> gym.Env[Any, Any]:
-    """Make an environment, this package's tasks included.
-
-    :param env_id: Gymnasium id
-    :param env_kwargs: its keywords
-    :param render_mode: Gymnasium's render mode, or None
-    :return: the environment
-    :raises gymnasium.error.Error: when the id is unknown
-    :raises ValueError: when it does not take the keywords
-    """
-    register_tasks()
-    options = dict(env_kwargs) if render_mode is None else {**env_kwargs, "render_mode": render_mode}
-    try:
-        return gym.make(env_id, **options)
-    except TypeError as error:
-        raise ValueError(f"{env_id}: {error}") from error
-
-
-def make_train_env(env_id: str, n_envs: int, seed: int, env_kwargs: Mapping[str, Any]) -> VecEnv:
-    """Make the training environments: in this process, or, several of robosuite's, each in its own.
-
-    A step of a robosuite task takes longer than an update, one of a MuJoCo task less than the way to another process.
-
-    :param env_id: Gymnasium id
-    :param n_envs: how many
-    :param seed: of the first one; the others count on from it
-    :param env_kwargs: keywords of the environments
-    :return: the environments
-    """
-    from sb3_actpc.envs import ROBOSUITE_IDS
-
-    in_processes = n_envs > 1 and env_id.rpartition(":")[2] in ROBOSUITE_IDS
-    kind: type[VecEnv] = SubprocVecEnv if in_processes else DummyVecEnv
-    # a worker that has not imported this package finds the task by its module
-    name = f"sb3_actpc.envs:{env_id}" if in_processes and ":" not in env_id else env_id
-    return make_vec_env(name, n_envs=n_envs, seed=seed, env_kwargs=dict(env_kwargs), vec_env_cls=kind)  # type: ignore[arg-type]
-
-
-def make_eval_envs(env_id: str, env_kwargs: Mapping[str, Any], n_episodes: int) -> list[gym.Env[Any, Any]]:
-    """As many environments as episodes are played side by side.
-
-    :param env_id: Gymnasium id
-    :param env_kwargs: its keywords
-    :param n_episodes: how many episodes will be played
-    :return: at most ``MAX_EVALUATION_ENVS`` environments
-    """
-    return [make_env(env_id, env_kwargs) for _ in range(min(n_episodes, MAX_EVALUATION_ENVS))]
-
-
-def register_tasks() -> None:
-    """Register this package's tasks with Gymnasium (again does no harm)."""
-    from sb3_actpc.envs import register_envs
-
-    register_envs()
-
-
-def check_env_id(env_id: str) -> None:
-    """Check that an environment is registered; ids with a module (``module:Name-v0``) are left to ``gymnasium.make``.
-
-    :param env_id: Gymnasium id
-    :raises gymnasium.error.Error: when it is unknown
-    """
-    register_tasks()
-    if ":" not in env_id:
-        gym.spec(env_id)
 
 
 def run_folder(config: RunConfig) -> Path:
@@ -264,7 +200,7 @@ def demonstrators_return(path: Path | None) -> float | None:
     return None if returns is None else float(returns.mean())
 
 
-def build_model(plan: RunPlan, config: RunConfig, env: VecEnv) -> OffPolicyAlgorithm:
+def build_model(plan: RunPlan, config: RunConfig, env: VecEnv) -> BaseAlgorithm:
     """Make the agent.
 
     :param plan: the resolved settings
@@ -273,7 +209,7 @@ def build_model(plan: RunPlan, config: RunConfig, env: VecEnv) -> OffPolicyAlgor
     :return: the agent, not trained
     :raises ValueError: when a setting has a wrong value
     """
-    kwargs = dict(plan.algorithm_kwargs)
+    kwargs = copy.deepcopy(plan.algorithm_kwargs)  # SB3 adds keys of its own to the dictionaries it is given
     if "learning_rate" in kwargs:
         kwargs["learning_rate"] = parse_schedule(kwargs["learning_rate"])
     if plan.uses_demonstrations:
@@ -300,6 +236,7 @@ def _train(
     folder = run_folder(config) if resumed is None else resumed
     has_checkpoint = resumed is not None and bool(list_bundles(folder / CHECKPOINTS))
     if has_checkpoint:  # before any file of the run is touched
+        assert isinstance(model, OffPolicyAlgorithm)
         restore(model, folder / CHECKPOINTS, report)
     folder.mkdir(parents=True, exist_ok=True)
     if resumed is None:
@@ -312,7 +249,7 @@ def _train(
     report(f"{config.env}: {config.algo}, {plan.n_timesteps} steps{since}, into {folder}")
     if not has_checkpoint:
         callback.begin(model)
-    _learn(model, plan.n_timesteps, _callbacks(folder, plan, callback, report), config.progress)
+    _learn(model, plan.n_timesteps, _callbacks(folder, plan, callback, report), config.progress, goes_on=has_checkpoint)
     seconds = callback.wall_seconds
     result = {
         **callback.last_summary,
@@ -345,12 +282,14 @@ def _callbacks(
     return [CheckpointCallback(folder / CHECKPOINTS, plan.checkpoint_freq, at_end=False, report=report), evaluation]
 
 
-def _learn(model: OffPolicyAlgorithm, n_timesteps: int, callbacks: list[BaseCallback], progress: bool) -> None:
+def _learn(
+    model: BaseAlgorithm, n_timesteps: int, callbacks: list[BaseCallback], progress: bool, goes_on: bool
+) -> None:
     # what progress_bar=True does, but closed when training stops early
     bar = [ProgressBarCallback()] if progress else []
     left = n_timesteps - model.num_timesteps
     try:
-        model.learn(max(left, 0), callback=[*callbacks, *bar], reset_num_timesteps=model.num_timesteps == 0)
+        model.learn(max(left, 0), callback=[*callbacks, *bar], reset_num_timesteps=not goes_on)
     finally:
         for callback in callbacks:
             if isinstance(callback, CheckpointCallback):
@@ -371,6 +310,7 @@ def _write_config(folder: Path, config: RunConfig, plan: RunPlan, reference: flo
         "checkpoint_freq": plan.checkpoint_freq,
         "env_kwargs": plan.env_kwargs,
         "noise": None if plan.noise is None else list(plan.noise),
+        "normalize": plan.normalize,
         "settings": {key: list(value) if isinstance(value, tuple) else value for key, value in plan.algorithm_kwargs.items()},
         "demonstrations": None if plan.demonstrations is None else str(plan.demonstrations),
         "demonstrators_return": reference,

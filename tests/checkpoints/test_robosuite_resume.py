@@ -12,7 +12,7 @@ from stable_baselines3.common.vec_env import SubprocVecEnv
 from sb3_actpc import ActPC
 from sb3_actpc.envs import ROBOSUITE_IDS
 from sb3_actpc.training import RunConfig, train_run
-from sb3_actpc.training.run import make_train_env
+from sb3_actpc.training.environments import make_train_env
 from tests.checkpoints.runs import assert_same, learn_in_two, learn_straight
 from tests.test_robosuite_demonstrations import made_up
 
@@ -50,7 +50,7 @@ def test_a_run_stopped_within_an_episode_is_the_run_never_stopped(env_id: str, t
 
 def test_several_environments_keep_combined_replay_and_self_imitation() -> None:
     """Two processes: each environment's newest transition is in the batch, each one's success enters the memory."""
-    env = make_train_env("SparseLift-v0", 2, seed=1, env_kwargs={"horizon": 12})
+    env = make_train_env("SparseLift-v0", {"horizon": 12}, n_envs=2, seed=1)
     assert isinstance(env, SubprocVecEnv)
     model = ActPC("MlpPolicy", env, demonstrations=made_up("SparseLift-v0"), alpha_ext=1.0, **SMALL)
     model.learn(40)
@@ -71,7 +71,7 @@ def test_several_environments_keep_combined_replay_and_self_imitation() -> None:
 
 
 def test_several_mujoco_environments_stay_in_this_process() -> None:
-    env = make_train_env("SparseHopper-v5", 2, seed=1, env_kwargs={})
+    env = make_train_env("SparseHopper-v5", {}, n_envs=2, seed=1)
     assert not isinstance(env, SubprocVecEnv)
     env.close()
 

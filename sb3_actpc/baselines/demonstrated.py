@@ -1,0 +1,127 @@
+"""What the off-policy baselines share: demonstrations in every batch."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.type_aliases import GymEnv
+from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
+
+from sb3_actpc.common.demonstration_buffers import (
+    DemonstrationDictReplayBuffer,
+    _DemonstrationReplay,
+    demonstration_buffer_class,
+    fit_demonstrations,
+)
+from sb3_actpc.common.demonstrations import Demonstrations
+
+
+class DemonstratedAlgorithm(OffPolicyAlgorithm):
+    """
+    An off-policy algorithm whose replay buffer is one of :mod:`sb3_actpc.common.demonstration_buffers`.
+
+    An agent that is loaded without an environment, to be played, gets a buffer of one transition and does not look for its
+    demonstrations; :meth:`set_env` makes the whole buffer.
+    """
+
+    demonstrations: Demonstrations | Path | None
+    n_demonstrations: int | None
+    n_demonstration_transitions: int | None
+    demonstration_fraction: float
+
+    def _set_demonstrations(
+        self,
+        demonstrations: Demonstrations | str | Path | None,
+        n_demonstrations: int | None,
+        n_demonstration_transitions: int | None,
+        demonstration_fraction: float,
+    ) -> None:
+        # a path is kept absolute, so that the saved agent finds its demonstrations from any folder
+        self.demonstrations = Path(demonstrations).absolute() if isinstance(demonstrations, (str, Path)) else demonstrations
+        self.n_demonstrations, self.n_demonstration_transitions = n_demonstrations, n_demonstration_transitions
+        self.demonstration_fraction = demonstration_fraction
+
+    def _setup_model(self) -> None:
+        asked = self.replay_buffer_class, dict(self.replay_buffer_kwargs), self.n_steps
+        if self.replay_buffer is None:
+            self.replay_buffer = self._make_replay_buffer()
+        # the buffer is made: SB3 is not to warn of, nor to choose, another
+        self.replay_buffer_class, self.n_steps = type(self.replay_buffer), 1
+        super()._setup_model()
+        self.replay_buffer_class, self.replay_buffer_kwargs, self.n_steps = asked
+
+    def _replay_class(self) -> type[_DemonstrationReplay]:
+        return demonstration_buffer_class(self.replay_buffer_class, self.observation_space, self.n_steps)
+
+    def _make_replay_buffer(self) -> ReplayBuffer:
+        kind, kwargs = self._replay_class(), dict(self.replay_buffer_kwargs)
+        size = self.buffer_size
+        demonstrations = None
+        if self.env is None:
+            kind, kwargs, size = _placeholder(kind), {}, self.n_envs
+        else:
+            if self.demonstrations is not None:
+                demonstrations = self._fitted_demonstrations()
+            if self.n_steps > 1:
+                kwargs = {"n_steps": self.n_steps, "gamma": self.gamma, **kwargs}
+            if issubclass(kind, HerReplayBuffer):
+                kwargs["env"] = self.env
+        return kind(
+            size,
+            self.observation_space,
+            self.action_space,
+            device=self.device,
+            n_envs=self.n_envs,
+            optimize_memory_usage=self.optimize_memory_usage and self.env is not None,
+            demonstrations=demonstrations,
+            demonstration_fraction=self.demonstration_fraction,
+            **kwargs,
+        )
+
+    def _fitted_demonstrations(self) -> Demonstrations:
+        assert self.demonstrations is not None
+        return fit_demonstrations(
+            self.demonstrations,
+            self.env,
+            self.observation_space,
+            self.action_space,
+            self.n_demonstrations,
+            self.n_demonstration_transitions,
+        )
+
+    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
+        """
+        :param env: as SB3's; an agent that was loaded without one gets its replay buffer and its demonstrations now
+        :param force_reset: as SB3's
+        """
+        was_without = self.env is None
+        super().set_env(env, force_reset)
+        if was_without:
+            self.replay_buffer = self._make_replay_buffer()
+
+    def checkpoint_state(self) -> dict[str, Any]:
+        """What a checkpoint (:mod:`sb3_actpc.checkpoints`) keeps beside SB3's state: how many demonstrations there were."""
+        return {"n_demonstrated": self._n_demonstrated()}
+
+    def restore_checkpoint_state(self, state: dict[str, Any]) -> None:
+        """
+        :param state: what :meth:`checkpoint_state` returned
+        :raises ValueError: when it was taken with other demonstrations
+        """
+        if state["n_demonstrated"] != self._n_demonstrated():
+            raise ValueError(
+                f"the checkpoint's agent has {state['n_demonstrated']} demonstrated transitions, this one "
+                f"{self._n_demonstrated()}: pass the same demonstrations="
+            )
+
+    def _n_demonstrated(self) -> int:
+        demonstrated = getattr(self.replay_buffer, "demonstrated", None)
+        return 0 if demonstrated is None else demonstrated.buffer_size
+
+
+def _placeholder(kind: type[_DemonstrationReplay]) -> type[_DemonstrationReplay]:
+    """A class that needs no environment, with observations of the same kind."""
+    return DemonstrationDictReplayBuffer if issubclass(kind, DictReplayBuffer) else kind

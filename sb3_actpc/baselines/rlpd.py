@@ -1,0 +1,147 @@
+"""SAC with demonstrations in the way of RLPD: what a practitioner would try first today."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, ClassVar
+
+import torch as th
+from stable_baselines3 import SAC
+from stable_baselines3.common.policies import BasePolicy, ContinuousCritic
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor, create_mlp
+from stable_baselines3.common.type_aliases import GymEnv, Schedule
+from stable_baselines3.sac.policies import SACPolicy
+from torch import nn
+
+from sb3_actpc.baselines.demonstrated import DemonstratedAlgorithm
+from sb3_actpc.baselines.keywords import with_keywords_of
+from sb3_actpc.common.checks import check_range
+from sb3_actpc.common.demonstrations import Demonstrations
+
+
+class LayerNormCritic(ContinuousCritic):
+    """
+    SB3's critics with layer normalisation before every activation.
+
+    :param args: as SB3's
+    :param kwargs: as SB3's
+    """
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.n_drawn: int | None = None  # of the critics, how many answer; None for all
+        net_arch, activation = kwargs["net_arch"], kwargs.get("activation_fn", nn.ReLU)
+        n_inputs = kwargs["features_dim"] + int(self.action_space.shape[0])  # type: ignore[index]
+        for index in range(self.n_critics):
+            layers = create_mlp(n_inputs, 1, net_arch, activation, post_linear_modules=[nn.LayerNorm])
+            self.q_networks[index] = nn.Sequential(*layers)
+            self.add_module(f"qf{index}", self.q_networks[index])
+
+    def forward(self, obs: th.Tensor, actions: th.Tensor) -> tuple[th.Tensor, ...]:
+        """
+        :param obs: (B, *obs_shape)
+        :param actions: (B, A)
+        :return: action-values (B, 1) of every critic, or of ``n_drawn`` drawn ones
+        """
+        values = super().forward(obs, actions)
+        if self.n_drawn is None:
+            return values
+        return tuple(values[index] for index in th.randperm(len(values))[: self.n_drawn])
+
+
+class LayerNormSACPolicy(SACPolicy):
+    """
+    SB3's SAC policy with :class:`LayerNormCritic`.
+
+    :param args: as SB3's
+    :param n_critics: how many critics
+    :param n_target_critics: how many drawn target critics give the smallest value that bootstraps (REDQ, arXiv 2101.05982)
+    :param kwargs: as SB3's
+    :raises ValueError: when more are to be drawn than there are
+    """
+
+    def __init__(self, *args: Any, n_critics: int = 10, n_target_critics: int = 2, **kwargs: Any) -> None:
+        if not 1 <= n_target_critics <= n_critics:
+            raise ValueError(f"n_target_critics={n_target_critics!r} must be between 1 and n_critics={n_critics}")
+        self.n_target_critics = n_target_critics
+        super().__init__(*args, **{**kwargs, "n_critics": n_critics})
+
+    def _build(self, lr_schedule: Schedule) -> None:
+        super()._build(lr_schedule)
+        self.critic_target.n_drawn = self.n_target_critics  # type: ignore[assignment]
+
+    def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> LayerNormCritic:
+        """
+        :param features_extractor: as SB3's
+        :return: the critics
+        """
+        kwargs = self._update_features_extractor(self.critic_kwargs, features_extractor)
+        return LayerNormCritic(**kwargs).to(self.device)
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        return {**super()._get_constructor_parameters(), "n_target_critics": self.n_target_critics}
+
+
+class LayerNormMultiInputPolicy(LayerNormSACPolicy):
+    """The same for Dict observations."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **{"features_extractor_class": CombinedExtractor, **kwargs})
+
+
+@with_keywords_of(SAC)
+class RLPD(DemonstratedAlgorithm, SAC):
+    """
+    SAC in the way of RLPD (Ball et al., arXiv 2302.02948): half of every batch from the demonstrations, layer-normalised
+    critics, an ensemble of which two bootstrap, several updates a step. The learning itself is Stable-Baselines3's SAC.
+
+    Defaults are those published (10 critics, 20 updates a step, 5000 random steps before learning).
+
+    Differences from RLPD's code (github.com/ikostrikov/rlpd):
+
+    1. The actor and the temperature are updated with every update of the critic; there once for all 20.
+    2. The actor climbs the smallest of all critics' values, as in SB3; there their mean.
+
+    :param policy: "MlpPolicy" or "MultiInputPolicy"; ``policy_kwargs`` takes ``n_critics`` and ``n_target_critics``
+    :param env: as SB3's
+    :param demonstrations: a path, or a :class:`~sb3_actpc.common.demonstrations.Demonstrations`; None learns without
+    :param n_demonstrations: use only the first so many episodes of them
+    :param n_demonstration_transitions: use only the first so many transitions
+    :param demonstration_fraction: share of each batch that comes from them; without demonstrations it has no effect
+    :param learning_starts: as SB3's
+    :param gradient_steps: as SB3's
+    :param options: further keywords of SB3's SAC
+    :raises ValueError: for a keyword with a value that is not allowed, for demonstrations that do not fit the environment
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
+        "MlpPolicy": LayerNormSACPolicy,
+        "MultiInputPolicy": LayerNormMultiInputPolicy,
+    }
+
+    def __init__(
+        self,
+        policy: str | type[SACPolicy],
+        env: GymEnv | str | None,
+        *,
+        demonstrations: Demonstrations | str | Path | None = None,
+        n_demonstrations: int | None = None,
+        n_demonstration_transitions: int | None = None,
+        demonstration_fraction: float = 0.5,
+        learning_starts: int = 5000,
+        gradient_steps: int = 20,
+        _init_setup_model: bool = True,
+        **options: Any,
+    ) -> None:
+        check_range(locals(), "demonstration_fraction", 0, 1)
+        super().__init__(
+            policy,
+            env,  # type: ignore[arg-type]
+            learning_starts=learning_starts,
+            gradient_steps=gradient_steps,
+            _init_setup_model=False,
+            **options,
+        )
+        self._set_demonstrations(demonstrations, n_demonstrations, n_demonstration_transitions, demonstration_fraction)
+        if _init_setup_model:
+            self._setup_model()

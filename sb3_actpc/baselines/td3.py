@@ -1,0 +1,262 @@
+"""TD3 and DDPG with demonstrations; actor and critic have rates, optimisers and target rates of their own, as in the paper."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch as th
+from stable_baselines3 import TD3
+from stable_baselines3.common.policies import BaseModel
+from stable_baselines3.common.type_aliases import GymEnv
+from stable_baselines3.common.utils import polyak_update
+from stable_baselines3.td3.policies import TD3Policy
+
+from sb3_actpc.baselines.demonstrated import DemonstratedAlgorithm
+from sb3_actpc.baselines.keywords import with_keywords_of
+from sb3_actpc.common.checks import check_kinds, check_range
+from sb3_actpc.common.demonstrations import Demonstrations
+from sb3_actpc.common.episodes import map_observations
+
+OPTIMIZERS: dict[str, type[th.optim.Optimizer]] = {"adam": th.optim.Adam, "adamw": th.optim.AdamW}
+NETWORK_KEYWORDS = ("learning_rate", "optimizer", "optimizer_kwargs", "tau")
+
+
+@with_keywords_of(TD3)
+class TD3Demo(DemonstratedAlgorithm, TD3):
+    """
+    Stable-Baselines3's TD3 (Fujimoto et al., arXiv 1802.09477) with a share of demonstrations in every batch.
+
+    Without demonstrations and without ``actor_kwargs`` and ``critic_kwargs`` it is SB3's TD3, number by number.
+
+    :param policy: as SB3's
+    :param env: as SB3's
+    :param demonstrations: a path, or a :class:`~sb3_actpc.common.demonstrations.Demonstrations`; None learns without
+    :param n_demonstrations: use only the first so many episodes of them
+    :param n_demonstration_transitions: use only the first so many transitions
+    :param demonstration_fraction: share of each batch that comes from them; without demonstrations it has no effect
+    :param actor_kwargs: of the actor alone: ``learning_rate`` (a number; it follows the schedule of the algorithm's),
+        ``optimizer`` ("adam" or "adamw"), ``optimizer_kwargs`` and ``tau``
+    :param critic_kwargs: the same for the critic
+    :param options: further keywords of SB3's TD3
+    :raises ValueError: for a keyword with a value that is not allowed, for demonstrations that do not fit the environment
+    """
+
+    def __init__(
+        self,
+        policy: str | type[TD3Policy],
+        env: GymEnv | str | None,
+        *,
+        demonstrations: Demonstrations | str | Path | None = None,
+        n_demonstrations: int | None = None,
+        n_demonstration_transitions: int | None = None,
+        demonstration_fraction: float = 0.5,
+        actor_kwargs: dict[str, Any] | None = None,
+        critic_kwargs: dict[str, Any] | None = None,
+        _init_setup_model: bool = True,
+        **options: Any,
+    ) -> None:
+        check_kinds(locals(), mappings="actor_kwargs critic_kwargs")
+        check_range(locals(), "demonstration_fraction", 0, 1)
+        super().__init__(policy, env, _init_setup_model=False, **options)  # type: ignore[arg-type]
+        self._set_demonstrations(demonstrations, n_demonstrations, n_demonstration_transitions, demonstration_fraction)
+        self.actor_kwargs, self.critic_kwargs = actor_kwargs, critic_kwargs
+        if _init_setup_model:
+            self._setup_model()
+
+    def _setup_model(self) -> None:
+        super()._setup_model()
+        self._losses: dict[str, list[float]] = defaultdict(list)
+        for name, given in (("actor", self.actor_kwargs), ("critic", self.critic_kwargs)):
+            if given:
+                self._give_optimizer(name, given)
+
+    def _give_optimizer(self, name: str, given: dict[str, Any]) -> None:
+        unknown = sorted(set(given) - set(NETWORK_KEYWORDS))
+        if unknown:
+            raise ValueError(f"{name}_kwargs has unknown keys {unknown}: choose from {', '.join(NETWORK_KEYWORDS)}")
+        if given.get("optimizer", "adam") not in OPTIMIZERS:
+            raise ValueError(f"{name}_kwargs: optimizer={given['optimizer']!r} is unknown; choose one of {sorted(OPTIMIZERS)}")
+        check_kinds({"learning_rate": 0.0, "tau": self.tau, **given}, numbers="learning_rate tau")
+        network: BaseModel = getattr(self, name)
+        kind, options = self.policy.optimizer_class, self.policy.optimizer_kwargs
+        if "optimizer" in given:
+            kind, options = OPTIMIZERS[given["optimizer"]], {}
+        rate = given.get("learning_rate", self.lr_schedule(1.0))
+        options = {**options, **given.get("optimizer_kwargs", {})}
+        network.optimizer = kind(network.parameters(), lr=rate, **options)  # type: ignore[call-arg]
+
+    def _tau_of(self, given: dict[str, Any] | None) -> float:
+        return (given or {}).get("tau", self.tau)
+
+    def _update_learning_rate(self, optimizers: list[th.optim.Optimizer] | th.optim.Optimizer) -> None:
+        """SB3's schedule; a network's own learning rate falls as the schedule does."""
+        super()._update_learning_rate(optimizers)
+        start = self.lr_schedule(1.0)
+        progress = self.lr_schedule(self._current_progress_remaining) / start if start else 0.0
+        given = {id(self.actor.optimizer): self.actor_kwargs, id(self.critic.optimizer): self.critic_kwargs}
+        for optimizer in optimizers if isinstance(optimizers, Iterable) else [optimizers]:
+            own = (given.get(id(optimizer)) or {}).get("learning_rate")
+            if own is not None:
+                for group in optimizer.param_groups:
+                    group["lr"] = own * progress
+
+    # ------------------------------------------------------------------ learning
+
+    def train(self, gradient_steps: int, batch_size: int = 100) -> None:
+        """
+        TD3's updates.
+
+        :param gradient_steps: how many of the critic; the actor and the targets follow every ``policy_delay``
+        :param batch_size: B
+        """
+        assert self.replay_buffer is not None
+        self.policy.set_training_mode(True)
+        self._update_learning_rate([self.actor.optimizer, self.critic.optimizer])
+        for _ in range(gradient_steps):
+            self._n_updates += 1
+            batch = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
+            self._update_critic(batch)
+            if self._n_updates % self.policy_delay == 0:
+                self._update_actor(batch)
+                self._update_targets()
+        self._log_training()
+
+    def _update_critic(self, batch: Any) -> None:
+        targets = self._critic_targets(batch)
+        values = self.critic(batch.observations, batch.actions)
+        loss = self._critic_loss(th.stack(values), targets)
+        self._losses["critic_loss"].append(loss.item())
+        self.critic.optimizer.zero_grad()
+        loss.backward()
+        self.critic.optimizer.step()
+
+    def _critic_targets(self, batch: Any) -> th.Tensor:
+        """Clipped double Q-learning with target policy smoothing, (B, 1)."""
+        discounts = self.gamma if batch.discounts is None else batch.discounts
+        with th.no_grad():
+            noise = batch.actions.clone().normal_(0, self.target_policy_noise)
+            noise = noise.clamp(-self.target_noise_clip, self.target_noise_clip)
+            next_actions = (self.actor_target(batch.next_observations) + noise).clamp(-1, 1)
+            next_values = th.cat(self.critic_target(batch.next_observations, next_actions), dim=1).amin(dim=1, keepdim=True)
+            return batch.rewards + (1 - batch.dones) * discounts * next_values
+
+    def _critic_loss(self, values: th.Tensor, targets: th.Tensor) -> th.Tensor:
+        """
+        :param values: (n_critics, B, 1)
+        :param targets: (B, 1)
+        :return: mean squared error, summed over the critics
+        """
+        return sum((th.nn.functional.mse_loss(one, targets) for one in values), start=values.new_zeros(()))
+
+    def _update_actor(self, batch: Any) -> None:
+        loss = self._actor_loss(batch, self.actor(batch.observations))
+        self._losses["actor_loss"].append(loss.item())
+        self.actor.optimizer.zero_grad()
+        loss.backward()
+        self.actor.optimizer.step()
+
+    def _actor_loss(self, batch: Any, actions: th.Tensor) -> th.Tensor:
+        """
+        :param batch: B transitions
+        :param actions: (B, A), what the actor does in them
+        :return: minus the mean action-value
+        """
+        return -self.critic.q1_forward(batch.observations, actions).mean()
+
+    def _update_targets(self) -> None:
+        polyak_update(self.critic.parameters(), self.critic_target.parameters(), self._tau_of(self.critic_kwargs))
+        polyak_update(self.actor.parameters(), self.actor_target.parameters(), self._tau_of(self.actor_kwargs))
+        # running means of batch normalisation are copied, as in SB3
+        polyak_update(self.critic_batch_norm_stats, self.critic_batch_norm_stats_target, 1.0)
+        polyak_update(self.actor_batch_norm_stats, self.actor_batch_norm_stats_target, 1.0)
+
+    def _log_training(self) -> None:
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        for name, values in self._losses.items():
+            self.logger.record(f"train/{name}", np.mean(values))
+        self._losses.clear()
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_losses"]
+
+
+@with_keywords_of(TD3Demo)
+class DDPGDemo(TD3Demo):
+    """
+    DDPG with demonstrations (the paper's DDPG-Demo), after Nair et al., arXiv 1709.10089.
+
+    From there: demonstrations in every batch, a cloning loss on them, the Q-filter (only demonstrated actions that the critic
+    values above the actor's are cloned) and both weights (λ1 = 0.001 of the policy gradient, λ2 = 1 / 128 of the cloning loss
+    summed over 128 demonstrations, that is 1 of its mean). DDPG itself is SB3's: TD3 with one critic, no delay, no noise
+    in the targets. With ``cloning_weight=0`` and ``policy_gradient_weight=1`` it is SB3's DDPG.
+
+    Differences from Nair et al.:
+
+    1. Episodes start as the task starts them; theirs also start from demonstrated states.
+    2. No hindsight relabelling here; :class:`~sb3_actpc.baselines.HER` adds it.
+    3. Returns are one-step unless ``n_steps`` says otherwise.
+    4. No L2 penalty on weights; ``actor_kwargs`` can ask for AdamW's decay.
+
+    :param policy: as SB3's
+    :param env: as SB3's
+    :param policy_gradient_weight: λ1, of minus the mean action-value; 1 where nothing is cloned
+    :param cloning_weight: of the mean over the batch's demonstrations of the squared distance between action and
+        demonstrated action (scaled to [-1, 1], summed over its dimensions); 0 for none
+    :param q_filter: clone only what the critic values above the actor's own action
+    :param demonstration_fraction: share of each batch; Nair et al. take 128 of 1152
+    :param options: further keywords of :class:`TD3Demo`
+    :raises ValueError: as :class:`TD3Demo`
+    """
+
+    def __init__(
+        self,
+        policy: str | type[TD3Policy],
+        env: GymEnv | str | None,
+        *,
+        policy_gradient_weight: float = 0.001,
+        cloning_weight: float = 1.0,
+        q_filter: bool = True,
+        demonstration_fraction: float = 1 / 9,
+        policy_delay: int = 1,
+        target_policy_noise: float = 0.1,
+        target_noise_clip: float = 0.0,
+        policy_kwargs: dict[str, Any] | None = None,
+        **options: Any,
+    ) -> None:
+        check_kinds(locals(), numbers="policy_gradient_weight cloning_weight", mappings="policy_kwargs")
+        check_range(locals(), "policy_gradient_weight cloning_weight", 0)
+        self.policy_gradient_weight, self.cloning_weight, self.q_filter = policy_gradient_weight, cloning_weight, q_filter
+        super().__init__(
+            policy,
+            env,
+            demonstration_fraction=demonstration_fraction,
+            policy_delay=policy_delay,
+            target_policy_noise=target_policy_noise,
+            target_noise_clip=target_noise_clip,
+            policy_kwargs={"n_critics": 1, **(policy_kwargs or {})},
+            **options,
+        )
+
+    def _actor_loss(self, batch: Any, actions: th.Tensor) -> th.Tensor:
+        loss = super()._actor_loss(batch, actions)
+        n_demonstrated = self.replay_buffer.n_demonstrated(len(actions))  # type: ignore[union-attr]
+        if not (n_demonstrated and self.cloning_weight):
+            return loss
+        shown = slice(len(actions) - n_demonstrated, None)
+        distances = (actions[shown] - batch.actions[shown]).square().sum(dim=1, keepdim=True)
+        worth_it = self._worth_cloning(batch, actions, shown)
+        self._losses["cloned_share"].append(worth_it.mean().item())
+        return self.policy_gradient_weight * loss + self.cloning_weight * (distances * worth_it).mean()
+
+    def _worth_cloning(self, batch: Any, actions: th.Tensor, shown: slice) -> th.Tensor:
+        """The Q-filter: 1 where the critic values the demonstrated action above the actor's, (n_demonstrated, 1)."""
+        if not self.q_filter:
+            return th.ones_like(batch.rewards[shown])
+        rows = map_observations(lambda part: part[shown], batch.observations)
+        with th.no_grad():
+            theirs = self.critic.q1_forward(rows, batch.actions[shown])
+            return (theirs > self.critic.q1_forward(rows, actions[shown])).float()

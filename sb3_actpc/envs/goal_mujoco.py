@@ -1,0 +1,184 @@
+"""Goal versions of the sparse MuJoCo tasks, for hindsight experience replay (Andrychowicz et al., arXiv 1707.01495).
+
+Observations are dictionaries of ``observation``, ``achieved_goal`` and ``desired_goal``. The Reacher's goals are positions
+of its fingertip; what it observes of the target is in ``desired_goal`` alone, or a relabelled transition would still show the
+old one. The locomotion tasks have no goal of their own (the paper says so of HER): here it is the distance at which the
+``"displacement"`` condition begins to pay, and what is achieved is the distance from the start.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TYPE_CHECKING, Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+
+from sb3_actpc.envs import sparse_mujoco
+
+if TYPE_CHECKING:
+    from sb3_actpc.common.demonstrations import Demonstrations
+
+Observation = dict[str, np.ndarray]
+_REACHER_OWN = [0, 1, 2, 3, 6, 7]  # joint angles and velocities
+_REACHER_TARGET = slice(4, 6)
+_REACHER_DIFFERENCE = slice(8, 10)  # fingertip minus target; -v4 has its height too, always 0
+
+
+class GoalTask(gym.Wrapper[Any, np.ndarray, Any, np.ndarray]):
+    """
+    A sparse task as a goal task: the same physics, time limits and ``info``.
+
+    :param env: the sparse task
+    :param n_own: size of ``observation``
+    :param n_goal: size of a goal
+    """
+
+    def __init__(self, env: gym.Env[np.ndarray, np.ndarray], n_own: int, n_goal: int) -> None:
+        super().__init__(env)
+        sizes = {"observation": n_own, "achieved_goal": n_goal, "desired_goal": n_goal}
+        boxes: dict[str, spaces.Space[Any]] = {
+            key: spaces.Box(-np.inf, np.inf, (size,), np.float64) for key, size in sizes.items()
+        }
+        self.observation_space = spaces.Dict(boxes)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, dict[str, Any]]:
+        """
+        :param seed: as the sparse task's
+        :param options: likewise
+        :return: the dictionary, and the sparse task's info
+        """
+        observation, info = self.env.reset(seed=seed, options=options)
+        return self._goal_observation(observation), info
+
+    def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """
+        :param action: (action_dim,) within the action space
+        :return: as the sparse task's, with the dictionary and the reward of :meth:`compute_reward`
+        """
+        observation, _, terminated, truncated, info = self.env.step(action)
+        row = self._goal_observation(observation)
+        reward = self.compute_reward(row["achieved_goal"], row["desired_goal"], info)
+        return row, float(reward), terminated, truncated, info
+
+    def compute_reward(self, achieved_goal: np.ndarray, desired_goal: np.ndarray, info: Any) -> np.ndarray:
+        """
+        :param achieved_goal: (n_goal,), or (N, n_goal) for N transitions
+        :param desired_goal: likewise
+        :param info: not used
+        :return: rewards, () or (N,)
+        """
+        raise NotImplementedError
+
+    def demonstrated_rewards(self, demonstrations: Demonstrations) -> np.ndarray:
+        """The rewards of transitions that :meth:`goal_demonstrations` made: as they are, (N,)."""
+        return demonstrations.rewards
+
+    def goal_demonstrations(self, demonstrations: Demonstrations) -> Demonstrations:
+        """
+        Recorded transitions of the sparse task as transitions of this one.
+
+        :param demonstrations: N transitions of the sparse task; those of this one are returned as they are
+        :return: the same transitions, each observation the flattened dictionary, paid by :meth:`compute_reward`
+        :raises ValueError: when the recording does not tell what was achieved
+        """
+        spec = self.spec
+        env_id = demonstrations.env_id if spec is None else spec.id
+        if demonstrations.env_id.rpartition("-v")[0] == env_id.rpartition("-v")[0]:
+            return demonstrations
+        rows, next_rows = self._demonstrated_rows(demonstrations)
+        rewards = self.compute_reward(next_rows["achieved_goal"], next_rows["desired_goal"], None)
+        keys = sorted(next_rows)  # the order of a Dict space
+        return dataclasses.replace(
+            demonstrations,
+            observations=np.concatenate([rows[key] for key in keys], axis=1),
+            next_observations=np.concatenate([next_rows[key] for key in keys], axis=1),
+            rewards=rewards,
+            env_id=env_id,
+        )
+
+    def _goal_observation(self, observation: np.ndarray) -> Observation:
+        raise NotImplementedError
+
+    def _demonstrated_rows(self, demonstrations: Demonstrations) -> tuple[Observation, Observation]:
+        """Observations and next observations of N transitions, (N, size) each."""
+        raise NotImplementedError
+
+
+class GoalReacher(GoalTask):
+    """
+    Goals are positions of the fingertip in the plane, in metres, (2,).
+
+    :param env: a sparse Reacher; its threshold and ``miss_reward`` count
+    """
+
+    def __init__(self, env: gym.Env[np.ndarray, np.ndarray]) -> None:
+        super().__init__(env, len(_REACHER_OWN), 2)
+
+    def compute_reward(self, achieved_goal: np.ndarray, desired_goal: np.ndarray, info: Any) -> np.ndarray:
+        """1 at or below the threshold's distance, else ``miss_reward``; see :meth:`GoalTask.compute_reward`."""
+        task: Any = self.unwrapped
+        distances = np.linalg.norm(achieved_goal - desired_goal, axis=-1)
+        return np.where(distances <= task.threshold, 1.0, task.miss_reward)
+
+    def _goal_observation(self, observation: np.ndarray) -> Observation:
+        target = observation[..., _REACHER_TARGET]
+        return {
+            "observation": observation[..., _REACHER_OWN],
+            "achieved_goal": observation[..., _REACHER_DIFFERENCE] + target,
+            "desired_goal": target,
+        }
+
+    def _demonstrated_rows(self, demonstrations: Demonstrations) -> tuple[Observation, Observation]:
+        return self._goal_observation(demonstrations.observations), self._goal_observation(demonstrations.next_observations)
+
+
+class GoalLocomotion(GoalTask):
+    """
+    A goal is a distance from the start along x, in metres, (1,): reached, and paid, at or beyond it.
+
+    :param env: a sparse locomotion task with the ``"displacement"`` condition; its threshold is the goal
+    :raises ValueError: for another condition
+    """
+
+    def __init__(self, env: gym.Env[np.ndarray, np.ndarray]) -> None:
+        task: Any = env.unwrapped
+        if task.condition != "displacement":
+            raise ValueError(f"condition={task.condition!r} has no goal that is a position: leave it at 'displacement'")
+        super().__init__(env, int(np.prod(env.observation_space.shape or ())), 1)
+
+    def compute_reward(self, achieved_goal: np.ndarray, desired_goal: np.ndarray, info: Any) -> np.ndarray:
+        """1 at or beyond the desired distance, else 0; see :meth:`GoalTask.compute_reward`."""
+        return np.where((achieved_goal >= desired_goal)[..., 0], 1.0, 0.0)
+
+    def _goal_observation(self, observation: np.ndarray) -> Observation:
+        task: Any = self.unwrapped
+        travelled = np.array([task.data.qpos[0] - task._start_x])
+        return {"observation": observation, "achieved_goal": travelled, "desired_goal": np.array([task.distance])}
+
+    def _demonstrated_rows(self, demonstrations: Demonstrations) -> tuple[Observation, Observation]:
+        if demonstrations.dense_rewards is None:
+            raise ValueError(
+                f"demonstrations of {demonstrations.env_id}: dense_rewards are missing, from which the distance travelled is "
+                "computed: record them again (sb3-actpc demos collect)"
+            )
+        task: Any = self.unwrapped
+        moved = task._demonstrated_velocities(demonstrations) * task.dt
+        after = np.concatenate([np.cumsum(moved[start:end]) for start, end in demonstrations.episode_bounds])
+        desired = np.full((len(after), 1), task.distance)
+        rows = {"observation": demonstrations.observations, "achieved_goal": (after - moved)[:, None], "desired_goal": desired}
+        return rows, {**rows, "observation": demonstrations.next_observations, "achieved_goal": after[:, None]}
+
+
+def make_goal_env(task: str, **kwargs: Any) -> GoalTask:
+    """
+    Entry point of the ids ``Goal...``.
+
+    :param task: class in :mod:`sb3_actpc.envs.sparse_mujoco`, such as ``"SparseHopperV5Env"``
+    :param kwargs: its keywords
+    :return: the goal task
+    :raises ValueError: for a keyword that the task does not take
+    """
+    env = getattr(sparse_mujoco, task)(**kwargs)
+    return GoalReacher(env) if isinstance(env, sparse_mujoco.SparseReacherEnv) else GoalLocomotion(env)

@@ -1,0 +1,95 @@
+"""The environments of a run: one way to make them, whatever the algorithm."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import io
+from collections.abc import Mapping
+from typing import Any
+
+import gymnasium as gym
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecNormalize
+
+MAX_EVALUATION_ENVS = 10
+
+
+def make_env(env_id: str, env_kwargs: Mapping[str, Any], render_mode: str | None = None) -> gym.Env[Any, Any]:
+    """Make an environment, this package's tasks included.
+
+    :param env_id: Gymnasium id
+    :param env_kwargs: its keywords
+    :param render_mode: Gymnasium's render mode, or None
+    :return: the environment
+    :raises gymnasium.error.Error: when the id is unknown
+    :raises ValueError: when it does not take the keywords
+    """
+    register_tasks(env_id)
+    options = dict(env_kwargs) if render_mode is None else {**env_kwargs, "render_mode": render_mode}
+    try:
+        return gym.make(env_id, **options)
+    except TypeError as error:
+        raise ValueError(f"{env_id}: {error}") from error
+
+
+def make_eval_envs(env_id: str, env_kwargs: Mapping[str, Any], n_episodes: int) -> list[gym.Env[Any, Any]]:
+    """As many environments as episodes are played side by side.
+
+    :param env_id: Gymnasium id
+    :param env_kwargs: its keywords
+    :param n_episodes: how many episodes will be played
+    :return: at most ``MAX_EVALUATION_ENVS`` environments
+    """
+    return [make_env(env_id, env_kwargs) for _ in range(min(n_episodes, MAX_EVALUATION_ENVS))]
+
+
+def make_train_env(
+    env_id: str, env_kwargs: Mapping[str, Any], n_envs: int, seed: int, normalize: Mapping[str, Any] | None = None
+) -> VecEnv:
+    """The environment that an agent learns in: SB3's ``Monitor`` and ``DummyVecEnv``.
+
+    Several of robosuite's are put into processes of their own (``SubprocVecEnv``): a step there takes longer than an update,
+    one of a MuJoCo task less than the way to another process.
+
+    :param env_id: Gymnasium id
+    :param env_kwargs: its keywords
+    :param n_envs: how many side by side
+    :param seed: the first's; the others have those that follow
+    :param normalize: keywords of SB3's ``VecNormalize`` around it, or None for none
+    :return: the environment
+    :raises gymnasium.error.Error: when the id is unknown
+    :raises ValueError: when it does not take the keywords
+    """
+    from sb3_actpc.envs import ROBOSUITE_IDS
+
+    in_processes = n_envs > 1 and env_id.rpartition(":")[2] in ROBOSUITE_IDS
+    kind: type[VecEnv] = SubprocVecEnv if in_processes else DummyVecEnv
+    arguments = {"env_id": env_id, "env_kwargs": env_kwargs}
+    env = make_vec_env(make_env, n_envs=n_envs, seed=seed, env_kwargs=arguments, vec_env_cls=kind)  # type: ignore[arg-type]
+    return env if normalize is None else VecNormalize(env, **normalize)
+
+
+def register_tasks(env_id: str) -> None:
+    """Register this package's tasks with Gymnasium (again does no harm), and those of gymnasium-robotics where they are meant.
+
+    :param env_id: Gymnasium id
+    """
+    from sb3_actpc.envs import register_envs
+
+    register_envs()
+    if ":" not in env_id and env_id not in gym.registry:
+        # not installed: Gymnasium will say that the id is unknown; installed: it prints a note on tasks of another kind
+        with contextlib.suppress(ImportError), contextlib.redirect_stderr(io.StringIO()):
+            importlib.import_module("gymnasium_robotics")
+
+
+def check_env_id(env_id: str) -> None:
+    """Check that an environment is registered; ids with a module (``module:Name-v0``) are left to ``gymnasium.make``.
+
+    :param env_id: Gymnasium id
+    :raises gymnasium.error.Error: when it is unknown
+    """
+    register_tasks(env_id)
+    if ":" not in env_id:
+        gym.spec(env_id)

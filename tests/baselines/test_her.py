@@ -1,0 +1,268 @@
+"""Hindsight replay: the goal tasks, the priorities, the exploration, and that it learns what it is made for."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3.common.env_checker import check_env
+from stable_baselines3.common.env_util import make_vec_env
+
+from sb3_actpc import ActPC
+from sb3_actpc.baselines import HER
+from sb3_actpc.baselines.prioritized import PrioritizedHerReplayBuffer, SumTree
+from sb3_actpc.common.demonstration_buffers import fit_demonstrations
+from sb3_actpc.envs import GOAL_MUJOCO_IDS, sparse_env_id
+from sb3_actpc.training import RunConfig, train_run
+from tests.checkpoints.runs import assert_same, learn_in_two, learn_straight
+from tests.recordings import record
+
+pytestmark = pytest.mark.filterwarnings("ignore:.*out of date.*", "ignore:.*infinity.*")
+SMALL = {"policy_kwargs": {"net_arch": [16]}, "batch_size": 16, "buffer_size": 200, "seed": 1, "learning_starts": 0}
+
+
+# ---------------------------------------------------------------------- goal tasks
+
+
+@pytest.mark.parametrize("env_id", GOAL_MUJOCO_IDS)
+def test_a_goal_task_is_its_sparse_task_with_goals(env_id: str) -> None:
+    """Same states, same pay, same ends; the goals alone decide the pay."""
+    goal, sparse = gym.make(env_id), gym.make(sparse_env_id(env_id))
+    check_env(goal, skip_render_check=True)
+    row, _ = goal.reset(seed=3)
+    observation, _ = sparse.reset(seed=3)
+    goal.action_space.seed(3)
+    for _ in range(30):
+        assert np.isin(row["observation"], observation).all()
+        action = goal.action_space.sample()
+        row, reward, terminated, truncated, info = goal.step(action)
+        observation, paid, *ends, expected = sparse.step(action)
+        assert reward == paid
+        assert [terminated, truncated] == ends and info["dense_reward"] == expected["dense_reward"]
+        assert reward == goal.get_wrapper_attr("compute_reward")(row["achieved_goal"], row["desired_goal"], {})
+        # what was achieved would have been paid as a goal
+        assert goal.get_wrapper_attr("compute_reward")(row["achieved_goal"], row["achieved_goal"], {}) == 1.0
+        if terminated or truncated:
+            break
+    goal.close()
+    sparse.close()
+
+
+def test_what_the_reacher_observes_of_its_target_is_in_the_goal_alone() -> None:
+    """Or a relabelled transition would show two targets."""
+    env = gym.make("GoalReacher-v5")
+    observe = env.get_wrapper_attr("_goal_observation")
+    env.reset(seed=0)
+    task = env.unwrapped
+    before = observe(task._get_obs())
+    task.set_state(task.data.qpos + np.array([0, 0, 0.05, 0.05]), task.data.qvel)
+    after = observe(task._get_obs())
+    assert np.array_equal(before["observation"], after["observation"])
+    assert not np.array_equal(before["desired_goal"], after["desired_goal"])
+    assert after["desired_goal"] == pytest.approx(task.get_body_com("target")[:2])
+    assert after["achieved_goal"] == pytest.approx(task.get_body_com("fingertip")[:2])
+    env.close()
+
+
+def test_a_condition_without_a_position_has_no_goal_version() -> None:
+    with pytest.raises(ValueError, match="condition='forward' has no goal"):
+        gym.make("GoalHopper-v5", condition="forward")
+
+
+@pytest.mark.parametrize("env_id", ["GoalReacher-v5", "GoalReacher-v4", "GoalHopper-v5", "GoalSwimmer-v4"])
+def test_demonstrations_of_the_sparse_task_become_those_that_the_goal_task_records(env_id: str) -> None:
+    """The same random actions from the same seeds, recorded in both."""
+    env = make_vec_env(env_id)
+    shown = fit_demonstrations(record(sparse_env_id(env_id)), env, env.observation_space, env.action_space)
+    live = gym.make(env_id, max_episode_steps=12)
+    live.action_space.seed(0)
+    rows, rewards = [], []
+    for episode in range(2):
+        row, _ = live.reset(seed=episode)
+        done = False
+        while not done:
+            rows.append(gym.spaces.flatten(live.observation_space, row))
+            row, reward, terminated, truncated, _ = live.step(live.action_space.sample())
+            rewards.append(reward)
+            done = terminated or truncated
+    assert shown.env_id == env_id
+    assert shown.observations == pytest.approx(np.array(rows), abs=1e-4)
+    assert shown.rewards.tolist() == rewards
+    again = fit_demonstrations(shown, env, env.observation_space, env.action_space)
+    assert np.array_equal(again.observations, shown.observations) and again.env_id == env_id
+    env.close()
+    live.close()
+
+
+# ---------------------------------------------------------------------- priorities
+
+
+def test_the_tree_sums_and_draws_in_proportion() -> None:
+    tree = SumTree(5)
+    tree[np.arange(5)] = np.array([1.0, 0.0, 2.0, 4.0, 1.0])
+    tree[np.array([4, 4])] = np.array([3.0, 1.0])
+    assert tree.total == 8.0 and tree[np.array([3, 4])].tolist() == [4.0, 1.0]
+    counts = np.bincount(np.concatenate([tree.draw(64) for _ in range(100)]), minlength=5) / 6400
+    # each draw comes from a part of the total of its own: the shares are all but exact
+    assert counts == pytest.approx([1 / 8, 0, 2 / 8, 4 / 8, 1 / 8], abs=0.01)
+
+
+def goal_buffer(size: int = 40, **options: float) -> PrioritizedHerReplayBuffer:
+    env = make_vec_env("GoalReacher-v5")
+    return PrioritizedHerReplayBuffer(
+        size, env.observation_space, env.action_space, env, n_sampled_goal=1, goal_selection_strategy="final", **options
+    )
+
+
+def add_episode(buffer: PrioritizedHerReplayBuffer, number: int, length: int) -> None:
+    """Its transitions achieve (number, step) and wish for (0, 0)."""
+    for step in range(length):
+        goal = np.array([[number, step]], dtype=float)
+        row = {"observation": np.zeros((1, 6)), "achieved_goal": goal - [[0, 1]], "desired_goal": np.zeros((1, 2))}
+        done = np.array([step == length - 1])
+        buffer.add(row, {**row, "achieved_goal": goal}, np.zeros((1, 2)), np.zeros(1), done, [{}])
+
+
+def test_every_transition_is_there_twice_with_its_own_and_with_its_episodes_last_goal() -> None:
+    buffer = goal_buffer()
+    add_episode(buffer, 1, 4)
+    add_episode(buffer, 2, 6)
+    add_episode(buffer, 3, 2)
+    batch = buffer.sample(240)
+    wished = [tuple(goal) for goal in batch.observations["desired_goal"].tolist()]
+    assert sorted(set(wished)) == [(0, 0), (1, 3), (2, 5), (3, 1)]
+    for goal, share in (((0, 0), 0.5), ((1, 3), 4 / 24), ((2, 5), 6 / 24), ((3, 1), 2 / 24)):
+        assert wished.count(goal) / 240 == pytest.approx(share, abs=0.02)
+    assert (buffer.importance_weights == 1).all()  # new transitions all have the same priority
+    reached = (batch.next_observations["achieved_goal"] == batch.observations["desired_goal"]).all(dim=1)
+    assert (batch.rewards[reached] == 1).all()
+
+
+def test_transitions_are_drawn_by_their_errors_and_weighed_against_it() -> None:
+    buffer = goal_buffer(alpha=0.5, beta=0.4, beta_increment=0.1, epsilon=0.0)
+    add_episode(buffer, 1, 10)
+    buffer.sample(20)
+    assert sorted(buffer._drawn) == list(range(20))  # all equal: each is drawn once
+    errors = np.where(buffer._drawn == 4, -16.0, 1.0)
+    buffer.update_priorities(errors)  # priorities 4 and 1
+    batch = buffer.sample(2300)
+    drawn = np.bincount(buffer._drawn, minlength=20)
+    assert drawn[4] / 2300 == pytest.approx(4 / 23, abs=0.005)
+    weights = buffer.importance_weights.flatten()[th.as_tensor(buffer._drawn == 4)]
+    assert weights == pytest.approx(np.full(len(weights), 4**-0.5))  # beta was 0.4 and is 0.5
+    assert len(batch.rewards) == 2300
+    assert buffer.beta == pytest.approx(0.6)
+    add_episode(buffer, 2, 1)
+    assert buffer.priorities[10, 0].tolist() == [4.0, 4.0]
+
+
+def test_an_overwritten_episode_is_drawn_no_more() -> None:
+    buffer = goal_buffer(size=10)
+    add_episode(buffer, 1, 6)
+    add_episode(buffer, 2, 4)
+    add_episode(buffer, 3, 2)  # overwrites the first two steps of the first episode: all of it goes
+    for _ in range(20):
+        numbers = buffer.sample(32).next_observations["achieved_goal"][:, 0]
+        assert set(numbers.tolist()) <= {2.0, 3.0}
+    leaves = buffer._tree[np.arange(20)].reshape(10, 1, 2)
+    assert np.array_equal(leaves, buffer.priorities)
+    assert np.array_equal(leaves[:, 0, 0] > 0, buffer.ep_length[:, 0] > 0)
+
+
+def test_nothing_can_be_drawn_before_an_episode_has_ended() -> None:
+    with pytest.raises(RuntimeError, match="no whole episode"):
+        goal_buffer().sample(4)
+
+
+# ---------------------------------------------------------------------- the algorithm
+
+
+def make(**options: object) -> HER:
+    return HER("MultiInputPolicy", "GoalReacher-v5", **{**SMALL, "demonstrations": record("SparseReacher-v5"), **options})
+
+
+def test_random_actions_become_rarer_down_to_their_smallest_share() -> None:
+    model = make(demonstrations=None, random_action_decay=0.99)
+    model.actor.load_state_dict({name: 0 * value for name, value in model.actor.state_dict().items()})  # always acts 0
+    model._last_obs = model.env.reset()
+    for steps, share in ((0, 1.0), (50, 0.99**50), (1000, 0.32)):
+        model.num_timesteps = steps
+        assert model.random_action_probability == pytest.approx(share)
+        random = np.mean([bool(model._sample_action(0)[0].any()) for _ in range(600)])
+        assert random == pytest.approx(share, abs=0.06)
+
+
+@pytest.mark.parametrize("prioritized", [True, False])
+def test_it_learns_from_its_own_episodes_and_from_demonstrations_with_relabelled_goals(prioritized: bool) -> None:
+    model = make(prioritized=prioritized, cloning_weight=1.0)
+    model.learn(49)
+    assert model._n_updates == 0  # no episode has ended
+    model.learn(5, reset_num_timesteps=False)
+    assert model._n_updates > 0
+    shown = model.replay_buffer.demonstrated.sample(200)
+    ends = record("SparseReacher-v5").next_observations[[11, 23]]
+    last = {tuple(np.round(row[8:10] + row[4:6], 4)) for row in ends.astype(np.float64)}
+    relabelled = {tuple(np.round(goal, 4)) for goal in shown.observations["desired_goal"][100:].double().numpy()}
+    assert relabelled == last
+
+
+def test_the_loss_is_weighed_and_the_priorities_follow_the_errors() -> None:
+    model = make(demonstration_fraction=0.5)
+    model.learn(50)
+    buffer = model.replay_buffer
+    buffer.sample(16)
+    buffer.importance_weights = th.linspace(0.1, 0.8, 8)[:, None]
+    values, targets = th.randn(1, 16, 1), th.randn(16, 1)
+    expected = th.cat([buffer.importance_weights, th.ones(8, 1)])
+    assert model._critic_loss(values, targets).item() == pytest.approx((expected * (values[0] - targets) ** 2).mean().item())
+    stored = buffer.priorities.reshape(-1)[buffer._drawn[-1]]
+    assert stored == pytest.approx((abs(float(values[0, 7] - targets[7])) + 0.01) ** 0.6, rel=1e-5)
+
+
+def test_a_stopped_run_goes_on_bit_for_bit(tmp_path) -> None:
+    straight = learn_straight(make, tmp_path / "straight", 120)
+    resumed = learn_in_two(make, tmp_path / "two", 120, 75)
+    assert_same(straight, resumed)
+    mine, theirs = straight.replay_buffer, resumed.replay_buffer
+    assert (mine.beta, mine.largest_priority) == (theirs.beta, theirs.largest_priority)
+    assert np.array_equal(mine._tree.nodes, theirs._tree.nodes)
+
+
+def test_a_task_without_goals_is_refused() -> None:
+    with pytest.raises(ValueError, match="such as GoalReacher-v5"):
+        HER("MlpPolicy", "SparseReacher-v5")
+
+
+def test_actpc_runs_on_the_same_goal_task_and_demonstrations() -> None:
+    model = ActPC(
+        "MultiInputPolicy",
+        "GoalReacher-v5",
+        replay_buffer_class="HerReplayBuffer",
+        demonstrations=record("SparseReacher-v5"),
+        learning_starts=50,
+        batch_size=16,
+        settling="scheduled",
+        prior_updates=2,
+        policy_kwargs={"net_arch": [8]},
+        seed=0,
+    )
+    model.learn(55)
+    assert model._n_updates == 5
+    assert model.expert.demonstrations.env_id == "GoalReacher-v5"
+
+
+def test_actpc_and_her_run_on_fetch(tmp_path) -> None:
+    pytest.importorskip("gymnasium_robotics")
+    for algo, more in (("her", {}), ("actpc", {"policy": "MultiInputPolicy", "replay_buffer_class": "HerReplayBuffer"})):
+        overrides = {"learning_starts": 50, "batch_size": 16, "policy_kwargs": {"net_arch": [8]}, "buffer_size": 100, **more}
+        options = {"overrides": overrides, "progress": False, "eval_episodes": 1, "output": str(tmp_path / algo)}
+        result = train_run(RunConfig("FetchReach-v4", algo, n_timesteps=55, eval_freq=55, checkpoint_freq=0, **options))
+        assert result["success_rate"] in (0.0, 1.0) and result["timesteps"] == 55
+
+
+@pytest.mark.slow
+def test_her_solves_fetch_reach_within_its_20000_steps(tmp_path) -> None:
+    """At least 90 % of 50 episodes, as every working HER does."""
+    pytest.importorskip("gymnasium_robotics")
+    config = RunConfig("FetchReach-v4", "her", eval_episodes=50, progress=False, output=str(tmp_path / "run"))
+    result = train_run(config, print)
+    assert result["success_rate"] >= 0.9
