@@ -9,9 +9,7 @@ Training writes whole checkpoints, each one complete or absent, so a stopped run
 
 import json
 import shutil
-from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +27,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from torch import nn
 
 from sb3_actpc.common.demonstrations import Demonstrations
+from sb3_actpc.demonstrations.recording import Report, join_episodes, record_successes, silent
 from sb3_actpc.envs import dense_env_id
 
 EXPERT_ALGORITHMS: dict[str, type[BaseAlgorithm]] = {"ppo": PPO, "td3": TD3, "sac": SAC}
@@ -36,12 +35,6 @@ DEFAULT_EXPERT_EPISODES = 2000  # of the paper's demonstrators
 N_EVALUATION_EPISODES = 10  # enough to notice a policy that falls over now and then
 _ACTIVATIONS: dict[str, type[nn.Module]] = {"relu": nn.ReLU, "tanh": nn.Tanh}
 _CHECKPOINT_PREFIX = "step_"
-
-Report = Callable[[str], None]
-
-
-def _silent(_: str) -> None:
-    """Drop a progress line."""
 
 
 @dataclass(frozen=True)
@@ -86,6 +79,9 @@ class Expert:
     normalization: VecNormalize | None
     n_steps: int
     mean_return: float
+
+    def start(self, seed: int) -> None:
+        """A new episode begins; a deterministic policy has nothing to prepare."""
 
     def predict(self, observation: np.ndarray) -> np.ndarray:
         """Deterministic action in the environment's units.
@@ -284,7 +280,7 @@ def train_expert(
     work_dir: str | Path,
     save_every: int = 50_000,
     target_return: float | None = None,
-    report: Report = _silent,
+    report: Report = silent,
 ) -> Expert:
     """Train an expert on the dense task, or go on from the newest checkpoint in ``work_dir``.
 
@@ -363,7 +359,7 @@ def collect_demonstrations(
     seed: int = 0,
     max_tries: int | None = None,
     metadata: dict[str, Any] | None = None,
-    report: Report = _silent,
+    report: Report = silent,
 ) -> Demonstrations:
     """Roll out an expert's deterministic policy in the sparse task and keep the successful episodes.
 
@@ -378,54 +374,16 @@ def collect_demonstrations(
         dense rewards (N,), all float32
     :raises ValueError: if fewer than ``n_episodes`` of ``max_tries`` episodes succeed, or ``n_episodes`` is below 1
     """
-    if n_episodes < 1:
-        raise ValueError(f"n_episodes={n_episodes} must be at least 1: give the number of demonstrated episodes")
-    max_tries = 10 * n_episodes if max_tries is None else max_tries
     env = gym.make(env_id)
-    episodes: list[dict[str, np.ndarray]] = []
-    n_tries = 0
-    while len(episodes) < n_episodes and n_tries < max_tries:
-        episode, success = _play_episode(expert, env, seed + n_tries)
-        n_tries += 1
-        if success:
-            episodes.append(episode)
-            sparse, dense = episode["rewards"].sum(), episode["dense_rewards"].sum()
-            report(f"episode {len(episodes)}/{n_episodes} (try {n_tries}): sparse return {sparse:.1f}, dense {dense:.1f}")
-    env.close()
-    if len(episodes) < n_episodes:
-        raise ValueError(
-            f"only {len(episodes)} of {n_tries} episodes succeeded in {env_id}, {n_episodes} are needed: "
-            "train the expert longer (--steps) or ask for fewer episodes (--episodes)"
-        )
-    columns = {key: np.concatenate([episode[key] for episode in episodes]) for key in episodes[0]}
-    lengths = [len(episode["rewards"]) for episode in episodes]
+    try:
+        episodes, n_tries = record_successes([expert], env, n_episodes, seed, max_tries, report)
+    finally:
+        env.close()
     kept = {
         "seed": seed,
         "n_tries": n_tries,
         "expert_steps": expert.n_steps,
         "expert_mean_dense_return": expert.mean_return,
-        "gymnasium": version("gymnasium"),
-        "mujoco": version("mujoco"),
         **(metadata or {}),
     }
-    starts = np.cumsum([0, *lengths[:-1]]).astype(np.int64)
-    return Demonstrations(**columns, episode_starts=starts, env_id=env_id, metadata=kept)
-
-
-def _play_episode(expert: Expert, env: gym.Env, seed: int) -> tuple[dict[str, np.ndarray], bool]:
-    """One episode as columns, and whether it ended in success."""
-    rows: dict[str, list[Any]] = {
-        key: [] for key in ("observations", "actions", "next_observations", "rewards", "terminations", "dense_rewards")
-    }
-    observation, info = env.reset(seed=seed)
-    done = False
-    while not done:
-        action = expert.predict(observation)
-        next_observation, reward, terminated, truncated, info = env.step(action)
-        values = (observation, action, next_observation, reward, terminated, info["dense_reward"])
-        for column, value in zip(rows.values(), values, strict=True):
-            column.append(value)
-        observation, done = next_observation, terminated or truncated
-    columns = {key: np.asarray(column, dtype=np.float32) for key, column in rows.items()}
-    columns["terminations"] = np.asarray(rows["terminations"], dtype=bool)
-    return columns, bool(info["is_success"])
+    return join_episodes(episodes, env_id, kept, packages=("gymnasium", "mujoco"))

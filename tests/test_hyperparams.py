@@ -8,7 +8,7 @@ import pytest
 import torch as th
 import yaml
 
-from sb3_actpc.envs import register_envs, sparse_env_id
+from sb3_actpc.envs import ROBOSUITE_IDS, register_envs, sparse_env_id
 from sb3_actpc.training import ALGORITHMS, RunConfig
 from sb3_actpc.training.config import HYPERPARAMS_FOLDERS, resolve_run
 from sb3_actpc.training.environments import make_train_env, register_tasks
@@ -61,6 +61,8 @@ def test_every_entry_builds_its_agent_which_trains(preset: str, key: str, record
     register_tasks(env_id)
     if env_id not in gym.registry:
         pytest.skip(f"{env_id} is not registered")
+    if env_id in ROBOSUITE_IDS:
+        pytest.importorskip("robosuite", reason="robosuite is an extra")
     sparse = sparse_env_id(env_id)
     demonstrations = str(record_file(recordings, sparse, N_EPISODES)) if sparse.startswith("Sparse") else "none"
     n_steps = 16 if algo in ("logo", "ppo") else 3

@@ -10,7 +10,7 @@ import pytest
 
 PACKAGE = Path(__file__).resolve().parents[1] / "sb3_actpc"
 # each is large, or an extra that may not be installed
-LAZY = ("minari", "ray", "rl_zoo3", "robosuite", "scipy")
+LAZY = ("h5py", "minari", "ray", "rl_zoo3", "robosuite", "scipy")
 HEAVY = (
     "torch",
     "stable_baselines3",
@@ -18,6 +18,7 @@ HEAVY = (
     "mujoco",
     "sb3_actpc.actpc",
     "sb3_actpc.comparison",
+    "sb3_actpc.demonstrations",
     "sb3_actpc.experts",
     "sb3_actpc.ngc",
     "sb3_actpc.training",
@@ -103,6 +104,13 @@ def test_common_does_not_import_what_is_built_on_it(forbidden: str) -> None:
 @pytest.mark.parametrize("forbidden", ["torch", "stable_baselines3", "sb3_actpc.actpc", "sb3_actpc.ngc", "sb3_actpc.cli"])
 def test_envs_know_neither_torch_nor_the_agent(forbidden: str) -> None:
     assert [entry for entry in imports_in("sb3_actpc.envs") if is_within(entry.target, forbidden)] == []
+
+
+@pytest.mark.parametrize(
+    "forbidden", ["torch", "stable_baselines3", "sb3_actpc.actpc", "sb3_actpc.experts", "sb3_actpc.training"]
+)
+def test_demonstrations_know_neither_torch_nor_the_agent(forbidden: str) -> None:
+    assert [entry for entry in imports_in("sb3_actpc.demonstrations") if is_within(entry.target, forbidden)] == []
 
 
 @pytest.mark.parametrize("package", ["sb3_actpc.actpc", "sb3_actpc.ngc"])

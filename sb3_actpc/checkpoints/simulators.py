@@ -14,6 +14,8 @@ from sb3_actpc.checkpoints.encoding import Decoder, Encoder, OpaqueValue
 # buffers of the current step, and what the constructors make anew
 _SKIPPED = {"venv", "env", "class_attributes", "results_writer", "obs_spaces", "metadata", "_metadata", "spec", "_cached_spec"}
 _SKIPPED_WALL_TIME = {"t_start"}
+# under this name, what an environment's own checkpoint_state() returned
+_OWN_STATE = "checkpoint_state()"
 _DUMMY_SKIPPED = {"envs", "buf_infos", "reset_infos", "keys", "actions"}
 _IN_ARENA = ("efc_", "contact", "iefc_", "iM", "iLD", "iacc", "ifrc_")  # of MuJoCo's data
 
@@ -105,15 +107,21 @@ def _capture_env(env: gym.Env[Any, Any], encoder: Encoder, where: str) -> dict[s
     record: dict[str, Any] = {"classes": [type(layer).__qualname__ for layer in layers], "layers": []}
     for depth, layer in enumerate(layers):
         attributes: dict[str, Any] = {}
-        for name, value in vars(layer).items():
-            if name in _SKIPPED or name in _SKIPPED_WALL_TIME:
-                continue
+        for name, value in _layer_values(layer).items():
             try:
                 attributes[name] = _encode_attribute(layer, name, value, encoder, f"{where}.{depth}.{name}")
             except OpaqueValue as error:
                 record.setdefault("reason", str(error))
         record["layers"].append(attributes)
     return record
+
+
+def _layer_values(layer: gym.Env[Any, Any]) -> dict[str, Any]:
+    """What to store of an environment or a wrapper: its attributes and, first, what it says of the objects that it hides
+    (``checkpoint_state()``; the attributes named in ``checkpoint_skipped`` hold them)."""
+    skipped = {*_SKIPPED, *_SKIPPED_WALL_TIME, *getattr(layer, "checkpoint_skipped", ())}
+    own = {_OWN_STATE: layer.checkpoint_state()} if hasattr(layer, "checkpoint_state") else {}
+    return own | {name: value for name, value in vars(layer).items() if name not in skipped}
 
 
 def _encode_attribute(layer: Any, name: str, value: Any, encoder: Encoder, where: str) -> Any:
@@ -134,7 +142,9 @@ def _restore_env(env: gym.Env[Any, Any], entry: dict[str, Any], decoder: Decoder
         for name, node in attributes.items():
             if generators_only and not _is_generator(node):
                 continue
-            if isinstance(node, dict) and "physics" in node:
+            if name == _OWN_STATE:
+                layer.restore_checkpoint_state(decoder.decode(node))  # type: ignore[attr-defined]
+            elif isinstance(node, dict) and "physics" in node:
                 data = getattr(layer, name)
                 restore_physics(data.model, data, decoder.decode(node["physics"]))
             else:

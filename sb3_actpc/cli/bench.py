@@ -1,4 +1,5 @@
-"""``sb3-actpc bench``: what one update costs, as ratios to SB3's TD3 and to the matrix products alone."""
+"""``sb3-actpc bench``: what one update costs, as ratios to SB3's TD3 and to the matrix products alone; with ``--robosuite``,
+the speed of the robosuite tasks as a ratio to robosuite's own loop."""
 
 from __future__ import annotations
 
@@ -15,6 +16,7 @@ TASK = "SparseHalfCheetah-v5"
 BATCH_SIZE = 256
 WIDTH = 256
 N_FILLED = 1000
+N_ENV_STEPS = 20
 
 
 def add_parser(subparsers: Any) -> None:
@@ -23,6 +25,7 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument("--rounds", type=int, default=40, help="interleaved measurements of every entry")
     parser.add_argument("--threads", type=int, default=None, help="torch threads (default: torch's own choice)")
     parser.add_argument("--device", default="cpu", help="torch device")
+    parser.add_argument("--robosuite", action="store_true", help="time the robosuite tasks instead")
     parser.set_defaults(run=run)
 
 
@@ -33,6 +36,7 @@ def run(args: argparse.Namespace) -> int:
     :param args: the parsed command line
     :return: the exit code
     :raises ValueError: when a number is too small
+    :raises ImportError: when ``--robosuite`` is asked for and not installed
     """
     import torch as th
 
@@ -40,6 +44,9 @@ def run(args: argparse.Namespace) -> int:
         raise ValueError(f"--rounds {args.rounds} and --threads {args.threads} must be at least 1")
     if args.threads is not None:
         th.set_num_threads(args.threads)
+    if args.robosuite:
+        _bench_robosuite(args.rounds)
+        return 0
     entries: dict[str, Callable[[], object]] = {"SB3 TD3 train()": _stepper(_td3(args.device))}
     for name, keywords in _settings().items():
         entries[name] = _stepper(_actpc(keywords, args.device))
@@ -145,6 +152,38 @@ def _print(times: dict[str, list[float]], threads: int, device: str) -> None:
         base, unit = (floor, "the products") if "settling" in name else (reference, "TD3")
         ratio = statistics.median(a / b for a, b in zip(own, base, strict=True))
         print(f"{name:46s} {ratio:6.2f} x {unit}")
+
+
+def _bench_robosuite(rounds: int) -> None:
+    """Steps and resets of both tasks, interleaved with those of robosuite's own environment at its defaults."""
+    from sb3_actpc.envs.robosuite_layouts import ROBOSUITE_TASKS
+
+    print(f"medians of {rounds} interleaved rounds of {N_ENV_STEPS} steps and a reset")
+    for env_id, task in ROBOSUITE_TASKS.items():
+        times = _interleave(_robosuite_entries(env_id, task.name), rounds, synchronize=lambda: None)
+        medians = {name: statistics.median(values) for name, values in times.items()}
+        ratio = statistics.median(a / b for a, b in zip(times["robosuite's steps"], times["our steps"], strict=True))
+        print(
+            f"{env_id}: {N_ENV_STEPS / medians['our steps']:.0f} steps/s, {ratio:.2f} x robosuite's own; "
+            f"a reset takes {1000 * medians['our reset']:.1f} ms, robosuite's {1000 * medians['robosuite reset']:.0f} ms"
+        )
+
+
+def _robosuite_entries(env_id: str, name: str) -> dict[str, Callable[[], object]]:
+    import gymnasium as gym
+    import numpy as np
+
+    from sb3_actpc.envs.robosuite_tasks import make_simulation
+
+    env, theirs = gym.make(env_id, horizon=10**9), make_simulation(name, use_object_obs=True, hard_reset=True)
+    env.reset(seed=0)
+    actions = np.random.default_rng(0).uniform(-0.3, 0.3, (N_ENV_STEPS, 7))
+    return {
+        "our steps": lambda: [env.step(action) for action in actions],
+        "robosuite's steps": lambda: [theirs.step(action) for action in actions],
+        "our reset": env.reset,
+        "robosuite reset": theirs.reset,
+    }
 
 
 def _memory_ratio() -> float:

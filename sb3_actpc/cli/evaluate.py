@@ -19,7 +19,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("folder", metavar="RUN", help="run folder, as written by sb3-actpc train")
     parser.add_argument("--episodes", type=int, default=10, metavar="N", help="episodes to play (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=0, help="seed of the first episode (default: %(default)s)")
-    parser.add_argument("--video", metavar="FILE", help="video of the first episode, .mp4 or .gif (default: RUN/video.mp4)")
+    parser.add_argument(
+        "--video", metavar="FILE", help="video of the first episode, .mp4 or .gif, or a .png strip (default: RUN/video.mp4)"
+    )
     parser.add_argument("--frames", type=int, default=300, metavar="N", help="its most frames (default: %(default)s)")
     parser.add_argument("--size", type=int, metavar="PIXELS", help="its height and width (default: the environment's)")
     parser.add_argument(

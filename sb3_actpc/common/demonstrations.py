@@ -25,6 +25,7 @@ from sb3_actpc.common.files import atomic_write
 FORMAT_VERSION = 1
 DATA_FOLDER = Path(__file__).resolve().parents[1] / "data"
 ACTION_TOLERANCE = 1e-4
+HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 
 _STORED_FIELDS = (
     "observations",
@@ -530,6 +531,10 @@ def _read_arrays(content: bytes, source: str) -> dict[str, np.ndarray]:
     try:
         archive = zipfile.ZipFile(io.BytesIO(content))
     except _CORRUPT_FILE_ERRORS as error:
+        if content.startswith(HDF5_SIGNATURE):
+            raise ValueError(
+                f"{source}: expected a demonstrations .npz file, found HDF5: convert it with `sb3-actpc demos convert`"
+            ) from None
         raise ValueError(f"{source}: expected a demonstrations .npz file, found {len(content)} bytes ({error})") from None
     with archive:
         version = _read_array(archive, "format_version", source)

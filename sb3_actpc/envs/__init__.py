@@ -5,15 +5,20 @@ Importing this package is light: MuJoCo and the environment classes are loaded b
 
 from gymnasium.envs.registration import register, registry
 
+from sb3_actpc.envs.robosuite_layouts import ROBOSUITE_TASKS
+
 SPARSE_MUJOCO_TASKS: tuple[str, ...] = ("Reacher", "HalfCheetah", "Walker2d", "Hopper", "Swimmer")
 SPARSE_MUJOCO_IDS: tuple[str, ...] = tuple(f"Sparse{task}-{v}" for v in ("v5", "v4") for task in SPARSE_MUJOCO_TASKS)
 GOAL_MUJOCO_IDS: tuple[str, ...] = tuple(env_id.replace("Sparse", "Goal", 1) for env_id in SPARSE_MUJOCO_IDS)
+ROBOSUITE_IDS: tuple[str, ...] = tuple(ROBOSUITE_TASKS)
+SPARSE_IDS: tuple[str, ...] = SPARSE_MUJOCO_IDS + ROBOSUITE_IDS
 
 
 def register_envs() -> None:
     """Register the sparse tasks with Gymnasium; ids that are registered already are left alone.
 
-    The time limits are those of the base tasks: 50 steps for the Reacher, 1000 for the others.
+    The time limits of the MuJoCo tasks are those of the base tasks: 50 steps for the Reacher, 1000 for the others. The
+    robosuite tasks have their own keyword ``horizon``.
     """
     for env_id in SPARSE_MUJOCO_IDS:
         if env_id in registry:
@@ -34,6 +39,9 @@ def register_envs() -> None:
             max_episode_steps=50 if task == "SparseReacher" else 1000,
             kwargs={"task": f"{task}{env_version.upper()}Env"},
         )
+    for env_id in ROBOSUITE_IDS:
+        if env_id not in registry:
+            register(id=env_id, entry_point=f"sb3_actpc.envs.robosuite_tasks:{env_id.split('-')[0]}Env")
 
 
 def sparse_env_id(env_id: str) -> str:
@@ -61,6 +69,8 @@ register_envs()
 
 __all__ = [
     "GOAL_MUJOCO_IDS",
+    "ROBOSUITE_IDS",
+    "SPARSE_IDS",
     "SPARSE_MUJOCO_IDS",
     "SPARSE_MUJOCO_TASKS",
     "dense_env_id",

@@ -10,7 +10,7 @@ from typing import Any
 
 import gymnasium as gym
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecNormalize
 
 MAX_EVALUATION_ENVS = 10
 
@@ -49,6 +49,9 @@ def make_train_env(
 ) -> VecEnv:
     """The environment that an agent learns in: SB3's ``Monitor`` and ``DummyVecEnv``.
 
+    Several of robosuite's are put into processes of their own (``SubprocVecEnv``): a step there takes longer than an update,
+    one of a MuJoCo task less than the way to another process.
+
     :param env_id: Gymnasium id
     :param env_kwargs: its keywords
     :param n_envs: how many side by side
@@ -58,7 +61,12 @@ def make_train_env(
     :raises gymnasium.error.Error: when the id is unknown
     :raises ValueError: when it does not take the keywords
     """
-    env = make_vec_env(make_env, n_envs=n_envs, seed=seed, env_kwargs={"env_id": env_id, "env_kwargs": env_kwargs})
+    from sb3_actpc.envs import ROBOSUITE_IDS
+
+    in_processes = n_envs > 1 and env_id.rpartition(":")[2] in ROBOSUITE_IDS
+    kind: type[VecEnv] = SubprocVecEnv if in_processes else DummyVecEnv
+    arguments = {"env_id": env_id, "env_kwargs": env_kwargs}
+    env = make_vec_env(make_env, n_envs=n_envs, seed=seed, env_kwargs=arguments, vec_env_cls=kind)  # type: ignore[arg-type]
     return env if normalize is None else VecNormalize(env, **normalize)
 
 

@@ -8,7 +8,7 @@ import platform
 import subprocess
 from pathlib import Path
 
-_PACKAGES = ("sb3-actpc", "stable-baselines3", "torch", "gymnasium", "mujoco", "numpy")
+_PACKAGES = ("sb3-actpc", "stable-baselines3", "torch", "gymnasium", "mujoco", "robosuite", "numpy")
 CHECKOUT = Path(__file__).resolve().parents[2]
 
 

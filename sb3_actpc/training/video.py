@@ -1,4 +1,4 @@
-"""A video of one episode, where the machine can render."""
+"""A video of one episode, or a strip of pictures, where the machine can render."""
 
 from __future__ import annotations
 
@@ -13,9 +13,11 @@ from typing import Any
 import numpy as np
 
 from sb3_actpc.common.demonstrations import Demonstrations
+from sb3_actpc.common.files import atomic_write
 
 GL_BACKENDS = ("egl", "osmesa")
-VIDEO_SUFFIXES = (".mp4", ".gif")
+VIDEO_SUFFIXES = (".mp4", ".gif", ".png")
+STRIP_LENGTH = 6
 # of one episode; software rendering takes a twentieth of a second for each
 MAX_FRAMES = 300
 # in a process of its own: a broken graphics driver may end the process
@@ -50,10 +52,10 @@ def check_video_path(path: Path) -> None:
     """Check that a video can have this name.
 
     :param path: file to write
-    :raises ValueError: when the suffix is neither ``.mp4`` nor ``.gif``
+    :raises ValueError: when the suffix is none of ``VIDEO_SUFFIXES``
     """
     if path.suffix.lower() not in VIDEO_SUFFIXES:
-        raise ValueError(f"the video must end in {' or '.join(VIDEO_SUFFIXES)}, found {str(path)!r}")
+        raise ValueError(f"the video must end in .mp4, .gif or .png, found {str(path)!r}")
 
 
 def record_video(
@@ -70,7 +72,7 @@ def record_video(
     :param model: SB3 algorithm or policy
     :param env_id: Gymnasium id
     :param env_kwargs: keywords of the environment; ``width`` and ``height`` in pixels where it takes them
-    :param path: file to write, ``.mp4`` or ``.gif``
+    :param path: file to write: ``.mp4``, ``.gif``, or ``.png`` for ``STRIP_LENGTH`` pictures side by side, at half the size
     :param seed: seed of the episode
     :param n_frames: most frames to render
     :param demonstrations: draw their first episode on the right of the agent, or None
@@ -88,6 +90,10 @@ def record_video(
     import imageio.v2 as imageio
 
     path.parent.mkdir(parents=True, exist_ok=True)
+    if path.suffix.lower() == ".png":
+        with atomic_write(path) as file:
+            file.write(imageio.imwrite("<bytes>", picture_strip(frames), format="png"))
+        return len(frames)
     temporary = path.with_name(f".{path.name}{path.suffix}")  # the suffix tells imageio the format
     if path.suffix.lower() == ".gif":
         # viewers slow down a GIF with delays below 20 ms
@@ -97,6 +103,15 @@ def record_video(
         imageio.mimsave(temporary, frames, fps=frames_per_second, macro_block_size=2)
     temporary.replace(path)
     return len(frames)
+
+
+def picture_strip(frames: list[np.ndarray]) -> np.ndarray:
+    """
+    :param frames: (height, width, 3) uint8 each
+    :return: ``STRIP_LENGTH`` of them from the first to the last, side by side, (height / 2, STRIP_LENGTH * width / 2, 3)
+    """
+    chosen = np.linspace(0, len(frames) - 1, STRIP_LENGTH).round().astype(int)
+    return np.concatenate([frames[index][::2, ::2] for index in chosen], axis=1)
 
 
 @contextlib.contextmanager

@@ -1,0 +1,133 @@
+"""Opening other projects' HDF5 files so that every mistake in them is named: file, demonstration, key."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+# what h5py raises on bytes that are not there, or not HDF5's
+_READ_ERRORS = (OSError, RuntimeError, KeyError, ValueError, TypeError)
+
+
+@contextmanager
+def open_hdf5(path: str | os.PathLike[str]) -> Iterator[Any]:
+    """Open a file for reading.
+
+    :param path: the file
+    :return: its ``data`` group, an ``h5py.Group``
+    :raises FileNotFoundError: when there is no such file
+    :raises ValueError: when it is not a whole HDF5 file, or has no demonstrations
+    :raises ImportError: when h5py is not installed
+    """
+    h5py = import_h5py()
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"no demonstrations file at {path}")
+    try:
+        file = h5py.File(path, "r")
+    except _READ_ERRORS as error:
+        raise ValueError(f"{path}: expected a whole HDF5 file, found {Path(path).stat().st_size} bytes ({error})") from None
+    with file:
+        try:
+            data = file["data"]
+            names = demo_names(data)
+        except _READ_ERRORS as error:
+            raise ValueError(f"{path}: expected a group 'data' of demonstrations ({error})") from None
+        if not names:
+            raise ValueError(f"{path}: expected demonstrations data/demo_0, data/demo_1, ..., found none")
+        yield data
+
+
+def import_h5py() -> Any:
+    """:raises ImportError: when h5py is not installed; the message says how to install it"""
+    try:
+        import h5py
+    except ImportError as error:
+        raise ImportError('HDF5 demonstrations need h5py: pip install "sb3-actpc[robosuite]"') from error
+    return h5py
+
+
+def demo_names(data: Any) -> list[str]:
+    """``demo_0``, ``demo_1``, ... of a group, by their numbers."""
+    return sorted((name for name in data if re.fullmatch(r"demo_\d+", name)), key=lambda name: int(name[5:]))
+
+
+def read_array(group: Any, key: str, source: str, size: int | None = None, length: int | None = None) -> np.ndarray:
+    """
+    :param group: an ``h5py.Group``
+    :param key: name of a dataset in it
+    :param source: file and demonstration, for messages
+    :param size: numbers in a row; None for a column
+    :param length: rows that are expected, None for any number of at least 1
+    :return: (length, size) float64, or (length,)
+    :raises ValueError: when it is missing, cannot be read, has another shape or type, or holds NaN or infinity
+    """
+    if key not in group:
+        raise ValueError(f"{source}: key {key!r} is missing, only {', '.join(sorted(group)) or 'nothing'} is there")
+    try:
+        values = np.asarray(group[key][()])
+    except _READ_ERRORS as error:
+        raise ValueError(f"{source}: key {key!r} cannot be read ({error})") from None
+    if values.dtype.kind not in "biuf":
+        raise ValueError(f"{source}: key {key!r} must hold numbers, found type {values.dtype}")
+    columns = () if size is None else (size,)
+    wanted = (max(1, len(values)) if length is None else length, *columns) if values.ndim else None
+    if values.shape != wanted:
+        shape = ", ".join(str(n) for n in ("N" if length is None else length, *columns))
+        raise ValueError(f"{source}: key {key!r} must have the shape ({shape}), found {values.shape}")
+    bad = np.argwhere(~np.isfinite(values))
+    if len(bad):
+        index = tuple(bad[0].tolist())
+        raise ValueError(f"{source}: key {key!r} must be finite, found {values[index]} at index {index}")
+    return values.astype(np.float64)
+
+
+def read_json_attribute(data: Any, name: str, source: str) -> dict[str, Any]:
+    """
+    :param data: an ``h5py.Group``
+    :param name: attribute with a JSON dictionary
+    :param source: the file, for messages
+    :return: the dictionary
+    :raises ValueError: when it is missing or not JSON
+    """
+    try:
+        value = json.loads(data.attrs[name])
+    except KeyError:
+        raise ValueError(f"{source}: attribute {name!r} of 'data' is missing, which says what was recorded") from None
+    except (TypeError, ValueError, OSError) as error:
+        raise ValueError(f"{source}: attribute {name!r} of 'data' is not JSON ({error})") from None
+    if not isinstance(value, dict):
+        raise ValueError(f"{source}: attribute {name!r} of 'data' must be a dictionary, found {value!r}")
+    return value
+
+
+def check_recorded_task(recorded: dict[str, Any], name: str, source: str) -> None:
+    """Check robosuite's task, robot and controller.
+
+    :param recorded: robosuite's keywords, with ``env_name``
+    :param name: robosuite's name of the task wanted
+    :param source: the file, for messages
+    :raises ValueError: naming the first one that differs
+    """
+    robots = recorded.get("robots", "Panda")
+    controller = recorded.get("controller_configs") or {}
+    parts = controller.get("body_parts", {})
+    arm = parts.get("right", parts.get("arms", {}).get("right", controller))
+    found = {
+        "env_name": recorded.get("env_name"),
+        "robots": robots[0] if isinstance(robots, list) and len(robots) == 1 else robots,
+        "controller": arm.get("type", "OSC_POSE"),
+        "control_freq": recorded.get("control_freq", 20),
+        # absolute poses are not what the environment takes
+        "input_type": arm.get("input_type", "delta" if arm.get("control_delta", True) else "absolute"),
+    }
+    wanted = {"env_name": name, "robots": "Panda", "controller": "OSC_POSE", "control_freq": 20, "input_type": "delta"}
+    for key, value in wanted.items():
+        if found[key] != value:
+            raise ValueError(f"{source}: expected demonstrations with {key} = {value!r}, found {found[key]!r}: another task")

@@ -1,0 +1,370 @@
+"""Scripted operators of the robosuite tasks: closed-loop demonstrators that see what the agent sees, and nothing else.
+
+``proficiency`` sets how well one works, so that sets like robomimic's multi-human ones (Mandlekar et al., arXiv 2108.03298:
+six operators, two worse, two okay and two better, 50 demonstrations each) can be made.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from sb3_actpc.common.demonstrations import Demonstrations
+from sb3_actpc.demonstrations.recording import Report, join_episodes, record_successes, silent
+from sb3_actpc.envs.robosuite_layouts import (
+    ACTION_DIM,
+    CAN_BIN_HIGH,
+    CAN_BIN_LOW,
+    TABLE_HEIGHT,
+    RobosuiteTask,
+    quaternion_product,
+    robosuite_task,
+)
+
+METRES_PER_ACTION = 0.05
+RADIANS_PER_ACTION = 0.5
+# the arm covers about a third of the commanded distance in one control step, so three times the error does not overshoot
+GAIN = 3.0
+LONGEST_DETOUR = 30
+OPEN, CLOSE = -1.0, 1.0
+POINTING_DOWN = np.array([1.0, 0.0, 0.0, 0.0])
+CONJUGATE = np.array([-1.0, -1.0, -1.0, 1.0])
+# the can's centre above the bins' walls; where it stands on the bin's floor
+CARRYING_HEIGHT = 1.05
+CAN_STANDING_HEIGHT = 0.86
+
+MIXED_OPERATORS: tuple[tuple[str, float], ...] = (
+    ("worse", 0.1),
+    ("worse", 0.25),
+    ("okay", 0.45),
+    ("okay", 0.6),
+    ("better", 0.85),
+    ("better", 1.0),
+)
+"""Level and proficiency of each operator of a mixed set."""
+
+
+@dataclass(frozen=True)
+class View:
+    """What an operator reads from an observation: metres, radians, quaternions (x, y, z, w).
+
+    :param eef_position: (3,) of the gripper
+    :param eef_quat: (4,)
+    :param finger_gap: distance of the fingers
+    :param object_position: (3,)
+    :param object_quat: (4,)
+    """
+
+    eef_position: np.ndarray
+    eef_quat: np.ndarray
+    finger_gap: float
+    object_position: np.ndarray
+    object_quat: np.ndarray
+
+    @property
+    def offset(self) -> np.ndarray:
+        """From the gripper to the object, (3,)."""
+        return self.object_position - self.eef_position
+
+
+@dataclass(frozen=True)
+class Skill:
+    """How well an operator works, from its proficiency p in [0, 1].
+
+    :param speed: largest translation action
+    :param tremor: standard deviation of the correlated noise on the actions
+    :param pause_rate: probability of a pause, per step
+    :param detour_rate: probability of a detour, per stage
+    :param aim_error: standard deviation of a grasp's place, in metres
+    :param tolerance: distance from the place aimed at, in metres, at which the fingers go down
+    """
+
+    speed: float
+    tremor: float
+    pause_rate: float
+    detour_rate: float
+    aim_error: float
+    tolerance: float
+
+    @classmethod
+    def of(cls, proficiency: float) -> Skill:
+        """
+        :param proficiency: p
+        :raises ValueError: when it does not lie in [0, 1]
+        """
+        if isinstance(proficiency, bool) or not isinstance(proficiency, int | float) or not 0.0 <= proficiency <= 1.0:
+            raise ValueError(f"proficiency={proficiency!r} must be a number from 0 (clumsy) to 1 (sure), or 'mixed'")
+        clumsiness = 1.0 - float(proficiency)
+        return cls(
+            speed=1.0 - 0.6 * clumsiness,
+            tremor=0.25 * clumsiness,
+            pause_rate=0.05 * clumsiness,
+            detour_rate=0.7 * clumsiness,
+            aim_error=0.01 * clumsiness,
+            tolerance=0.01 + 0.015 * clumsiness,
+        )
+
+
+class ScriptedOperator:
+    """Reaches over the object, descends, grasps, lifts, and for the can carries and lets go; starts anew when it has lost it.
+
+    :param env_id: ``SparseLift-v0`` or ``SparsePickPlaceCan-v0``
+    :param obs: the environment's ``obs``, ``"paper"`` or ``"robomimic"``
+    :param proficiency: 1 is quick and sure, 0 slow, trembling, pausing, roundabout and apt to miss
+    :param seed: seed of the operator's habits and, with the episode's, of its noise
+    :raises ValueError: when an argument is not allowed
+    """
+
+    def __init__(self, env_id: str, obs: str = "paper", proficiency: float = 1.0, seed: int = 0) -> None:
+        self.task: RobosuiteTask = robosuite_task(env_id)
+        self.proficiency = proficiency
+        self.skill = Skill.of(proficiency)
+        self.seed = seed
+        self._layout = self.task.layout(obs)
+        self._object_columns = self.task.object_columns()
+        habits = np.random.default_rng([seed, 0])
+        self._hover_height = habits.uniform(0.06, 0.12)
+        self._lift_height = habits.uniform(0.1, 0.2)
+        self._stages: dict[str, Callable[[View], tuple[np.ndarray, float, bool]]] = {
+            "reach": self._reach,
+            "descend": self._descend,
+            "grasp": self._grasp,
+            "lift": self._lift,
+        }
+        if self.task.name == "PickPlaceCan":
+            self._stages |= {"carry": self._carry, "lower": self._lower, "release": self._release}
+        self.start(0)
+
+    def start(self, seed: int) -> None:
+        """
+        A new episode begins.
+
+        :param seed: the same one gives the same noise
+        """
+        self._rng = np.random.default_rng([self.seed, 1, seed])
+        self._noise = np.zeros(ACTION_DIM - 1)
+        self._pause = 0
+        self._last_gap = np.inf
+        self._yaw: float | None = None
+        self._enter("reach")
+
+    def predict(self, observation: np.ndarray) -> np.ndarray:
+        """
+        :param observation: (obs_dim,)
+        :return: action (7,) float32, in [-1, 1]
+        """
+        view = self._view(observation)
+        if self.stage not in ("reach", "descend", "release") and self._has_lost(view):
+            self._enter("reach")
+        target, fingers, is_done = self._stages[self.stage](view)
+        if is_done:
+            names = list(self._stages)
+            self._enter(names[min(names.index(self.stage) + 1, len(names) - 1)])
+        action = np.empty(ACTION_DIM)
+        action[:3] = self._translation(view, target)
+        action[3:6] = self._rotation(view)
+        action[:6] = self._disturb(action[:6])
+        action[6] = fingers
+        self._last_gap = view.finger_gap
+        return np.clip(action, -1.0, 1.0).astype(np.float32)
+
+    # ------------------------------------------------------------------ stages: target (3,), fingers, done
+
+    def _reach(self, view: View) -> tuple[np.ndarray, float, bool]:
+        """Over the object, the fingers open and turned along it."""
+        target = view.object_position + self._aim + np.array([0.0, 0.0, self._hover_height])
+        distance, tolerance = np.linalg.norm((target - view.eef_position)[:2]), self.skill.tolerance
+        aligned = distance < tolerance and self._turn_left(view) < 10.0 * tolerance
+        return target, OPEN, bool(aligned and view.eef_position[2] < target[2] + 0.03)
+
+    def _descend(self, view: View) -> tuple[np.ndarray, float, bool]:
+        target = view.object_position + self._aim
+        distance = np.linalg.norm((target - view.eef_position)[:2])
+        if distance > self.skill.tolerance + 0.02:
+            self._enter("reach")
+        elif distance > self.skill.tolerance + 0.005:  # wait above it, do not push it over
+            target = target + np.array([0.0, 0.0, 0.05])
+        depth = 0.01 if self.task.name == "Lift" else 0.02
+        return target, OPEN, bool(self.stage == "descend" and view.eef_position[2] < view.object_position[2] + depth)
+
+    def _grasp(self, view: View) -> tuple[np.ndarray, float, bool]:
+        """Close until the fingers stand still."""
+        is_still = self._last_gap - view.finger_gap < 5e-4
+        return view.eef_position, CLOSE, bool(is_still and self._steps() > 3)
+
+    def _lift(self, view: View) -> tuple[np.ndarray, float, bool]:
+        height = CARRYING_HEIGHT if self.task.name == "PickPlaceCan" else TABLE_HEIGHT + self._lift_height
+        target = view.eef_position + np.array([0.0, 0.0, height + 0.03 - view.object_position[2]])
+        return target, CLOSE, bool(self.task.name == "PickPlaceCan" and view.object_position[2] > height)
+
+    def _carry(self, view: View) -> tuple[np.ndarray, float, bool]:
+        to_bin = (CAN_BIN_LOW + CAN_BIN_HIGH)[:2] / 2.0 - view.object_position[:2]
+        target = view.eef_position + np.array([*to_bin, CARRYING_HEIGHT - view.object_position[2]])
+        return target, CLOSE, bool(np.linalg.norm(to_bin) < 0.05)
+
+    def _lower(self, view: View) -> tuple[np.ndarray, float, bool]:
+        to_bin = (CAN_BIN_LOW + CAN_BIN_HIGH)[:2] / 2.0 - view.object_position[:2]
+        target = view.eef_position + np.array([*to_bin, CAN_STANDING_HEIGHT - view.object_position[2]])
+        return target, CLOSE, bool(view.object_position[2] < CAN_STANDING_HEIGHT + 0.02)
+
+    def _release(self, view: View) -> tuple[np.ndarray, float, bool]:
+        """Open, then move up and away, which ends the episode."""
+        up = 0.2 if view.finger_gap > 0.07 else 0.0
+        if self._steps() > 40:
+            self._enter("reach")
+        return view.eef_position + np.array([0.0, 0.0, up]), OPEN, False
+
+    # ------------------------------------------------------------------ parts
+
+    def _enter(self, stage: str) -> None:
+        self.stage = stage
+        self._stage_steps = 0
+        if stage == "reach":
+            self._aim = np.array([*self._rng.normal(0.0, self.skill.aim_error, 2), 0.0])
+        self._detour: np.ndarray | None = None
+        self._detour_left = LONGEST_DETOUR
+        if stage in ("reach", "carry") and self._rng.random() < self.skill.detour_rate:
+            self._detour = self._rng.uniform([-0.08, -0.08, 0.0], [0.08, 0.08, 0.06])
+
+    def _steps(self) -> int:
+        """Counts the steps of a stage."""
+        self._stage_steps += 1
+        return self._stage_steps
+
+    def _has_lost(self, view: View) -> bool:
+        """Whether the fingers have closed on nothing, or the object has slipped out of them."""
+        return view.finger_gap < 0.01 or bool(np.linalg.norm(view.offset) > 0.06)
+
+    def _translation(self, view: View, target: np.ndarray) -> np.ndarray:
+        if self._detour is not None:
+            target = target + self._detour
+            self._detour_left -= 1
+            if np.linalg.norm(target - view.eef_position) < 0.03 or self._detour_left == 0:
+                self._detour = None
+        command = GAIN * (target - view.eef_position) / METRES_PER_ACTION
+        return command * min(1.0, self.skill.speed / max(float(np.abs(command).max()), 1e-9))
+
+    def _rotation(self, view: View) -> np.ndarray:
+        """Turn towards pointing straight down, along the object's edges."""
+        error = rotation_between(view.eef_quat, multiply(about_z(self._target_yaw(view)), POINTING_DOWN))
+        return np.clip(GAIN * error / RADIANS_PER_ACTION, -self.skill.speed, self.skill.speed)
+
+    def _target_yaw(self, view: View) -> float:
+        """The cube's angle modulo a quarter turn, nearest to the gripper's first one; for the round can, the gripper's own."""
+        if self.task.name == "PickPlaceCan":
+            return yaw_of(multiply(view.eef_quat, POINTING_DOWN * CONJUGATE))
+        if self._yaw is None or self.stage == "reach":
+            start = 0.0 if self._yaw is None else self._yaw
+            quarter = np.pi / 2.0
+            turn = yaw_of(view.object_quat) - start
+            self._yaw = start + (turn + quarter / 2.0) % quarter - quarter / 2.0
+        return self._yaw
+
+    def _turn_left(self, view: View) -> float:
+        target = multiply(about_z(self._target_yaw(view)), POINTING_DOWN)
+        return float(np.linalg.norm(rotation_between(view.eef_quat, target)))
+
+    def _disturb(self, command: np.ndarray) -> np.ndarray:
+        """Pauses and tremor; an autocorrelated noise, weaker on the rotation."""
+        if self._pause == 0 and self._rng.random() < self.skill.pause_rate:
+            self._pause = int(self._rng.integers(3, 12))
+        if self._pause > 0:
+            self._pause -= 1
+            command = np.zeros_like(command)
+        scale = self.skill.tremor * np.array([1.0, 1.0, 1.0, 0.3, 0.3, 0.3])
+        self._noise = 0.8 * self._noise + 0.6 * self._rng.normal(0.0, 1.0, len(command))
+        return command + scale * self._noise
+
+    def _view(self, observation: np.ndarray) -> View:
+        parts: dict[str, Any] = {name: np.asarray(observation[columns], float) for name, columns in self._layout.items()}
+        fingers, state = parts["robot0_gripper_qpos"], parts["object"]
+        return View(
+            eef_position=parts["robot0_eef_pos"],
+            eef_quat=parts["robot0_eef_quat"],
+            finger_gap=float(fingers[0] - fingers[1]),
+            object_position=state[self._object_columns["pos"]],
+            object_quat=state[self._object_columns["quat"]],
+        )
+
+
+def collect_scripted(
+    env_id: str,
+    proficiency: float | str = 1.0,
+    n_episodes: int = 50,
+    seed: int = 0,
+    max_tries: int | None = None,
+    metadata: dict[str, Any] | None = None,
+    report: Report = silent,
+    obs: str = "paper",
+) -> Demonstrations:
+    """Record successful episodes of scripted operators.
+
+    :param env_id: ``SparseLift-v0`` or ``SparsePickPlaceCan-v0``
+    :param proficiency: in [0, 1], or ``"mixed"`` for the six of ``MIXED_OPERATORS``, who take turns
+    :param n_episodes: successful episodes wanted; for ``"mixed"`` a multiple of 6
+    :param seed: try number i is reset with the seed ``seed + i``
+    :param max_tries: episodes played at most, None for ``10 * n_episodes``
+    :param metadata: JSON values to keep with the demonstrations
+    :param report: takes one line of progress per kept episode
+    :param obs: the environment's ``obs``
+    :return: the episodes; ``metadata["filter_keys"]`` has robomimic's filter keys of each one (``"better"``,
+        ``"better_operator_1"``, ...) when the set is mixed
+    :raises ValueError: when an argument is not allowed, or too few episodes succeed
+    :raises ImportError: when robosuite is not installed
+    """
+    operators, keys = _operators(env_id, proficiency, n_episodes, seed, obs)
+    env = gym.make(env_id, obs=obs)
+    try:
+        episodes, n_tries = record_successes(operators, env, n_episodes, seed, max_tries, report)
+    finally:
+        env.close()
+    kept: dict[str, Any] = {"expert": "scripted", "proficiency": proficiency, "seed": seed, "n_tries": n_tries}
+    if keys:
+        kept["filter_keys"] = [keys[i % len(keys)] for i in range(n_episodes)]
+    return join_episodes(episodes, env_id, {**kept, **(metadata or {})}, packages=("robosuite", "mujoco"))
+
+
+def _operators(
+    env_id: str, proficiency: float | str, n_episodes: int, seed: int, obs: str
+) -> tuple[list[ScriptedOperator], list[list[str]]]:
+    """The operators and, of a mixed set, the filter keys of each."""
+    if proficiency != "mixed":
+        return [ScriptedOperator(env_id, obs, proficiency, seed)], []  # type: ignore[arg-type]
+    if n_episodes % len(MIXED_OPERATORS):
+        raise ValueError(
+            f"n_episodes={n_episodes} of a mixed set must be a multiple of its {len(MIXED_OPERATORS)} operators: "
+            f"ask for {-(-n_episodes // len(MIXED_OPERATORS)) * len(MIXED_OPERATORS)}"
+        )
+    levels = [level for level, _ in MIXED_OPERATORS]
+    operators = [ScriptedOperator(env_id, obs, value, 100 * seed + i) for i, (_, value) in enumerate(MIXED_OPERATORS)]
+    return operators, [[level, f"{level}_operator_{levels[: i + 1].count(level)}"] for i, level in enumerate(levels)]
+
+
+def multiply(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Product of two quaternions (x, y, z, w), (4,): the rotation ``second``, then ``first``."""
+    return quaternion_product(first[None], second[None])[0]
+
+
+def about_z(angle: float) -> np.ndarray:
+    """Quaternion (x, y, z, w) of a rotation about the vertical."""
+    return np.array([0.0, 0.0, np.sin(angle / 2.0), np.cos(angle / 2.0)])
+
+
+def yaw_of(quat: np.ndarray) -> float:
+    """Angle about the vertical of a quaternion (x, y, z, w)."""
+    x, y, z, w = quat
+    return float(np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)))
+
+
+def rotation_between(start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """Rotation vector (3,), in radians, that turns one orientation into another, both (x, y, z, w)."""
+    difference = multiply(end, start * CONJUGATE)
+    difference = difference if difference[3] >= 0.0 else -difference
+    sine = float(np.linalg.norm(difference[:3]))
+    if sine < 1e-12:
+        return np.zeros(3)
+    return 2.0 * np.arctan2(sine, difference[3]) / sine * difference[:3]

@@ -1,0 +1,209 @@
+"""robomimic's HDF5 files of low-dimensional observations (Mandlekar et al., arXiv 2108.03298), read and written with h5py.
+
+Layout: ``data`` (attribute ``env_args``, JSON), ``data/demo_i/{actions,rewards,dones}``, ``data/demo_i/{obs,next_obs}/<key>``,
+and ``mask/<filter key>``, the names of some of the demonstrations.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any
+
+import numpy as np
+
+from sb3_actpc.common.demonstrations import ACTION_TOLERANCE, Demonstrations
+from sb3_actpc.common.files import atomic_write
+from sb3_actpc.demonstrations.hdf5 import (
+    check_recorded_task,
+    demo_names,
+    import_h5py,
+    open_hdf5,
+    read_array,
+    read_json_attribute,
+)
+from sb3_actpc.demonstrations.recording import Columns, join_episodes
+from sb3_actpc.envs.robosuite_layouts import ACTION_DIM, OBSERVATIONS, PROPRIOCEPTION, RobosuiteTask, robosuite_task
+
+ROBOSUITE_TYPE = 1  # robomimic's EnvType
+# metres: the median over an episode of how much an object's two recorded distances from the gripper differ
+OBJECT_TOLERANCE = 0.005
+
+
+def read_robomimic(
+    path: str | os.PathLike[str], env_id: str, obs: str = "paper", filter_key: str | None = None
+) -> Demonstrations:
+    """Read a robomimic file.
+
+    Episodes end where they first succeed, as they do in the environment. Rewards that are missing or not 0 and 1 are
+    computed from the observed object (the latter are kept as dense rewards). The object's state is built from its recorded
+    pose as the environment builds it, whether robosuite 1.4 or 1.5 recorded it. Where the file has no ``next_obs``, the last
+    observation of an episode follows itself.
+
+    :param path: the file
+    :param env_id: the task it must be of, ``SparseLift-v0`` or ``SparsePickPlaceCan-v0``
+    :param obs: the observations to build, ``"paper"`` or ``"robomimic"``
+    :param filter_key: read only the demonstrations under ``mask/<filter_key>``, such as ``"better"`` or ``"20_percent"``
+    :return: the demonstrations
+    :raises FileNotFoundError: when there is no such file
+    :raises ValueError: when the file is cut short, of another task, or a demonstration lacks a key or holds a wrong one; the
+        message names the file, the demonstration and the key
+    :raises ImportError: when h5py is not installed
+    """
+    task, source = robosuite_task(env_id), str(path)
+    task.layout(obs)
+    with open_hdf5(path) as data:
+        arguments = read_json_attribute(data, "env_args", source)
+        check_recorded_task({**(arguments.get("env_kwargs") or {}), "env_name": arguments.get("env_name")}, task.name, source)
+        names = demo_names(data) if filter_key is None else _filtered(data, filter_key, source)
+        episodes = [_read_episode(data[name], task, obs, f"{source}: {name}") for name in names]
+    dense = [("dense_rewards" in episode) for episode in episodes]
+    if not all(dense):
+        episodes = [{key: value for key, value in episode.items() if key != "dense_rewards"} for episode in episodes]
+    metadata = {"source": "robomimic", "env_version": str(arguments.get("env_version", "unknown")), "demos": names}
+    if filter_key is not None:
+        metadata["filter_key"] = filter_key
+    return join_episodes(episodes, env_id, metadata, source)
+
+
+def write_robomimic(demonstrations: Demonstrations, path: str | os.PathLike[str]) -> None:
+    """Write demonstrations of a robosuite task as robomimic stores them, all at once or not at all.
+
+    The filter keys of a mixed set (``metadata["filter_keys"]``) become masks.
+
+    :param demonstrations: of ``SparseLift-v0`` or ``SparsePickPlaceCan-v0``, with one of their ``obs``
+    :param path: file to write
+    :raises ValueError: when they are of another task or layout
+    :raises ImportError: when h5py is not installed
+    """
+    h5py = import_h5py()
+    task = robosuite_task(demonstrations.env_id)
+    layout = task.layout(task.obs_of_size(demonstrations.observations.shape[1]))
+    content = io.BytesIO()
+    with h5py.File(content, "w") as file:
+        data = file.create_group("data")
+        data.attrs["total"] = len(demonstrations)
+        data.attrs["env_args"] = json.dumps(_env_args(task))
+        for index, (start, end) in enumerate(demonstrations.episode_bounds):
+            _write_episode(data.create_group(f"demo_{index}"), demonstrations, slice(start, end), layout)
+        for key, members in _masks(demonstrations).items():
+            file.create_dataset(f"mask/{key}", data=np.array(members, dtype="S"))
+    with atomic_write(path) as target:
+        target.write(content.getvalue())
+
+
+def _filtered(data: Any, filter_key: str, source: str) -> list[str]:
+    masks = data.file.get("mask", {})
+    if filter_key not in masks:
+        known = ", ".join(sorted(masks)) or "none, the file has no masks"
+        raise ValueError(f"{source}: no mask {filter_key!r}: choose one of {known}")
+    names = [name.decode() if isinstance(name, bytes) else str(name) for name in masks[filter_key][()]]
+    unknown = [name for name in names if name not in data]
+    if unknown or not names:
+        raise ValueError(f"{source}: mask {filter_key!r} must name demonstrations, found {', '.join(unknown) or 'none'}")
+    return sorted(names, key=demo_names(data).index)
+
+
+def _read_episode(group: Any, task: RobosuiteTask, obs: str, source: str) -> Columns:
+    actions = read_array(group, "actions", source, size=ACTION_DIM)
+    length = len(actions)
+    too_large = np.argwhere(np.abs(actions) > 1.0 + ACTION_TOLERANCE)
+    if len(too_large):
+        index = tuple(too_large[0].tolist())
+        raise ValueError(f"{source}: key 'actions' must lie in [-1, 1], found {actions[index]} at index {index}")
+    parts = _read_parts(group, "obs", task, obs, length, source)
+    if "next_obs" in group:
+        next_parts = _read_parts(group, "next_obs", task, obs, length, source)
+    else:
+        next_parts = {name: np.concatenate([part[1:], part[-1:]]) for name, part in parts.items()}
+    successes = task.is_success(next_parts["object"], next_parts["robot0_eef_pos"])
+    recorded = read_array(group, "rewards", source, length=length) if "rewards" in group else None
+    is_sparse = recorded is not None and bool(np.isin(recorded, (0.0, 1.0)).all())
+    rewards = recorded if recorded is not None and is_sparse else successes.astype(np.float64)
+    end = int(np.argmax(rewards)) + 1 if rewards.any() else length
+    columns = {
+        "observations": np.concatenate([parts[name] for name in OBSERVATIONS[obs]], axis=1),
+        "actions": actions,
+        "next_observations": np.concatenate([next_parts[name] for name in OBSERVATIONS[obs]], axis=1),
+        "rewards": rewards,
+        "terminations": rewards > 0.0,
+    }
+    if recorded is not None and not is_sparse:
+        columns["dense_rewards"] = recorded
+    return {name: column[:end] for name, column in columns.items()}
+
+
+def _read_parts(group: Any, kind: str, task: RobosuiteTask, obs: str, length: int, source: str) -> dict[str, np.ndarray]:
+    """Every part of the observations, (length, size), in the order of robosuite 1.5."""
+    sizes = {**PROPRIOCEPTION, "object": task.object_dim}
+    if kind not in group:
+        raise ValueError(f"{source}: key {kind!r} is missing, only {', '.join(sorted(group)) or 'nothing'} is there")
+    parts = {}
+    for name in OBSERVATIONS[obs]:
+        try:
+            parts[name] = read_array(group[kind], name, f"{source}: {kind}", sizes[name], length)
+        except ValueError as error:
+            hint = "" if name in OBSERVATIONS["robomimic"] or name in group[kind] else " (obs='robomimic' needs fewer keys)"
+            raise ValueError(f"{error}{hint}") from None
+    gripper = parts["robot0_eef_pos"], parts["robot0_eef_quat"]
+    parts["object"] = _object_states(parts["object"], *gripper, task, f"{source}: {kind}")
+    return parts
+
+
+def _object_states(
+    recorded: np.ndarray, eef_positions: np.ndarray, eef_quats: np.ndarray, task: RobosuiteTask, source: str
+) -> np.ndarray:
+    """The object's states, (N, object_dim), as the environment gives them.
+
+    The recorded ones may be in the order of robosuite 1.4 (Lift: the offset has the other sign; can: the absolute pose comes
+    first), and in robosuite 1.5 the can's pose in the gripper's frame lags behind by one step: only the absolute pose is
+    taken, and the order is that in which the distances to the gripper agree.
+    """
+    columns = task.object_columns()
+    orders = [recorded] if task.name == "Lift" else [recorded, np.concatenate([recorded[:, 7:], recorded[:, :7]], axis=1)]
+    errors = []
+    for states in orders:
+        distances = np.linalg.norm(states[:, columns["pos"]] - eef_positions, axis=1)
+        errors.append(np.median(np.abs(distances - np.linalg.norm(states[:, columns["to_eef_pos"]], axis=1))))
+    best = int(np.argmin(errors))
+    if errors[best] > OBJECT_TOLERANCE:
+        raise ValueError(
+            f"{source}: key 'object' must hold the object's {', '.join(columns)} in the order of robosuite 1.4 or 1.5, found "
+            f"numbers that do not agree with robot0_eef_pos (by {errors[best]:.3f} m)"
+        )
+    states = orders[best]
+    return task.object_states(states[:, columns["pos"]], states[:, columns["quat"]], eef_positions, eef_quats)
+
+
+def _env_args(task: RobosuiteTask) -> dict[str, Any]:
+    try:
+        robosuite_version = version("robosuite")
+    except PackageNotFoundError:
+        robosuite_version = "1.5.2"
+    arm = {"type": "OSC_POSE", "input_max": 1, "input_min": -1, "input_type": "delta", "input_ref_frame": "base"}
+    arm |= {"output_max": [0.05] * 3 + [0.5] * 3, "output_min": [-0.05] * 3 + [-0.5] * 3, "kp": 150, "damping_ratio": 1}
+    arm |= {"impedance_mode": "fixed", "kp_limits": [0, 300], "damping_ratio_limits": [0, 10], "gripper": {"type": "GRIP"}}
+    controller = {"type": "BASIC", "body_parts": {"right": {**arm, "uncouple_pos_ori": True, "ramp_ratio": 0.2}}}
+    kwargs = {"robots": ["Panda"], "controller_configs": controller, "control_freq": 20, "reward_shaping": False}
+    return {"env_name": task.name, "env_version": robosuite_version, "type": ROBOSUITE_TYPE, "env_kwargs": kwargs}
+
+
+def _write_episode(group: Any, demonstrations: Demonstrations, rows: slice, layout: dict[str, slice]) -> None:
+    group.attrs["num_samples"] = rows.stop - rows.start
+    group["actions"] = demonstrations.actions[rows]
+    group["rewards"] = demonstrations.rewards[rows]
+    group["dones"] = demonstrations.terminations[rows].astype(np.int64)
+    for part, columns in layout.items():
+        group[f"obs/{part}"] = demonstrations.observations[rows, columns]
+        group[f"next_obs/{part}"] = demonstrations.next_observations[rows, columns]
+
+
+def _masks(demonstrations: Demonstrations) -> dict[str, list[str]]:
+    """Filter key -> names of its demonstrations."""
+    masks: dict[str, list[str]] = {}
+    for index, keys in enumerate(demonstrations.metadata.get("filter_keys", [])[: demonstrations.n_episodes]):
+        for key in keys:
+            masks.setdefault(key, []).append(f"demo_{index}")
+    return masks

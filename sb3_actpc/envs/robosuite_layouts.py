@@ -1,0 +1,157 @@
+"""What a robosuite observation holds, and when a task is solved: arrays alone, robosuite is not needed.
+
+The parts have robomimic's names (``robot0_eef_pos``, ..., ``object``), so that its files can be read without a simulator.
+Positions are in metres in the world's frame, angles in radians, velocities per second; quaternions are (x, y, z, w).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+PROPRIOCEPTION: dict[str, int] = {
+    "robot0_joint_pos_cos": 7,
+    "robot0_joint_pos_sin": 7,
+    "robot0_joint_vel": 7,
+    "robot0_eef_pos": 3,
+    "robot0_eef_quat": 4,
+    "robot0_gripper_qpos": 2,
+    "robot0_gripper_qvel": 2,
+}
+OBSERVATIONS: dict[str, tuple[str, ...]] = {
+    # Ororbia & Mali (arXiv 2209.09174, appendix): 42 and 46 numbers
+    "paper": (*PROPRIOCEPTION, "object"),
+    # robomimic's low-dimensional keys: 19 and 23 numbers
+    "robomimic": ("robot0_eef_pos", "robot0_eef_quat", "robot0_gripper_qpos", "object"),
+}
+ACTION_DIM = 7
+"""Translation (3), rotation (3) and gripper (1; positive closes), each in [-1, 1]; 1 is 5 cm or 0.5 rad."""
+
+
+@dataclass(frozen=True)
+class RobosuiteTask:
+    """
+    :param env_id: Gymnasium id
+    :param name: robosuite's name
+    :param object_parts: the parts of the object's state, in order, and their sizes
+    """
+
+    env_id: str
+    name: str
+    object_parts: dict[str, int]
+
+    @property
+    def object_dim(self) -> int:
+        """Size of the object's state."""
+        return sum(self.object_parts.values())
+
+    def layout(self, obs: str) -> dict[str, slice]:
+        """
+        :param obs: key of ``OBSERVATIONS``
+        :return: part -> its columns in an observation, in order
+        :raises ValueError: for an unknown ``obs``
+        """
+        if obs not in OBSERVATIONS:
+            raise ValueError(f"obs={obs!r} is not one of {', '.join(OBSERVATIONS)}: choose one of these")
+        sizes = {**PROPRIOCEPTION, "object": self.object_dim}
+        ends = np.cumsum([sizes[part] for part in OBSERVATIONS[obs]]).tolist()
+        return {part: slice(end - sizes[part], end) for part, end in zip(OBSERVATIONS[obs], ends, strict=True)}
+
+    def obs_dim(self, obs: str) -> int:
+        """Size of an observation, for a key of ``OBSERVATIONS``."""
+        return self.layout(obs)["object"].stop
+
+    def obs_of_size(self, obs_dim: int) -> str:
+        """
+        :param obs_dim: size of an observation
+        :return: the key of ``OBSERVATIONS``
+        :raises ValueError: when no observation of the task has this size
+        """
+        sizes = {obs: self.obs_dim(obs) for obs in OBSERVATIONS}
+        for obs, size in sizes.items():
+            if size == obs_dim:
+                return obs
+        raise ValueError(f"an observation of {self.env_id} has {sizes} numbers, found {obs_dim}: use one of these layouts")
+
+    def object_columns(self) -> dict[str, slice]:
+        """Part of the object's state -> its columns in it."""
+        ends = np.cumsum(list(self.object_parts.values())).tolist()
+        return {part: slice(end - size, end) for (part, size), end in zip(self.object_parts.items(), ends, strict=True)}
+
+    def object_states(
+        self, positions: np.ndarray, quats: np.ndarray, eef_positions: np.ndarray, eef_quats: np.ndarray
+    ) -> np.ndarray:
+        """The object's states from its poses and the gripper's; quaternions are (x, y, z, w).
+
+        The can is seen in the gripper's frame, with a quaternion whose w is not negative; the cube's position relative to the
+        gripper is in the world's frame.
+
+        :param positions: (N, 3) of the object
+        :param quats: (N, 4)
+        :param eef_positions: (N, 3) of the gripper
+        :param eef_quats: (N, 4)
+        :return: (N, object_dim), in the order of robosuite 1.5
+        """
+        offsets = positions - eef_positions
+        if self.name == "Lift":
+            return np.concatenate([positions, quats, offsets], axis=1)
+        inverse = eef_quats * [-1.0, -1.0, -1.0, 1.0]
+        turned = quaternion_product(inverse, np.concatenate([offsets, np.zeros_like(offsets[:, :1])], axis=1))
+        relative_positions = quaternion_product(turned, eef_quats)[:, :3]
+        relative_quats = quaternion_product(inverse, quats)
+        relative_quats = np.where(relative_quats[:, 3:] < 0.0, -relative_quats, relative_quats)
+        return np.concatenate([relative_positions, relative_quats, positions, quats], axis=1)
+
+    def is_success(self, object_states: np.ndarray, eef_positions: np.ndarray) -> np.ndarray:
+        """robosuite's success, from observed quantities.
+
+        Lift: the cube's centre is more than 4 cm above the table. Can: the can lies in its quarter of the right-hand bin
+        and the gripper is off it.
+
+        :param object_states: (N, object_dim)
+        :param eef_positions: (N, 3) of the gripper
+        :return: (N,) bool
+        """
+        positions = object_states[:, self.object_columns()["pos"]]
+        if self.name == "Lift":
+            return positions[:, 2] > TABLE_HEIGHT + 0.04
+        distances = np.linalg.norm(eef_positions - positions, axis=1)
+        inside = ((positions > CAN_BIN_LOW) & (positions < CAN_BIN_HIGH)).all(axis=1)
+        return inside & (1.0 - np.tanh(10.0 * distances) < 0.6)
+
+
+# of robosuite 1.5.2: environments/manipulation/{lift,pick_place}.py
+TABLE_HEIGHT = 0.8
+BIN_SIZE = (0.39, 0.49)
+CAN_BIN_LOW = np.array([0.1, 0.28, 0.8])
+CAN_BIN_HIGH = CAN_BIN_LOW + np.array([BIN_SIZE[0] / 2, BIN_SIZE[1] / 2, 0.1])
+
+ROBOSUITE_TASKS: dict[str, RobosuiteTask] = {
+    task.env_id: task
+    for task in (
+        RobosuiteTask("SparseLift-v0", "Lift", {"pos": 3, "quat": 4, "to_eef_pos": 3}),
+        RobosuiteTask("SparsePickPlaceCan-v0", "PickPlaceCan", {"to_eef_pos": 3, "to_eef_quat": 4, "pos": 3, "quat": 4}),
+    )
+}
+
+
+def quaternion_product(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Products of quaternions (x, y, z, w): the rotation ``second``, then ``first``.
+
+    :param first: (N, 4)
+    :param second: (N, 4)
+    :return: (N, 4)
+    """
+    (v, a), (w, b) = (first[:, :3], first[:, 3:]), (second[:, :3], second[:, 3:])
+    return np.concatenate([a * w + b * v + np.cross(v, w), a * b - (v * w).sum(axis=1, keepdims=True)], axis=1)
+
+
+def robosuite_task(env_id: str) -> RobosuiteTask:
+    """
+    :param env_id: Gymnasium id, with or without the module before a colon
+    :return: the task
+    :raises ValueError: when it is none of ``ROBOSUITE_TASKS``
+    """
+    task = ROBOSUITE_TASKS.get(env_id.rpartition(":")[2])
+    if task is None:
+        raise ValueError(f"{env_id!r} is not a robosuite task: choose one of {', '.join(ROBOSUITE_TASKS)}")
+    return task

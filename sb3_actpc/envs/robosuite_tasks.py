@@ -1,0 +1,343 @@
+"""Block lifting and can pick-and-place: robosuite's Panda tasks with sparse rewards, as Gymnasium environments.
+
+The tasks are those of Ororbia & Mali (arXiv 2209.09174): a Panda arm under operational-space control of the gripper's pose
+(OSC_POSE, 20 Hz). Robosuite (the extra ``sb3-actpc[robosuite]``) is imported when an environment is made.
+
+An environment here *contains* a robosuite environment. It differs from robosuite's own loop in what is reported, not in the
+physics: the horizon is a truncation, success a termination; observations and success are read from the poses at the end of
+the control step (robosuite's lag behind by one simulation step, 2 ms, and the can's pose in the gripper's frame by one control
+step); the random numbers are Gymnasium's.
+"""
+
+from __future__ import annotations
+
+import importlib
+import logging
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any, ClassVar
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+from gymnasium import spaces, utils
+
+from sb3_actpc.envs.robosuite_layouts import ACTION_DIM, RobosuiteTask, robosuite_task
+
+CONTROL_FREQUENCY = 20
+# of robosuite 1.5.2 (environments/manipulation/lift.py): half edges in metres, density in kg/m^3
+CUBE_HALF_EDGES = (0.020, 0.022)
+CUBE_DENSITY = 1000.0
+
+
+class SparseRobosuiteEnv(gym.Env[np.ndarray, np.ndarray], utils.EzPickle):
+    """Reward 1 on success, which ends the episode, else 0.
+
+    Actions are (7,) in [-1, 1]: translation of the gripper (1 is 5 cm), its rotation (1 is 0.5 rad), both in the frame of
+    the robot's base, and the fingers (positive closes). ``info["dense_reward"]`` is robosuite's shaped reward,
+    ``info["is_success"]`` its success.
+
+    A reset takes milliseconds: robosuite's soft reset, after which the state depends on the seed alone.
+
+    :param obs: ``"paper"`` (42 numbers in Lift, 46 in Can: joint angles' cosines and sines, joint velocities, the gripper's
+        position, quaternion, finger positions and velocities, and the object's state) or ``"robomimic"`` (19 and 23: the
+        gripper's position, quaternion and finger positions, and the object's state); float32
+    :param horizon: control steps after which an episode is truncated
+    :param render_mode: ``"rgb_array"``, or None
+    :param camera: what :meth:`render` looks through: ``"agentview"``, ``"frontview"``, ``"sideview"`` among others
+    :param width: of the rendered pictures, in pixels
+    :param height: likewise
+    :raises ImportError: when robosuite is not installed
+    :raises ValueError: when a keyword has a value that is not allowed
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": CONTROL_FREQUENCY}  # type: ignore[misc]
+    env_id: ClassVar[str]
+
+    # what robosuite holds is put into checkpoints by checkpoint_state
+    checkpoint_skipped: ClassVar[tuple[str, ...]] = ("_simulation", "_renderer", "_layout", "task")
+
+    def __init__(
+        self,
+        obs: str = "paper",
+        horizon: int = 500,
+        render_mode: str | None = None,
+        camera: str = "agentview",
+        width: int = 384,
+        height: int = 384,
+    ) -> None:
+        self.task: RobosuiteTask = robosuite_task(self.env_id)
+        self._layout = self.task.layout(obs)
+        for name, value in (("horizon", horizon), ("width", width), ("height", height)):
+            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+                raise ValueError(f"{name}={value!r} must be a whole number of at least 1: give one, or leave it out")
+        if render_mode not in (None, "rgb_array"):
+            raise ValueError(f"render_mode={render_mode!r} is not available: choose 'rgb_array' or None")
+        utils.EzPickle.__init__(self, obs, horizon, render_mode, camera, width, height)
+        self.obs, self.horizon, self.render_mode, self.camera = obs, horizon, render_mode, camera
+        self.width, self.height = width, height
+        self.observation_space = spaces.Box(-np.inf, np.inf, (self.task.obs_dim(obs),), np.float32)
+        self.action_space = spaces.Box(-1.0, 1.0, (ACTION_DIM,), np.float32)
+        self._simulation = make_simulation(self.task.name)
+        self.model: Any = self._simulation.sim.model._model
+        self.data: Any = self._simulation.sim.data._data
+        cameras = [self.model.camera(i).name for i in range(self.model.ncam)]
+        if camera not in cameras:
+            raise ValueError(f"camera={camera!r} does not exist: choose one of {', '.join(cameras)}")
+        self._renderer: mujoco.Renderer | None = None
+        self._elapsed_steps = 0
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
+        """Start an episode: the arm near its rest pose, the object at a random place.
+
+        :param seed: of the generator; the same seed gives the same state bit for bit, None goes on with the generator
+        :param options: not used
+        :return: observation (obs_dim,) and ``{"is_success": False}``
+        """
+        super().reset(seed=seed)
+        share_generator(self._simulation, self.np_random)
+        self._randomize_model()
+        self._simulation.reset()
+        self._elapsed_steps = 0
+        return self._observe(), {"is_success": False}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """Advance by one control step, 1/20 s.
+
+        :param action: (7,)
+        :return: observation (obs_dim,), reward (1 on success, else 0), terminated (success), truncated (the horizon), info
+            with ``dense_reward`` (float) and ``is_success`` (bool)
+        """
+        dense_reward = float(self._simulation.step(np.asarray(action, dtype=np.float64))[1])
+        self._elapsed_steps += 1
+        observation = self._observe()
+        is_success = bool(self._simulation._check_success())
+        is_truncated = not is_success and self._elapsed_steps >= self.horizon
+        info = {"dense_reward": dense_reward, "is_success": is_success}
+        return observation, float(is_success), is_success, is_truncated, info
+
+    def observe_state(self, state: np.ndarray) -> np.ndarray:
+        """Put the simulation into a recorded state and observe it.
+
+        :param state: (1 + n_positions + n_velocities,): time, joint positions, joint velocities, as robosuite records them
+        :return: observation (obs_dim,)
+        :raises ValueError: when the state is of another size, so of another task
+        """
+        size = 1 + self.model.nq + self.model.nv
+        if np.shape(state) != (size,):
+            raise ValueError(f"a state of {self.env_id} has {size} numbers, found shape {np.shape(state)}: use its own states")
+        self.data.time = state[0]
+        self.data.qpos[:], self.data.qvel[:] = state[1 : 1 + self.model.nq], state[1 + self.model.nq :]
+        mujoco.mj_forward(self.model, self.data)
+        return self._observe()
+
+    def render(self) -> np.ndarray | None:
+        """The camera's view, (height, width, 3) uint8; None without a render mode.
+
+        :raises RuntimeError: (or what the OpenGL library raises) when the machine cannot render
+        """
+        if self.render_mode is None:
+            return None
+        if self._renderer is None:
+            self.model.vis.global_.offwidth, self.model.vis.global_.offheight = self.width, self.height
+            self._renderer = mujoco.Renderer(self.model, self.height, self.width)
+        options = mujoco.MjvOption()
+        options.geomgroup[0] = 0  # collision shapes
+        self._renderer.update_scene(self.data, camera=self.camera, scene_option=options)
+        return self._renderer.render().copy()
+
+    def close(self) -> None:
+        """Free the simulation and the renderer."""
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
+        if self._simulation.sim is not None:
+            self._simulation.close()
+
+    def checkpoint_state(self) -> dict[str, Any]:
+        """What a checkpoint needs beside ``data`` and the generators: plain values of the controllers, the gripper and the
+        counters."""
+        return {name: _plain_attributes(part) for name, part in _stateful_parts(self._simulation).items()}
+
+    def restore_checkpoint_state(self, state: dict[str, Any]) -> None:
+        """:param state: what :meth:`checkpoint_state` returned"""
+        share_generator(self._simulation, self.np_random)
+        for name, part in _stateful_parts(self._simulation).items():
+            vars(part).update(state[name])
+
+    def _randomize_model(self) -> None:
+        """Draw what differs between the models of two episodes."""
+
+    def _observe(self) -> np.ndarray:
+        mujoco.mj_kinematics(self.model, self.data)  # a control step ends with poses from before its last simulation step
+        parts = self._observation_parts()
+        return np.concatenate([parts[name] for name in self._layout]).astype(np.float32)
+
+    def _observation_parts(self) -> dict[str, np.ndarray]:
+        robot = self._simulation.robots[0]
+        joints = self.data.qpos[robot._ref_joint_pos_indexes]
+        eef_quat = np.roll(self.data.body(robot.robot_model.eef_name["right"]).xquat, -1)  # (w, x, y, z) to (x, y, z, w)
+        eef_position = self.data.site_xpos[robot.eef_site_id["right"]]
+        body = self._object_body()
+        position, quat = self.data.xpos[body], np.roll(self.data.xquat[body], -1)
+        return {
+            "robot0_joint_pos_cos": np.cos(joints),
+            "robot0_joint_pos_sin": np.sin(joints),
+            "robot0_joint_vel": self.data.qvel[robot._ref_joint_vel_indexes],
+            "robot0_eef_pos": eef_position,
+            "robot0_eef_quat": eef_quat,
+            "robot0_gripper_qpos": self.data.qpos[robot._ref_gripper_joint_pos_indexes["right"]],
+            "robot0_gripper_qvel": self.data.qvel[robot._ref_gripper_joint_vel_indexes["right"]],
+            "object": self.task.object_states(position[None], quat[None], eef_position[None], eef_quat[None])[0],
+        }
+
+    def _object_body(self) -> int:
+        """Index of the object's body in the model."""
+        raise NotImplementedError
+
+
+class SparseLiftEnv(SparseRobosuiteEnv):
+    """Lift a cube more than 4 cm off the table; its place, its angle and its edges are random.
+
+    The object's state is the cube's position (3), its quaternion (4) and its position relative to the gripper (3).
+    """
+
+    env_id = "SparseLift-v0"
+
+    def _randomize_model(self) -> None:
+        resize_cube(self._simulation, self.np_random.uniform(*CUBE_HALF_EDGES, size=3))
+
+    def _object_body(self) -> int:
+        return self._simulation.cube_body_id
+
+    def checkpoint_state(self) -> dict[str, Any]:
+        """As above, and the cube's half edges in metres, (3,)."""
+        return {**super().checkpoint_state(), "cube": np.array(self._simulation.cube.size)}
+
+    def restore_checkpoint_state(self, state: dict[str, Any]) -> None:
+        """:param state: what :meth:`checkpoint_state` returned"""
+        resize_cube(self._simulation, state["cube"])
+        super().restore_checkpoint_state(state)
+
+
+class SparsePickPlaceCanEnv(SparseRobosuiteEnv):
+    """Carry a can from the left bin into its quarter of the right one and let it go; its place and angle are random.
+
+    The object's state is the can's position (3) and quaternion (4) in the gripper's frame, its position (3) and its
+    quaternion (4) in the world's.
+    """
+
+    env_id = "SparsePickPlaceCan-v0"
+
+    def _object_body(self) -> int:
+        return self._simulation.obj_body_id[self._simulation.obj_to_use]
+
+
+def make_simulation(name: str, **kwargs: Any) -> Any:
+    """A robosuite environment of the Panda with soft resets, shaped rewards and neither renderer nor time limit.
+
+    robosuite's own observations are off, unless ``use_object_obs`` is asked for: ours are read from the simulation.
+
+    :param name: ``"Lift"`` or ``"PickPlaceCan"``
+    :param kwargs: robosuite's keywords, in the place of ours
+    :return: the robosuite environment
+    :raises ImportError: when robosuite is not installed; the message says how to install it
+    """
+    with _quiet_import():
+        try:
+            robosuite = importlib.import_module("robosuite")
+        except ModuleNotFoundError as error:
+            if error.name != "robosuite":
+                raise
+            raise ImportError('the robosuite tasks need robosuite: pip install "sb3-actpc[robosuite]"') from error
+        settings = dict(
+            robots="Panda",
+            controller_configs=robosuite.load_composite_controller_config(robot="Panda"),
+            control_freq=CONTROL_FREQUENCY,
+            has_renderer=False,
+            has_offscreen_renderer=False,
+            renderer="mujoco",
+            use_camera_obs=False,
+            use_object_obs=False,
+            reward_shaping=True,
+            hard_reset=False,
+            ignore_done=True,
+        )
+        simulation = robosuite.make(name, **{**settings, **kwargs})
+        if not kwargs.get("use_object_obs", False):
+            for observable in simulation.observation_names:
+                simulation.modify_observable(observable, "enabled", False)
+    return simulation
+
+
+def share_generator(simulation: Any, generator: np.random.Generator) -> None:
+    """Let a robosuite environment draw its random numbers from ``generator``.
+
+    :param simulation: the robosuite environment
+    :param generator: any generator
+    """
+    simulation.rng = generator
+    samplers = [simulation.placement_initializer]
+    while samplers:
+        sampler = samplers.pop()
+        sampler.rng = generator
+        samplers += getattr(sampler, "samplers", {}).values()
+
+
+def resize_cube(simulation: Any, half_edges: np.ndarray) -> None:
+    """Give Lift's cube other edges, as if the model had been compiled with them (robosuite compiles it for each episode).
+
+    :param simulation: the robosuite environment; its state is lost, reset it or restore one
+    :param half_edges: (3,) in metres
+    """
+    model, data = simulation.sim.model._model, simulation.sim.data._data
+    simulation.cube.size = [float(edge) for edge in half_edges]
+    body = model.body(simulation.cube.root_body).id
+    geoms = np.flatnonzero(model.geom_bodyid == body)
+    model.geom_size[geoms] = model.geom_aabb[geoms, 3:] = half_edges
+    model.geom_rbound[geoms] = np.linalg.norm(half_edges)
+    start = model.body_bvhadr[body]
+    model.bvh_aabb[start : start + model.body_bvhnum[body], 3:] = half_edges
+    model.body_mass[body] = 8.0 * CUBE_DENSITY * np.prod(half_edges)
+    squares = np.square(half_edges)
+    model.body_inertia[body] = model.body_mass[body] / 3.0 * (squares.sum() - squares)
+    mujoco.mj_setConst(model, data)
+
+
+@contextmanager
+def _quiet_import() -> Iterator[None]:
+    """Keep robosuite's greetings off the screen, and its choice of an OpenGL library out of the environment variables:
+    MuJoCo cannot be imported by child processes with the name of one that is not there."""
+    logger, backend = logging.getLogger("robosuite_logs"), os.environ.get("MUJOCO_GL")
+
+    def is_error(record: logging.LogRecord) -> bool:
+        return record.levelno >= logging.ERROR
+
+    logger.addFilter(is_error)
+    try:
+        yield
+    finally:
+        logger.removeFilter(is_error)
+        if backend is None:
+            os.environ.pop("MUJOCO_GL", None)
+        else:
+            os.environ["MUJOCO_GL"] = backend
+
+
+def _stateful_parts(simulation: Any) -> dict[str, Any]:
+    """The objects whose plain attributes change from step to step."""
+    robot = simulation.robots[0]
+    parts = {"environment": simulation, "gripper": robot.gripper["right"]}
+    return parts | {f"controller_{name}": part for name, part in robot.composite_controller.part_controllers.items()}
+
+
+def _plain_attributes(part: Any) -> dict[str, Any]:
+    """Numbers, flags, and arrays of numbers among an object's attributes (arrays copied)."""
+    plain: dict[str, Any] = {}
+    for name, value in vars(part).items():
+        if isinstance(value, np.ndarray) and value.dtype.kind in "bif":
+            plain[name] = value.copy()
+        elif value is None or type(value) in (bool, int, float):
+            plain[name] = value
+    return plain
