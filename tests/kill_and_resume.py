@@ -9,12 +9,14 @@ normalisers, generators, simulators, evaluations and logs (times of the clock le
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import multiprocessing
 import random
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from pathlib import Path
@@ -115,41 +117,55 @@ def _without_clock(node: dict[str, Any]) -> dict[str, Any]:
     return {key: value for key, value in node.items() if key != "episode_times"}
 
 
-def kill_and_resume(folder: Path, n_kills: int, n_steps: int, seed: int) -> bool:
-    """
-    :param folder: where both runs go
-    :param n_kills: how often
-    :param n_steps: environment steps of the run
-    :param seed: of the moments
-    :return: whether both runs are equal
-    """
-    moments = random.Random(seed)
-    (folder / "straight").mkdir()
-    (folder / "killed").mkdir()
-    process = start(folder / "straight", n_steps)
+def run_to_the_end(folder: Path, n_steps: int) -> float:
+    """:return: seconds that it learned"""
+    process = start(folder, n_steps)
     started = time.perf_counter()
     process.join()
     assert process.exitcode == 0
-    whole = time.perf_counter() - started
-    done = 0
-    while done < n_kills:
-        process = start(folder / "killed", n_steps)
-        time.sleep(moments.uniform(0.0, 2.0 * whole / (n_kills + 1)))
-        if not process.is_alive():
-            break
+    return time.perf_counter() - started
+
+
+def kill_often(folder: Path, n_kills: int, n_steps: int, pauses: Iterator[float]) -> int:
+    """Kill a run and go on with it until it has been killed so often, or ends.
+
+    :return: how often it was killed
+    """
+    for killed in range(n_kills):
+        process = start(folder, n_steps)
+        process.join(next(pauses))
+        if process.exitcode is not None:
+            assert process.exitcode == 0
+            return killed
         process.kill()
         process.join()
-        done += 1
-        print(f"killed {done}", flush=True)
-    if process.exitcode != 0:
-        process = start(folder / "killed", n_steps)
-        process.join()
-        assert process.exitcode == 0
-    one, two = end_state(folder / "straight"), end_state(folder / "killed")
-    for path in differences(one, two):
+        print(f"killed {killed + 1}", flush=True)
+    run_to_the_end(folder, n_steps)
+    return n_kills
+
+
+def kill_and_resume(folder: Path, n_kills: int, n_steps: int, seed: int) -> bool:
+    """
+    :param folder: where all runs go
+    :param n_kills: how often; where a run ends before, another one is begun
+    :param n_steps: environment steps of a run
+    :param seed: of the moments
+    :return: whether the killed runs are equal to the one never stopped
+    """
+    moments = random.Random(seed)
+    (folder / "straight").mkdir()
+    seconds = run_to_the_end(folder / "straight", n_steps)
+    straight = end_state(folder / "straight")
+    pauses = (moments.uniform(0.0, 2.0 * seconds / (n_kills + 1)) for _ in itertools.count())
+    done, found = 0, []
+    while done < n_kills:
+        killed = Path(tempfile.mkdtemp(dir=folder))
+        done += kill_often(killed, n_kills - done, n_steps, pauses)
+        found += differences(straight, end_state(killed))
+    for path in found:
         print(f"different: {path}")
-    print(f"{done} kills, {one['steps']} steps: {'equal' if one == two else 'NOT EQUAL'}")
-    return one == two
+    print(f"{done} kills, {n_steps} steps: {'NOT EQUAL' if found else 'equal'}")
+    return not found
 
 
 def main() -> int:

@@ -267,7 +267,8 @@ class ActPC(OffPolicyAlgorithm):
         }
         self.policy_kwargs = self._merged_policy_kwargs()
         self.n_steps = 1  # the buffer knows; SB3 would warn that a custom one does not
-        with named_in_errors(f"buffer_size={self.buffer_size}, replay_buffer_kwargs={asked[1]!r}", ValueError):
+        # SB3 checks by assertion what does not go together
+        with named_in_errors(f"buffer_size={self.buffer_size}, replay_buffer_kwargs={asked[1]!r}", ValueError, AssertionError):
             super()._setup_model()
         self.replay_buffer_kwargs, self.policy_kwargs, self.n_steps = asked[1:]
         self._create_aliases()

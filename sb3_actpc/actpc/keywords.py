@@ -41,7 +41,7 @@ def check_keywords(given: Mapping[str, Any], policies: Mapping[str, type[BasePol
         optional="alpha_ext nudge",
         optional_whole="n_demonstrations n_demonstration_transitions seed",
         flags="optimize_memory_usage scale_pressure combined_replay working_memory",
-        texts="tensorboard_log",
+        paths="tensorboard_log",
         mappings=" ".join(["circuit_kwargs policy_kwargs replay_buffer_kwargs", *(f"{name}_kwargs" for name in CIRCUITS)]),
     )
     check_choices(

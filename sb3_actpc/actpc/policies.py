@@ -253,7 +253,7 @@ class ActPCPolicy(BasePolicy):
         self._build()
 
     def _build(self) -> None:
-        with named_in_errors(f"features_extractor_kwargs={self.features_extractor_kwargs!r}"):
+        with named_in_errors(f"features_extractor_kwargs={self.features_extractor_kwargs!r}", AssertionError):
             extractor = self.make_features_extractor()
         extractor.requires_grad_(False)
         arch, kwargs = self._net_arch_of("actor"), self._circuit_kwargs_of("actor")

@@ -14,7 +14,7 @@ import re
 import shutil
 import uuid
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
@@ -27,7 +27,7 @@ FORMAT = "sb3_actpc checkpoint"
 VERSION = 2
 MANIFEST = "manifest.json"
 SEGMENT = 8 * 2**20  # bytes of an array in one file
-COMPARED = 64 * 2**10  # bytes at a time: fresh memory for more would cost more than the comparison
+PIECE = 64 * 2**10  # bytes read at a time: fresh memory for more would cost more than what is done with them
 SHARED_FROM = 2**20  # bytes; smaller files are written again, so that damage to one concerns one checkpoint
 _NAME = re.compile(r"(\d{6,})_step_(\d+)")
 _TEMPORARY = ".writing-"
@@ -54,7 +54,7 @@ class BundleWriter:
     def __init__(self, folder: Path, previous: Bundle | None, workers: ThreadPoolExecutor) -> None:
         self.folder, self.previous, self.workers = folder, previous, workers
         self._shared: dict[str, dict[str, Any]] = {}
-        self._written: dict[str, tuple[int, Future[str]]] = {}
+        self._written: dict[str, tuple[int, Future[str], Future[None]]] = {}
 
     def files(self) -> dict[str, dict[str, Any]]:
         """Wait until everything is on the disk.
@@ -62,8 +62,11 @@ class BundleWriter:
         :return: name -> SHA-256 and size
         :raises OSError: when a file could not be flushed
         """
-        written = {name: {"sha256": digest.result(), "bytes": size} for name, (size, digest) in self._written.items()}
-        return {**self._shared, **written}
+        files = dict(self._shared)
+        for name, (size, digest, flushed) in self._written.items():
+            flushed.result()
+            files[name] = {"sha256": digest.result(), "bytes": size}
+        return files
 
     def add_bytes(self, name: str, data: bytes) -> None:
         """:param name: file name
@@ -100,10 +103,11 @@ class BundleWriter:
 
     def _write(self, name: str, parts: list[memoryview]) -> None:
         path = self.folder / name
+        digest = self.workers.submit(_hash, parts)
         with open(path, "xb", buffering=0) as file:
             for part in parts:
                 _write_all(file, part)
-        self._written[name] = sum(map(len, parts)), self.workers.submit(_flush_and_hash, path, parts)
+        self._written[name] = sum(map(len, parts)), digest, self.workers.submit(_flush, path)
 
     def _share(self, name: str, parts: list[memoryview]) -> bool:
         """Give the previous checkpoint's file a second name here, if it has this content.
@@ -134,10 +138,12 @@ def _write_all(file: IO[bytes], part: memoryview) -> None:
         part = part[file.write(part) :]
 
 
-def _flush_and_hash(path: Path, parts: list[memoryview]) -> str:
-    """Flush what was written to the disk; its SHA-256 is that of the memory it was written from."""
+def _flush(path: Path) -> None:
     with open(path, "rb+") as file:
         os.fsync(file.fileno())
+
+
+def _hash(parts: Iterable[bytes | memoryview]) -> str:
     digest = hashlib.sha256()
     for part in parts:
         digest.update(part)
@@ -148,7 +154,7 @@ def _holds(path: Path, parts: list[memoryview]) -> bool:
     """Whether a file has exactly this content."""
     if path.stat().st_size != sum(map(len, parts)):
         return False
-    pieces = (part[start : start + COMPARED] for part in parts for start in range(0, len(part), COMPARED))
+    pieces = (part[start : start + PIECE] for part in parts for start in range(0, len(part), PIECE))
     with open(path, "rb") as file:
         return all(file.read(len(piece)) == bytes(piece) for piece in pieces)
 
@@ -339,11 +345,8 @@ def _manifest_hash(manifest: Mapping[str, Any]) -> str:
 
 
 def _hash_file(path: Path) -> str:
-    digest = hashlib.sha256()
     with open(path, "rb") as file:
-        while part := file.read(SEGMENT):
-            digest.update(part)
-    return digest.hexdigest()
+        return _hash(iter(lambda: file.read(PIECE), b""))
 
 
 def _read_header(file: IO[bytes]) -> tuple[tuple[int, ...], np.dtype[Any]]:

@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from numbers import Integral, Real
+from os import PathLike
 from types import NoneType
 from typing import Any
 
@@ -58,7 +59,7 @@ _KINDS: dict[str, tuple[Callable[[Any], bool], str]] = {
     "optional": (lambda value: value is None or _is_number(value), "a finite number or None"),
     "optional_whole": (lambda value: value is None or _is_whole(value), "a whole number or None"),
     "flags": (lambda value: isinstance(value, (bool, np.bool_)), "True or False"),
-    "texts": (lambda value: isinstance(value, (str, NoneType)), "a text or None"),
+    "paths": (lambda value: isinstance(value, (str, PathLike, NoneType)), "a path or None"),
     "mappings": (
         lambda value: value is None or (isinstance(value, Mapping) and all(isinstance(key, str) for key in value)),
         "a dictionary with text keys, or None",
@@ -70,7 +71,7 @@ def check_kinds(given: Mapping[str, Any], **names: str) -> None:
     """
     :param given: keyword -> value
     :param names: keywords (separated by spaces) that must be ``numbers`` (finite), ``whole`` numbers, ``optional`` (a number
-        or None), ``optional_whole``, ``flags``, ``texts`` or ``mappings`` (the last two may be None)
+        or None), ``optional_whole``, ``flags``, ``paths`` or ``mappings`` (the last two may be None)
     :raises ValueError: naming the first value of another kind
     """
     for option, keywords in names.items():
