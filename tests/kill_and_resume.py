@@ -10,32 +10,37 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
+import multiprocessing
 import random
-import subprocess
 import sys
 import tempfile
 import time
+from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
 
-ROOT = Path(__file__).resolve().parents[1]
+import safetensors.numpy
+import safetensors.torch
+import torch as th
+from stable_baselines3.common.callbacks import EvalCallback
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.logger import configure
+from stable_baselines3.common.vec_env import VecNormalize
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+import sb3_actpc.envs  # noqa: F401, registers the task
+from sb3_actpc import ActPC
+from sb3_actpc.checkpoints import CheckpointCallback, continue_learning, find_bundle, list_bundles, restore
+from tests.checkpoints.runs import START_METHOD, log_rows
+
+PROCESSES: Any = multiprocessing.get_context(START_METHOD)
 SAVE_FREQ = 10
 CLOCK = {"time/fps", "time/time_elapsed"}
 
 
-def train(folder: Path, n_steps: int) -> None:
+def train(folder: Path, n_steps: int, started: Connection) -> None:
     """The run: start it, or go on with it, to its end."""
-    import torch as th
-    from stable_baselines3.common.callbacks import EvalCallback
-    from stable_baselines3.common.env_util import make_vec_env
-    from stable_baselines3.common.logger import configure
-    from stable_baselines3.common.vec_env import VecNormalize
-
-    import sb3_actpc.envs  # noqa: F401, registers the task
-    from sb3_actpc import ActPC
-    from sb3_actpc.checkpoints import CheckpointCallback, continue_learning, list_bundles, restore
-
     th.set_num_threads(1)
     env = VecNormalize(make_vec_env("SparseReacher-v5", n_envs=2, seed=0))
     model = ActPC(
@@ -51,43 +56,56 @@ def train(folder: Path, n_steps: int) -> None:
     if resumes:
         restore(model, folder / "checkpoints", print)
     model.set_logger(configure(str(folder), ["csv"]))
-    print(f"learning from step {model.num_timesteps}", flush=True)
+    print(f"  learning from step {model.num_timesteps}", flush=True)
+    started.send(model.num_timesteps)
     if resumes:
         continue_learning(model, [checkpoints, evaluation], log_interval=1)
     else:
         model.learn(n_steps, [checkpoints, evaluation], log_interval=1)
 
 
-def start(folder: Path, n_steps: int) -> subprocess.Popen[str]:
+def start(folder: Path, n_steps: int) -> BaseProcess:
     """The run in a process of its own, returned once it learns."""
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, str(Path(__file__).resolve()), "--train", str(folder), "--steps", str(n_steps)]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment)
-    assert process.stdout is not None
-    for line in process.stdout:
-        if line.startswith("learning"):
-            print(" ", line.strip(), flush=True)
-            return process
-        print(" ", line.strip())
-    raise RuntimeError(f"the run ended with code {process.wait()} before it learned")
+    receiver, sender = PROCESSES.Pipe(duplex=False)
+    process = PROCESSES.Process(target=train, args=(folder, n_steps, sender))
+    process.start()
+    sender.close()
+    try:
+        receiver.recv()
+    except EOFError:
+        process.join()
+        raise RuntimeError(f"the run ended with code {process.exitcode} before it learned") from None
+    return process
 
 
 def end_state(folder: Path) -> dict[str, Any]:
     """What the run has come to, without times of the clock."""
-    from sb3_actpc.checkpoints import find_bundle
-    from tests.checkpoints.runs import log_rows
-
     bundle = find_bundle(folder / "checkpoints")
-    files = {name: entry["sha256"] for name, entry in bundle.manifest["files"].items() if name != "state.json"}
+    files = {name: bundle.read_bytes(name) for name in bundle.manifest["files"] if name != "state.json"}
+    arrays = safetensors.numpy.load(files.pop("arrays.safetensors"))
+    tensors = safetensors.torch.load(files.pop("tensors.safetensors"))
     state = bundle.read_json("state.json")
     del state["logger"]["values"], state["counters"]["_num_timesteps_at_start"]
     state["logger"]["csv"] = None
     return {
         "files": files,
+        "arrays": {name: (str(array.dtype), array.tobytes()) for name, array in arrays.items()},
+        "tensors": {name: (str(tensor.dtype), tensor.numpy().tobytes()) for name, tensor in tensors.items()},
         "state": json.loads(json.dumps(state), object_hook=_without_clock),
         "progress": log_rows(folder / "progress.csv"),
         "steps": bundle.num_timesteps,
     }
+
+
+def differences(one: Any, two: Any, path: str = "") -> list[str]:
+    """Where two nested values of plain types differ."""
+    if isinstance(one, dict) and isinstance(two, dict):
+        parts = [(key, one.get(key), two.get(key)) for key in {**one, **two}]
+    elif isinstance(one, list) and isinstance(two, list) and len(one) == len(two):
+        parts = [(number, *pair) for number, pair in enumerate(zip(one, two, strict=True))]
+    else:
+        return [] if one == two else [path]
+    return [found for key, mine, theirs in parts for found in differences(mine, theirs, f"{path}/{key}")]
 
 
 def _without_clock(node: dict[str, Any]) -> dict[str, Any]:
@@ -110,24 +128,26 @@ def kill_and_resume(folder: Path, n_kills: int, n_steps: int, seed: int) -> bool
     (folder / "killed").mkdir()
     process = start(folder / "straight", n_steps)
     started = time.perf_counter()
-    assert process.wait() == 0
+    process.join()
+    assert process.exitcode == 0
     whole = time.perf_counter() - started
     done = 0
     while done < n_kills:
         process = start(folder / "killed", n_steps)
         time.sleep(moments.uniform(0.0, 2.0 * whole / (n_kills + 1)))
-        if process.poll() is not None:
+        if not process.is_alive():
             break
         process.kill()
-        process.wait()
+        process.join()
         done += 1
         print(f"killed {done}", flush=True)
-    if process.poll() != 0:
-        assert start(folder / "killed", n_steps).wait() == 0
+    if process.exitcode != 0:
+        process = start(folder / "killed", n_steps)
+        process.join()
+        assert process.exitcode == 0
     one, two = end_state(folder / "straight"), end_state(folder / "killed")
-    for name, value in one.items():
-        if value != two[name]:
-            print(f"{name} differ")
+    for path in differences(one, two):
+        print(f"different: {path}")
     print(f"{done} kills, {one['steps']} steps: {'equal' if one == two else 'NOT EQUAL'}")
     return one == two
 
@@ -138,12 +158,7 @@ def main() -> int:
     parser.add_argument("--kills", type=int, default=30)
     parser.add_argument("--steps", type=int, default=600)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--train", type=Path, help=argparse.SUPPRESS)
     args = parser.parse_args()
-    if args.train is not None:
-        train(args.train, args.steps)
-        return 0
-    sys.path.insert(0, str(ROOT))
     with tempfile.TemporaryDirectory() as folder:
         return 0 if kill_and_resume(Path(folder), args.kills, args.steps, args.seed) else 1
 

@@ -51,11 +51,12 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--steps", type=int, default=100_000)
     parser.add_argument("--buffer-size", type=int, default=5_000)
+    parser.add_argument("--train-freq", type=int, default=2, help="steps between two updates")
     args = parser.parse_args()
     since = 2 * args.buffer_size
     model = ActPC(
         "MlpPolicy", make_vec_env("SparseReacher-v5"), settling="scheduled", buffer_size=args.buffer_size, batch_size=16,
-        self_imitation_size=args.buffer_size, policy_kwargs={"net_arch": [16, 16]}, seed=0,
+        self_imitation_size=args.buffer_size, policy_kwargs={"net_arch": [16, 16]}, train_freq=args.train_freq, seed=0,
     )  # fmt: skip
     watch = Watch(since, args.steps)
     with tempfile.TemporaryDirectory() as folder:

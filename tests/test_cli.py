@@ -13,10 +13,11 @@ import numpy as np
 import pytest
 import yaml
 from stable_baselines3 import TD3
+from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 
 from sb3_actpc.cli import main
-from sb3_actpc.common.demonstrations import Demonstrations
+from sb3_actpc.common.demonstrations import DATA_FOLDER, Demonstrations
 from sb3_actpc.training import ALGORITHMS, RunConfig, play_episodes, train_run
 from sb3_actpc.training.config import find_demonstrations, load_preset, parse_assignments, parse_schedule
 from sb3_actpc.training.video import RenderingUnavailable, choose_gl_backend
@@ -361,13 +362,41 @@ def test_presets_are_plain_and_an_entry_replaces_the_default() -> None:
     assert load_preset("p.yml", "Other-v0") == {"gamma": 0.9, "tau": 0.01}
     assert load_preset("p.yml", ENV_ID) == {"policy_kwargs": {"optimizer_kwargs": {"eps": 1e-5}}}
     Path("p.yml").write_text("default: !!python/object/apply:os.getcwd []", encoding="utf-8")
-    with pytest.raises(ValueError, match="not a YAML file"):
+    with pytest.raises(ValueError, match="not YAML of plain values"):
         load_preset("p.yml", ENV_ID)
 
 
 def test_the_shipped_preset_has_settings_for_every_task() -> None:
     for env_id in ("SparseHalfCheetah-v5", "Anything-v0"):
         assert load_preset("actpc", env_id)["n_timesteps"] >= 1
+
+
+# mean dense returns that the shipped demonstrators must reach; the paper's agents are compared with such ones
+AIMS = {"HalfCheetah": 5500.0, "Walker2d": 3000.0, "Hopper": 2200.0, "Swimmer": 100.0, "Reacher": -6.0}
+
+
+@pytest.mark.parametrize("task", AIMS)
+def test_every_task_ships_good_successful_demonstrations_and_the_command_that_made_them(task: str) -> None:
+    demonstrations = Demonstrations.load(find_demonstrations(f"Sparse{task}-v5", "shipped"))
+    assert demonstrations.n_episodes == 20
+    assert demonstrations.dense_returns.mean() >= AIMS[task]
+    assert (demonstrations.episode_returns > 0).all()
+    assert demonstrations.metadata["command"].startswith(f"sb3-actpc demos collect --env Sparse{task}-v5")
+    env = make_vec_env(f"Sparse{task}-v5")
+    demonstrations.check(env.observation_space, env.action_space, f"Sparse{task}-v5")
+    assert np.array_equal(demonstrations.rewarded_by(env).rewards, demonstrations.rewards)
+    env.close()
+
+
+def test_the_weak_demonstrators_reach_about_half() -> None:
+    weak = Demonstrations.load(find_demonstrations("SparseHalfCheetah-v5", "weak"))
+    assert 0.4 * AIMS["HalfCheetah"] < weak.dense_returns.mean() < 0.6 * AIMS["HalfCheetah"]
+    with pytest.raises(FileNotFoundError, match="no weak demonstrations of SparseHopper-v5"):
+        find_demonstrations("SparseHopper-v5", "weak")
+
+
+def test_shipped_files_stay_below_12_megabytes() -> None:
+    assert sum(path.stat().st_size for path in DATA_FOLDER.glob("*.npz")) < 12e6
 
 
 def test_assignments_are_read_as_yaml() -> None:

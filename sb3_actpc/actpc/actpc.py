@@ -1,7 +1,7 @@
 """ActPC: active predictive coding as a Stable-Baselines3 algorithm (Ororbia & Mali, arXiv 2209.09174, Algorithm 1)."""
 
 import warnings
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from functools import reduce
 from os import PathLike
 from pathlib import Path
@@ -20,11 +20,12 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from sb3_actpc.actpc.demonstration_replay import DemonstrationReplay
 from sb3_actpc.actpc.diagnostics import Diagnostics
 from sb3_actpc.actpc.inputs import Batch, CircuitInputs
+from sb3_actpc.actpc.keywords import check_keywords
 from sb3_actpc.actpc.policies import ActPCActor, ActPCPolicy, CnnPolicy, Critics, MlpPolicy, MultiInputPolicy
-from sb3_actpc.actpc.signals import SIGNAL_ERRORS, make_normalizer, summed_squared_errors
-from sb3_actpc.checkpoints import load_checkpoint, load_weights, save_weights
+from sb3_actpc.actpc.signals import make_normalizer, summed_squared_errors
+from sb3_actpc.checkpoints import between_updates, load_checkpoint, load_weights, save_weights
 from sb3_actpc.common.buffers import _SignalReplay, combined_buffer_class
-from sb3_actpc.common.checks import check_choices, check_finite, check_kinds, check_numbers
+from sb3_actpc.common.checks import check_finite, named_in_errors
 from sb3_actpc.common.demonstration_buffers import fit_demonstrations
 from sb3_actpc.common.demonstrations import Demonstrations
 from sb3_actpc.common.episodes import Episodes, map_observations, sample_union
@@ -32,11 +33,9 @@ from sb3_actpc.ngc import HebbianChanges, NGCCircuit, settle_coupled
 
 SelfActPC = TypeVar("SelfActPC", bound="ActPC")
 
-SETTLINGS = ("iterative", "scheduled")
-BOOTSTRAPS = ("joint", "literal")
-TARGET_UPDATES = ("polyak", "hard")
-OBSERVATION_NORMALIZATIONS = ("none", "demonstrations")
-SMALLEST_VALUE_SCALE = 0.1  # of the mean absolute action-value that ``scale_pressure`` divides by: values start near 0
+# of the mean absolute action-value that ``scale_pressure`` divides by: one paid step. Where nothing was paid yet, the critic's
+# noise must not be blown up to full strength
+SMALLEST_VALUE_SCALE = 1.0
 EXPERT_SIGNALS_INTERVAL = 1000  # updates between two evaluations of the demonstrations' signals
 
 
@@ -86,7 +85,7 @@ class ActPC(OffPolicyAlgorithm):
     :param signal_normalizer: "max" (running maximum, the paper), "saturating" (r / (r + 1)) or "quantile"
     :param signal_errors: the signals sum the squared errors of "all" layers (the paper) or of the "output" alone
     :param actor_pressure: weight of the critic's pressure on the actor; 0 leaves refresh alone (cloning)
-    :param scale_pressure: divide the pressure by the batch's mean absolute action-value (at least 0.1)
+    :param scale_pressure: divide the pressure by the batch's mean absolute action-value (at least 1: one paid step)
     :param nudge: scale of the critic's clamped error while actor and critic settle as one (the paper's is 1); None for an
         infinitesimal one, or 1 with ``dynamics="state"``
     :param critic_warmup: updates before the critic's pressure reaches the actor
@@ -184,36 +183,7 @@ class ActPC(OffPolicyAlgorithm):
         seed: int | None = None,
         _init_setup_model: bool = True,
     ) -> None:
-        given = dict(locals())
-        check_kinds(
-            given,
-            numbers="tau gamma learning_starts refresh_weight demonstration_fraction alpha_ep alpha_in actor_pressure "
-            "target_policy_noise target_noise_clip",
-            whole="buffer_size batch_size n_steps gradient_steps prior_updates actor_warm_start self_imitation_size "
-            "critic_warmup n_critics target_update_interval memory_history stats_window_size verbose",
-            optional="alpha_ext nudge n_demonstrations n_demonstration_transitions seed",
-            mappings="circuit_kwargs actor_kwargs critic_kwargs generator_kwargs prior_kwargs policy_kwargs "
-            "replay_buffer_kwargs",
-        )
-        if not callable(learning_rate):
-            check_kinds(given, numbers="learning_rate")
-        check_choices(
-            given,
-            settling=SETTLINGS,
-            signal_errors=SIGNAL_ERRORS,
-            bootstrap=BOOTSTRAPS,
-            target_update=TARGET_UPDATES,
-            observation_normalization=OBSERVATION_NORMALIZATIONS,
-        )
-        check_numbers(
-            given,
-            at_least_0="prior_updates actor_warm_start refresh_weight self_imitation_size actor_pressure critic_warmup "
-            "target_policy_noise target_noise_clip",
-            at_least_1="n_critics target_update_interval memory_history",
-            fraction="demonstration_fraction",
-        )
-        if nudge is not None and not 0.0 < nudge <= 1.0:
-            raise ValueError(f"nudge={nudge!r} must be above 0 and at most 1")
+        check_keywords(locals(), self.policy_aliases)
         super().__init__(
             policy,
             env,
@@ -276,7 +246,7 @@ class ActPC(OffPolicyAlgorithm):
         self.signal_normalizer = signal_normalizer
         self.epistemic_normalizer = make_normalizer(signal_normalizer)
         self.instrumental_normalizer = make_normalizer(signal_normalizer)
-        self.pretrained = False
+        self.pretrained, self.n_pretraining_updates = False, 0
         if _init_setup_model:
             self._setup_model()
 
@@ -297,7 +267,8 @@ class ActPC(OffPolicyAlgorithm):
         }
         self.policy_kwargs = self._merged_policy_kwargs()
         self.n_steps = 1  # the buffer knows; SB3 would warn that a custom one does not
-        super()._setup_model()
+        with named_in_errors(f"buffer_size={self.buffer_size}, replay_buffer_kwargs={asked[1]!r}", ValueError):
+            super()._setup_model()
         self.replay_buffer_kwargs, self.policy_kwargs, self.n_steps = asked[1:]
         self._create_aliases()
         self._setup_demonstrations()
@@ -310,11 +281,10 @@ class ActPC(OffPolicyAlgorithm):
             **{f"{name}_kwargs": getattr(self, f"{name}_kwargs") for name in ("actor", "critic", "generator", "prior")},
         }
         merged = {**own, **self.policy_kwargs}
-        given = {**(self.circuit_kwargs or {}), **merged.get("circuit_kwargs", {})}
-        if given.get("settling", self.settling) != self.settling:
-            raise ValueError(
-                f"circuit_kwargs has settling={given['settling']!r} but the agent's is {self.settling!r}; pass settling="
-            )
+        given = {**(self.circuit_kwargs or {}), **(merged.get("circuit_kwargs") or {})}
+        chosen = given.get("settling", self.settling)
+        if not isinstance(chosen, str) or chosen != self.settling:
+            raise ValueError(f"circuit_kwargs has settling={chosen!r} but the agent's is {self.settling!r}; pass settling=")
         merged["circuit_kwargs"] = {**given, "settling": self.settling}
         return merged
 
@@ -392,11 +362,16 @@ class ActPC(OffPolicyAlgorithm):
                 self.replay_buffer.cut_running_episodes()
         result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
         self._check_observations(self._last_obs)
-        self.pretrain()
+        self.pretrain(between_updates(result[1]))
         return result
 
-    def pretrain(self) -> None:
-        """Train the prior (and, if asked for, the actor) on the demonstrations, once; ``learn`` calls this."""
+    def pretrain(self, before_update: Callable[[], None] = lambda: None) -> None:
+        """
+        Train the prior (and, if asked for, the actor) on the demonstrations, once; ``learn`` calls this.
+
+        :param before_update: called before each update
+        :raises ValueError: when the demonstrations of a loaded agent are not there any more
+        """
         if self.expert is None and self.demonstrations is not None:
             raise ValueError(f"no demonstrations file at {self.demonstrations}: set agent.demonstrations, or put it back")
         if self.pretrained or self.expert is None:
@@ -407,10 +382,14 @@ class ActPC(OffPolicyAlgorithm):
                 "observation_normalization='demonstrations'",
                 stacklevel=2,
             )
-        for _ in range(self.prior_updates if self.alpha_in else 0):  # without a weight the prior has no role
-            self._update_prior(self.policy.batch_size_of("prior", self.batch_size))
-        for _ in range(self.actor_warm_start):
-            self.actor.circuit.apply_changes(self._refresh_changes(), self.actor.circuit.optimizer)
+        n_prior = self.prior_updates if self.alpha_in else 0  # without a weight the prior has no role
+        for update in range(self.n_pretraining_updates, n_prior + self.actor_warm_start):
+            before_update()
+            if update < n_prior:
+                self._update_prior(self.policy.batch_size_of("prior", self.batch_size))
+            else:
+                self.actor.circuit.apply_changes(self._refresh_changes(), self.actor.circuit.optimizer)
+            self.n_pretraining_updates += 1
         self.actor_target.load_state_dict(self.actor.circuit.state_dict())
         self.pretrained = True
 
@@ -529,12 +508,16 @@ class ActPC(OffPolicyAlgorithm):
         inputs, weights = self.inputs, self.reward_weights
         features = inputs.features(replayed.observations)
         memory, next_memory = inputs.memories(replayed.history, replayed.history_mask, features)
+        next_features = bootstrap_features = inputs.features(replayed.next_observations)
+        if replayed.following_observations is not None:
+            next_features = inputs.features(replayed.following_observations)
         internal = weights[1] * replayed.epistemic + weights[2] * replayed.instrumental
         self.diagnostics.follow(internal_reward=internal.mean, task_reward=replayed.rewards.mean)
         batch = Batch(
             features=features,
             actions=replayed.actions,
-            next_features=inputs.features(replayed.next_observations),
+            next_features=next_features,
+            bootstrap_features=bootstrap_features,
             memory=memory,
             next_memory=next_memory,
             rewards=weights[0] * replayed.rewards + internal,
@@ -545,7 +528,7 @@ class ActPC(OffPolicyAlgorithm):
             if any(weights[1:]) and (self._n_updates % EXPERT_SIGNALS_INTERVAL == 1 or not self.expert.has_signals):
                 normalizers = self.epistemic_normalizer, self.instrumental_normalizer
                 self.expert.refresh_signals(self._raw_signals, inputs, *normalizers)
-            batch = batch.join(self.expert.sample(n_expert, inputs, weights, self.gamma))
+            batch = batch.join(self.expert.sample(n_expert, inputs, weights, self.gamma, self.n_steps))
         if min(sizes) == batch_size:
             return batch
         # circuits with a smaller batch take its first rows: the newest, then a fair mixture of the rest
@@ -587,11 +570,11 @@ class ActPC(OffPolicyAlgorithm):
         if self.bootstrap == "literal":
             next_actions = batch.actions
         else:
-            next_actions = self.actor_target.project(batch.next_features, batch.next_memory)
+            next_actions = self.actor_target.project(batch.bootstrap_features, batch.next_memory)
             if self.target_policy_noise:
                 noise = th.randn_like(next_actions) * self.target_policy_noise
                 next_actions = (next_actions + noise.clamp(-self.target_noise_clip, self.target_noise_clip)).clamp(-1.0, 1.0)
-        inputs = th.cat([batch.next_features, next_actions], dim=1)
+        inputs = th.cat([batch.bootstrap_features, next_actions], dim=1)
         first, *others = (critic.project(inputs) for critic in self.critic_target)
         values = reduce(th.minimum, others, first)
         return batch.rewards + (1.0 - batch.dones) * batch.discounts * values
@@ -671,6 +654,7 @@ class ActPC(OffPolicyAlgorithm):
         expert = self.expert
         return {
             "pretrained": self.pretrained,
+            "n_pretraining_updates": self.n_pretraining_updates,
             "rollout_state": self._rollout_state,
             "rollout_starts": self._rollout_starts,
             "normalizers": [dict(vars(self.epistemic_normalizer)), dict(vars(self.instrumental_normalizer))],
@@ -692,8 +676,8 @@ class ActPC(OffPolicyAlgorithm):
             )
         if self.expert is not None:
             self.expert.epistemic, self.expert.instrumental, self.expert.has_signals = signals
-        self.pretrained, self._rollout_state = state["pretrained"], state["rollout_state"]
-        self._rollout_starts = state["rollout_starts"]
+        self.pretrained, self.n_pretraining_updates = state["pretrained"], state["n_pretraining_updates"]
+        self._rollout_state, self._rollout_starts = state["rollout_state"], state["rollout_starts"]
         normalizers = self.epistemic_normalizer, self.instrumental_normalizer
         for normalizer, values in zip(normalizers, state["normalizers"], strict=True):
             vars(normalizer).update(values)

@@ -30,6 +30,8 @@ class DemonstrationReplay:
         history: int,
     ) -> None:
         self.demonstrations, self.history = demonstrations, history
+        bounds = demonstrations.episode_bounds
+        self.ends = np.repeat(bounds[:, 1], bounds[:, 1] - bounds[:, 0])
         self.episodes = Episodes.from_demonstrations(demonstrations, observation_space, action_space)
         self.next_observations = Episodes(
             split_observations(observation_space, demonstrations.next_observations),
@@ -42,37 +44,57 @@ class DemonstrationReplay:
     def __len__(self) -> int:
         return len(self.demonstrations)
 
-    def sample(self, n: int, inputs: CircuitInputs, weights: tuple[float, float, float], gamma: float) -> Batch:
+    def sample(
+        self, n: int, inputs: CircuitInputs, weights: tuple[float, float, float], gamma: float, n_steps: int = 1
+    ) -> Batch:
         """``n`` transitions drawn uniformly; see :meth:`batch`."""
-        return self.batch(np.random.randint(0, len(self), size=n), inputs, weights, gamma)
+        return self.batch(np.random.randint(0, len(self), size=n), inputs, weights, gamma, n_steps)
 
-    def batch(self, rows: np.ndarray, inputs: CircuitInputs, weights: tuple[float, float, float], gamma: float) -> Batch:
+    def batch(
+        self, rows: np.ndarray, inputs: CircuitInputs, weights: tuple[float, float, float], gamma: float, n_steps: int = 1
+    ) -> Batch:
         """
         :param rows: (B,) which transitions
         :param inputs: turns observations into features
         :param weights: (α_ext, α_ep, α_in)
         :param gamma: discount
+        :param n_steps: length of the returns, which end with the episode
         :return: the transitions as the circuits see them
         """
         samples = self.episodes.take(rows, self.history)
         features = inputs.features(inputs.observations(samples.observations))
         history = None if samples.history is None else inputs.observations(samples.history, batch_dims=2)
-        mask = None if samples.history_mask is None else inputs.tensor(samples.history_mask)
-        memory, next_memory = inputs.memories(history, mask, features)
-        task = self.demonstrations.rewards[rows]
-        if inputs.vec_normalize is not None:
-            task = inputs.vec_normalize.normalize_reward(task)
-        rewards = weights[0] * task + weights[1] * self.epistemic[rows] + weights[2] * self.instrumental[rows]
+        history_mask = None if samples.history_mask is None else inputs.tensor(samples.history_mask)
+        memory, next_memory = inputs.memories(history, history_mask, features)
+        steps = np.arange(n_steps)
+        window = rows[:, None] + steps
+        counts = window < self.ends[rows][:, None]
+        last = rows + counts.sum(1) - 1
+        rewards = self._rewards(window.clip(max=len(self) - 1), inputs, weights) * counts * gamma**steps
+        next_features = bootstrap_features = self._next_features(rows, inputs)
+        if n_steps > 1:
+            bootstrap_features = self._next_features(last, inputs)
         return Batch(
             features=features,
             actions=inputs.tensor(samples.actions),
-            next_features=inputs.features(inputs.observations(self.next_observations.take(rows).observations)),
+            next_features=next_features,
+            bootstrap_features=bootstrap_features,
             memory=memory,
             next_memory=next_memory,
-            rewards=inputs.tensor(rewards)[:, None],
-            dones=inputs.tensor(self.demonstrations.terminations[rows])[:, None],
-            discounts=features.new_full((len(rows), 1), gamma),
+            rewards=inputs.tensor(rewards.sum(1))[:, None],
+            dones=inputs.tensor(self.demonstrations.terminations[last])[:, None],
+            discounts=inputs.tensor(gamma ** counts.sum(1, keepdims=True)),
         )
+
+    def _next_features(self, rows: np.ndarray, inputs: CircuitInputs) -> th.Tensor:
+        return inputs.features(inputs.observations(self.next_observations.take(rows).observations))
+
+    def _rewards(self, rows: np.ndarray, inputs: CircuitInputs, weights: tuple[float, float, float]) -> np.ndarray:
+        """The weighted sum of the three parts at some rows, in the shape of ``rows``."""
+        task = self.demonstrations.rewards[rows]
+        if inputs.vec_normalize is not None:
+            task = inputs.vec_normalize.normalize_reward(task)
+        return weights[0] * task + weights[1] * self.epistemic[rows] + weights[2] * self.instrumental[rows]
 
     def refresh_signals(
         self, raw_signals: RawSignals, inputs: CircuitInputs, epistemic: Normalizer, instrumental: Normalizer

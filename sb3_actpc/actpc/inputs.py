@@ -17,7 +17,8 @@ class Batch(NamedTuple):
 
     :param features: normalised observations, (B, n_features)
     :param actions: (B, A), in [-1, 1]
-    :param next_features: (B, n_features)
+    :param next_features: one step on, which generator and prior predict, (B, n_features)
+    :param bootstrap_features: where the critic's target is bootstrapped: one step on, or n, (B, n_features)
     :param memory: m_t, (B, n_memory), or None
     :param next_memory: m_{t+1}, (B, n_memory), or None
     :param rewards: the combined reward r_t, (B, 1)
@@ -28,6 +29,7 @@ class Batch(NamedTuple):
     features: th.Tensor
     actions: th.Tensor
     next_features: th.Tensor
+    bootstrap_features: th.Tensor
     memory: th.Tensor | None
     next_memory: th.Tensor | None
     rewards: th.Tensor

@@ -15,9 +15,10 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, Combine
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
+from sb3_actpc.actpc.keywords import CIRCUITS, check_policy_keywords
+from sb3_actpc.common.checks import named_in_errors
 from sb3_actpc.ngc import NGCCircuit, WorkingMemory
 
-CIRCUITS = ("actor", "critic", "generator", "prior")
 # what circuit_kwargs, actor_kwargs and so on may set; sizes follow from the task
 _SIZES = {"self", "n_inputs", "n_outputs", "hidden", "output_activation", "n_memory", "n_feedback_inputs"}
 CIRCUIT_KEYWORDS = set(inspect.signature(NGCCircuit.__init__).parameters) - _SIZES
@@ -227,14 +228,12 @@ class ActPCPolicy(BasePolicy):
         optimizer_class: type[th.optim.Optimizer] = th.optim.Adam,
         optimizer_kwargs: dict[str, Any] | None = None,
     ) -> None:
+        check_policy_keywords(locals())
         if features_extractor_class is FlattenExtractor and is_image_space(observation_space):
             raise ValueError(
                 f"observations of shape {observation_space.shape} are images: ActPC learns no convolutions; use "
                 "'CnnPolicy' (fixed random ones), policy_kwargs=dict(features_extractor_class=...) or vector observations"
             )
-        unknown = set(net_arch) - {"pi", "qf", "generator", "prior"} if isinstance(net_arch, dict) else set()
-        if unknown:
-            raise ValueError(f"net_arch has unknown keys {sorted(unknown)}; choose from pi, qf, generator, prior")
         super().__init__(
             observation_space,
             action_space,
@@ -254,7 +253,8 @@ class ActPCPolicy(BasePolicy):
         self._build()
 
     def _build(self) -> None:
-        extractor = self.make_features_extractor()
+        with named_in_errors(f"features_extractor_kwargs={self.features_extractor_kwargs!r}"):
+            extractor = self.make_features_extractor()
         extractor.requires_grad_(False)
         arch, kwargs = self._net_arch_of("actor"), self._circuit_kwargs_of("actor")
         self.actor = ActPCActor(
@@ -296,7 +296,8 @@ class ActPCPolicy(BasePolicy):
         kwargs = {**default, **self.circuit_kwargs, **own}
         unknown = sorted(set(kwargs) - CIRCUIT_KEYWORDS)
         if unknown:
-            raise ValueError(f"{name}: a circuit has no keywords {unknown}; choose from {sorted(CIRCUIT_KEYWORDS)}")
+            known = sorted(CIRCUIT_KEYWORDS)
+            raise ValueError(f"circuit_kwargs, {name}_kwargs: a circuit has no keywords {unknown}; choose from {known}")
         return kwargs
 
     def _circuit(self, name: str, n_inputs: int, n_outputs: int, **extra: Any) -> NGCCircuit:
@@ -311,7 +312,8 @@ class ActPCPolicy(BasePolicy):
         kwargs = dict(self.optimizer_kwargs)
         if self.optimizer_class is th.optim.Adam:
             kwargs.setdefault("fused", True)  # one kernel for all synapses
-        return self.optimizer_class(groups, **kwargs)
+        with named_in_errors(f"optimizer_kwargs={self.optimizer_kwargs!r}"):
+            return self.optimizer_class(groups, **kwargs)
 
     def batch_size_of(self, name: str, default: int) -> int:
         """Batch size of a circuit: its own ``batch_size`` or the agent's."""

@@ -14,7 +14,7 @@ from stable_baselines3.td3.policies import TD3Policy
 from sb3_actpc.baselines.keywords import with_keywords_of
 from sb3_actpc.baselines.prioritized import DemonstrationPrioritizedHerReplayBuffer, PrioritizedHerReplayBuffer
 from sb3_actpc.baselines.td3 import DDPGDemo
-from sb3_actpc.common.checks import check_numbers
+from sb3_actpc.common.checks import check_range
 from sb3_actpc.common.demonstration_buffers import DemonstrationHerReplayBuffer, _DemonstrationReplay
 
 
@@ -65,7 +65,7 @@ class HER(DDPGDemo):
         replay_buffer_kwargs: dict[str, Any] | None = None,
         **options: Any,
     ) -> None:
-        check_numbers(locals(), fraction="random_action_start random_action_decay random_action_end")
+        check_range(locals(), "random_action_start random_action_decay random_action_end", 0, 1)
         self.prioritized = prioritized
         self.random_action_start, self.random_action_decay = random_action_start, random_action_decay
         self.random_action_end = random_action_end

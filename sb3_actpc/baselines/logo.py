@@ -20,7 +20,7 @@ from stable_baselines3.common.type_aliases import GymEnv
 from torch import nn
 
 from sb3_actpc.baselines.keywords import with_keywords_of
-from sb3_actpc.common.checks import check_kinds, check_numbers
+from sb3_actpc.common.checks import check_kinds, check_range
 from sb3_actpc.common.demonstration_buffers import fit_demonstrations
 from sb3_actpc.common.demonstrations import Demonstrations
 
@@ -109,8 +109,9 @@ class LOGO(TRPO):
         given = locals()
         numbers = "guidance_delta guidance_decay guidance_delta_min discriminator_learning_rate"
         check_kinds(given, numbers=numbers, whole="guidance_iterations discriminator_updates")
-        check_numbers(given, at_least_0=f"guidance_iterations {numbers}", fraction="guidance_decay")
-        check_numbers(given, at_least_1="discriminator_updates")
+        check_range(given, f"guidance_iterations {numbers}", 0)
+        check_range(given, "guidance_decay", 0, 1)
+        check_range(given, "discriminator_updates", 1)
         super().__init__(
             policy,
             env,  # type: ignore[arg-type]

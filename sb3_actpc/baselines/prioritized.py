@@ -10,7 +10,7 @@ from stable_baselines3.common.type_aliases import DictReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
-from sb3_actpc.common.checks import check_numbers
+from sb3_actpc.common.checks import check_range
 from sb3_actpc.common.demonstration_buffers import _DemonstrationReplay, _joined
 
 
@@ -81,7 +81,8 @@ class PrioritizedHerReplayBuffer(HerReplayBuffer):
         epsilon: float = 0.01,
         **kwargs: Any,
     ) -> None:
-        check_numbers(locals(), at_least_0="beta_increment epsilon", fraction="alpha beta")
+        check_range(locals(), "beta_increment epsilon", 0)
+        check_range(locals(), "alpha beta", 0, 1)
         super().__init__(*args, **kwargs)
         self.alpha, self.beta, self.beta_increment, self.epsilon = alpha, beta, beta_increment, epsilon
         self.priorities = np.zeros((self.buffer_size, self.n_envs, 2))

@@ -15,7 +15,7 @@ from torch import nn
 
 from sb3_actpc.baselines.demonstrated import DemonstratedAlgorithm
 from sb3_actpc.baselines.keywords import with_keywords_of
-from sb3_actpc.common.checks import check_numbers
+from sb3_actpc.common.checks import check_range
 from sb3_actpc.common.demonstrations import Demonstrations
 
 
@@ -133,7 +133,7 @@ class RLPD(DemonstratedAlgorithm, SAC):
         _init_setup_model: bool = True,
         **options: Any,
     ) -> None:
-        check_numbers(locals(), fraction="demonstration_fraction")
+        check_range(locals(), "demonstration_fraction", 0, 1)
         super().__init__(
             policy,
             env,  # type: ignore[arg-type]

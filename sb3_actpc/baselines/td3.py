@@ -17,7 +17,7 @@ from stable_baselines3.td3.policies import TD3Policy
 
 from sb3_actpc.baselines.demonstrated import DemonstratedAlgorithm
 from sb3_actpc.baselines.keywords import with_keywords_of
-from sb3_actpc.common.checks import check_kinds, check_numbers
+from sb3_actpc.common.checks import check_kinds, check_range
 from sb3_actpc.common.demonstrations import Demonstrations
 from sb3_actpc.common.episodes import map_observations
 
@@ -60,7 +60,7 @@ class TD3Demo(DemonstratedAlgorithm, TD3):
         **options: Any,
     ) -> None:
         check_kinds(locals(), mappings="actor_kwargs critic_kwargs")
-        check_numbers(locals(), fraction="demonstration_fraction")
+        check_range(locals(), "demonstration_fraction", 0, 1)
         super().__init__(policy, env, _init_setup_model=False, **options)  # type: ignore[arg-type]
         self._set_demonstrations(demonstrations, n_demonstrations, n_demonstration_transitions, demonstration_fraction)
         self.actor_kwargs, self.critic_kwargs = actor_kwargs, critic_kwargs
@@ -228,7 +228,7 @@ class DDPGDemo(TD3Demo):
         **options: Any,
     ) -> None:
         check_kinds(locals(), numbers="policy_gradient_weight cloning_weight", mappings="policy_kwargs")
-        check_numbers(locals(), at_least_0="policy_gradient_weight cloning_weight")
+        check_range(locals(), "policy_gradient_weight cloning_weight", 0)
         self.policy_gradient_weight, self.cloning_weight, self.q_filter = policy_gradient_weight, cloning_weight, q_filter
         super().__init__(
             policy,

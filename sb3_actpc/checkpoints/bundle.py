@@ -1,15 +1,20 @@
-"""The folder of a checkpoint: written under a temporary name, hashed while written, renamed when whole, checked when read."""
+"""The folder of a checkpoint: written under a temporary name, hashed while written, renamed when whole, checked when read.
+
+Every checkpoint is whole by itself. What has not changed since the one before is not written again: it is a second name (a
+hard link) of the same file, found by comparing that file with the memory, whatever the algorithm did with its buffer.
+"""
 
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 import os
 import re
 import shutil
 import uuid
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
@@ -19,9 +24,11 @@ import numpy as np
 from numpy.lib import format as npy
 
 FORMAT = "sb3_actpc checkpoint"
-VERSION = 1
+VERSION = 2
 MANIFEST = "manifest.json"
-CHUNK = 8 * 1024 * 1024  # bytes
+SEGMENT = 8 * 2**20  # bytes of an array in one file
+COMPARED = 64 * 2**10  # bytes at a time: fresh memory for more would cost more than the comparison
+SHARED_FROM = 2**20  # bytes; smaller files are written again, so that damage to one concerns one checkpoint
 _NAME = re.compile(r"(\d{6,})_step_(\d+)")
 _TEMPORARY = ".writing-"
 Report = Callable[[str], None]
@@ -37,77 +44,113 @@ def _warn(line: str) -> None:
 
 class BundleWriter:
     """
-    Files of one checkpoint; made by :func:`write_bundle`.
+    Files of one checkpoint; made by :func:`write_bundle`. Workers hash and flush a file while the next one is written.
 
     :param folder: where they go
-    :param hasher: one worker that hashes what is being written
+    :param previous: the checkpoint before: large files that have not changed since are shared with it
+    :param workers: hash and flush
     """
 
-    def __init__(self, folder: Path, hasher: ThreadPoolExecutor) -> None:
-        self.folder, self.hasher = folder, hasher
-        self.files: dict[str, dict[str, Any]] = {}
+    def __init__(self, folder: Path, previous: Bundle | None, workers: ThreadPoolExecutor) -> None:
+        self.folder, self.previous, self.workers = folder, previous, workers
+        self._shared: dict[str, dict[str, Any]] = {}
+        self._written: dict[str, tuple[int, Future[str]]] = {}
 
-    @contextmanager
-    def _open(self, name: str) -> Iterator[Callable[[Any], None]]:
-        """Hashes what it is given while it writes it, and flushes the file to the disk at the end."""
-        digest, size = hashlib.sha256(), 0
-        hashed: Future[None] | None = None
-        with open(self.folder / name, "xb") as file:
+    def files(self) -> dict[str, dict[str, Any]]:
+        """Wait until everything is on the disk.
 
-            def write(data: Any) -> None:
-                nonlocal size, hashed
-                view = memoryview(data).cast("B")
-                for start in range(0, len(view), CHUNK):
-                    part = view[start : start + CHUNK]
-                    hashed = self.hasher.submit(digest.update, part)
-                    file.write(part)
-                size += len(view)
-
-            yield write
-            file.flush()
-            os.fsync(file.fileno())
-        if hashed is not None:
-            hashed.result()  # the worker takes the parts in order: this was the last
-        self.files[name] = {"sha256": digest.hexdigest(), "bytes": size}
+        :return: name -> SHA-256 and size
+        :raises OSError: when a file could not be flushed
+        """
+        written = {name: {"sha256": digest.result(), "bytes": size} for name, (size, digest) in self._written.items()}
+        return {**self._shared, **written}
 
     def add_bytes(self, name: str, data: bytes) -> None:
         """:param name: file name
         :param data: its content"""
-        with self._open(name) as write:
-            if data:
-                write(data)
+        self._write(name, [memoryview(data)])
 
     def add_json(self, name: str, value: Any) -> None:
         """:param name: file name
         :param value: plain values"""
         self.add_bytes(name, json.dumps(value).encode())
 
-    def add_array(self, name: str, array: np.ndarray) -> None:
+    def add_array(self, stem: str, array: np.ndarray) -> list[str]:
         """
-        Write ``.npy`` straight from the array's memory.
+        Write ``.npy`` files straight from the array's memory, one for each range of rows; the ranges depend on the rows'
+        size alone, so that a range that has not changed since the previous checkpoint need not be written again.
 
-        :param name: file name
-        :param array: of numbers; one that is not C-contiguous is copied
+        :param stem: what the file names begin with
+        :param array: (n, ...) of numbers; one that is not C-contiguous is copied
+        :return: the file names, in the order of the rows
         :raises ValueError: for an array of Python objects
         """
         if array.dtype.hasobject:
-            raise ValueError(f"{name}: an array of Python objects cannot be stored")
+            raise ValueError(f"{stem}: an array of Python objects cannot be stored")
         array = np.ascontiguousarray(array)
-        with self._open(name) as write:
-            header = _HeaderSink()
-            npy.write_array_header_1_0(header, npy.header_data_from_array_1_0(array))
-            write(header.content)
-            if array.size:
-                write(array)
+        n_rows = max(1, SEGMENT // max(1, array[:1].nbytes))
+        names = []
+        for start in range(0, max(1, len(array)), n_rows):
+            rows = array[start : start + n_rows]
+            names.append(f"{stem}_{start}.npy")
+            parts = [memoryview(_npy_header(rows)), rows.reshape(-1).view(np.uint8).data]
+            if not self._share(names[-1], parts):
+                self._write(names[-1], parts)
+        return names
+
+    def _write(self, name: str, parts: list[memoryview]) -> None:
+        path = self.folder / name
+        with open(path, "xb", buffering=0) as file:
+            for part in parts:
+                _write_all(file, part)
+        self._written[name] = sum(map(len, parts)), self.workers.submit(_flush_and_hash, path, parts)
+
+    def _share(self, name: str, parts: list[memoryview]) -> bool:
+        """Give the previous checkpoint's file a second name here, if it has this content.
+
+        :return: whether it was done; not for small files, of which every checkpoint has its own
+        """
+        record = None if self.previous is None else self.previous.manifest["files"].get(name)
+        if self.previous is None or record is None or sum(map(len, parts)) < SHARED_FROM:
+            return False
+        try:
+            if not _holds(self.previous.path / name, parts):
+                return False
+            os.link(self.previous.path / name, self.folder / name)
+        except OSError:  # it is gone, or the file system has no links
+            return False
+        self._shared[name] = record
+        return True
 
 
-class _HeaderSink:
-    """Collects what NumPy writes as the header."""
+def _npy_header(array: np.ndarray) -> bytes:
+    header = io.BytesIO()
+    npy.write_array_header_1_0(header, npy.header_data_from_array_1_0(array))
+    return header.getvalue()
 
-    content = b""
 
-    def write(self, data: bytes) -> None:
-        self.content += data
+def _write_all(file: IO[bytes], part: memoryview) -> None:
+    while part:
+        part = part[file.write(part) :]
+
+
+def _flush_and_hash(path: Path, parts: list[memoryview]) -> str:
+    """Flush what was written to the disk; its SHA-256 is that of the memory it was written from."""
+    with open(path, "rb+") as file:
+        os.fsync(file.fileno())
+    digest = hashlib.sha256()
+    for part in parts:
+        digest.update(part)
+    return digest.hexdigest()
+
+
+def _holds(path: Path, parts: list[memoryview]) -> bool:
+    """Whether a file has exactly this content."""
+    if path.stat().st_size != sum(map(len, parts)):
+        return False
+    pieces = (part[start : start + COMPARED] for part in parts for start in range(0, len(part), COMPARED))
+    with open(path, "rb") as file:
+        return all(file.read(len(piece)) == bytes(piece) for piece in pieces)
 
 
 class Bundle:
@@ -116,7 +159,7 @@ class Bundle:
 
     :param path: its folder
     :raises DamagedCheckpoint: when the manifest is missing or not whole
-    :raises ValueError: when a newer version wrote it
+    :raises ValueError: when another version of the format wrote it
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
@@ -157,23 +200,28 @@ class Bundle:
         with open(self.path / name, "rb") as file:
             return _read_header(file)
 
-    def read_array_into(self, name: str, target: np.ndarray) -> None:
+    def read_array_into(self, names: Sequence[str], target: np.ndarray) -> None:
         """
-        :param name: file name
+        :param names: files of consecutive rows
         :param target: C-contiguous, of the stored shape and type; overwritten
         :raises ValueError: when shape or type differ
         """
-        with open(self.path / name, "rb") as file:
-            shape, dtype = _read_header(file)
-            if (shape, dtype) != (target.shape, target.dtype):
-                raise ValueError(f"{name} holds {dtype}{list(shape)}, expected {target.dtype}{list(target.shape)}")
-            if target.size:
-                file.readinto(target.data.cast("B"))
+        n_read = 0
+        for name in names:
+            with open(self.path / name, "rb") as file:
+                shape, dtype = _read_header(file)
+                rows = target[n_read : n_read + shape[0]]
+                if (shape, dtype) != (rows.shape, rows.dtype):
+                    raise ValueError(f"{name} holds {dtype}{list(shape)}, expected {rows.dtype}{list(rows.shape)}")
+                file.readinto(rows.reshape(-1).view(np.uint8).data)
+            n_read += shape[0]
+        if n_read != len(target):
+            raise ValueError(f"{', '.join(names)} hold {n_read} rows, expected {len(target)}")
 
 
 @contextmanager
 def write_bundle(
-    folder: Path, num_timesteps: int, keep: int, manifest: Mapping[str, Any], check: Callable[[], None] = lambda: None
+    folder: Path, num_timesteps: int, keep: int, manifest: Mapping[str, Any]
 ) -> Iterator[BundleWriter]:
     """
     Write a checkpoint; it appears in ``folder`` only when the block and everything after it has worked.
@@ -182,7 +230,6 @@ def write_bundle(
     :param num_timesteps: environment steps so far
     :param keep: how many checkpoints stay
     :param manifest: what else to record, plain values
-    :param check: called last before the checkpoint gets its name
     :return: takes the files
     :raises OSError: when the disk is full or the folder cannot be written; nothing is left behind then
     """
@@ -191,13 +238,14 @@ def write_bundle(
     temporary = folder / f"{_TEMPORARY}{uuid.uuid4().hex[:12]}"
     temporary.mkdir()
     try:
-        with ThreadPoolExecutor(max_workers=1) as hasher:
-            writer = BundleWriter(temporary, hasher)
+        with ThreadPoolExecutor(max_workers=4) as workers:
+            writer = BundleWriter(temporary, _newest_readable(folder), workers)
             yield writer
-            record = {"format": FORMAT, "version": VERSION, "num_timesteps": num_timesteps, **manifest, "files": writer.files}
+            files = writer.files()
+            record = {"format": FORMAT, "version": VERSION, "num_timesteps": num_timesteps, **manifest, "files": files}
             writer.add_json(MANIFEST, {**record, "sha256": _manifest_hash(record)})
+            writer.files()
         _sync_folder(temporary)
-        check()
         numbers = [number for number, _ in _list(folder)]
         os.replace(temporary, folder / f"{max(numbers, default=0) + 1:06d}_step_{num_timesteps}")
         _sync_folder(folder)
@@ -225,7 +273,7 @@ def find_bundle(path: str | os.PathLike[str], report: Report = _warn) -> Bundle:
     :return: the checkpoint, verified
     :raises FileNotFoundError: when there is none
     :raises DamagedCheckpoint: when all are damaged, or ``path`` is one that is
-    :raises ValueError: when the newest was written by a newer version
+    :raises ValueError: when the newest was written in another version of the format
     """
     path = Path(path)
     bundles = list_bundles(path)
@@ -241,6 +289,16 @@ def find_bundle(path: str | os.PathLike[str], report: Report = _warn) -> Bundle:
         except DamagedCheckpoint as error:
             report(f"damaged checkpoint skipped: {error}")
     raise DamagedCheckpoint(f"{path}: all of its {len(bundles)} checkpoints are damaged")
+
+
+def _newest_readable(folder: Path) -> Bundle | None:
+    """The newest checkpoint whose manifest is whole; its files are not looked at."""
+    for path in reversed(list_bundles(folder)):
+        try:
+            return Bundle(path)
+        except ValueError:
+            continue
+    return None
 
 
 def _verified(path: Path) -> Bundle:
@@ -268,10 +326,10 @@ def _read_manifest(path: Path) -> dict[str, Any]:
     recorded = manifest.pop("sha256", None)
     if _manifest_hash(manifest) != recorded:
         raise DamagedCheckpoint(f"{path}: {MANIFEST} is not what was written")
-    if manifest["version"] > VERSION:
+    if manifest["version"] != VERSION:
         raise ValueError(
-            f"{path} has format version {manifest['version']}, this sb3_actpc reads up to {VERSION}: install the newer "
-            f"version that wrote it ({manifest.get('versions', {}).get('sb3-actpc', 'unknown')})"
+            f"{path} has format version {manifest['version']}, this sb3_actpc reads {VERSION}: go on with the version that "
+            f"wrote it ({manifest.get('versions', {}).get('sb3-actpc', 'unknown')})"
         )
     return manifest
 
@@ -283,7 +341,7 @@ def _manifest_hash(manifest: Mapping[str, Any]) -> str:
 def _hash_file(path: Path) -> str:
     digest = hashlib.sha256()
     with open(path, "rb") as file:
-        while part := file.read(CHUNK):
+        while part := file.read(SEGMENT):
             digest.update(part)
     return digest.hexdigest()
 

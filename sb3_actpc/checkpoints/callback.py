@@ -35,8 +35,9 @@ class CheckpointCallback(BaseCallback):
     Saves everything that the training of any SB3 off-policy algorithm depends on, every ``save_freq`` steps and when the
     process is told to stop (SIGTERM, SIGINT); the latter raises :class:`~sb3_actpc.checkpoints.TrainingStopped`.
 
-    A checkpoint is taken between two rollouts (``train_freq`` steps), or between two updates of a ``train()`` that a signal
-    interrupts. The handlers that were there before come back when ``learn`` ends; after an error, call :meth:`close`.
+    A checkpoint is taken between two rollouts (``train_freq`` steps), or between two updates of a ``train()`` or a
+    pre-training (see :func:`between_updates`) that a signal interrupts. The handlers that were there before come back when
+    ``learn`` ends; after an error, call :meth:`close`.
 
     To go on, see :func:`restore` and :func:`continue_learning`.
 
@@ -112,20 +113,18 @@ class CheckpointCallback(BaseCallback):
         if not isinstance(self.model, OffPolicyAlgorithm):
             raise ValueError(f"{type(self.model).__name__} is not an off-policy algorithm: only those can be checkpointed")
         check_writable(self.folder)
-
-    def _on_training_start(self) -> None:
-        self._env_id = env_name(self.training_env)
-        self._others = [one for one in callback_tree(self.locals.get("callback")) if one is not self]
-        self._last_saved = self.num_timesteps
         if self.handle_signals:
             self.signals.install()
+
+    def _on_training_start(self) -> None:
+        self._follow(self.locals.get("callback"))
+        self._last_saved = self.num_timesteps
+        if self.handle_signals:
             watch(self._algorithm.replay_buffer, self._on_sample)
 
     def _on_rollout_start(self) -> None:
         self._samples = None
-        self._resume()
-        if self.signals.received:
-            self._stop(0)
+        self._resume_or_stop()
         if self.num_timesteps - self._last_saved >= self.save_freq:
             self._save_or_report()
 
@@ -145,6 +144,11 @@ class CheckpointCallback(BaseCallback):
         self.close()
         if self.at_end and self._last_saved != self._algorithm.num_timesteps:
             self._save_or_report()
+
+    def _follow(self, callback: Any) -> None:
+        """Take note of the task and of the callbacks beside this one."""
+        self._env_id = env_name(self.training_env)
+        self._others = [one for one in callback_tree(callback) if one is not self]
 
     # ------------------------------------------------------------------ resuming
 
@@ -166,6 +170,11 @@ class CheckpointCallback(BaseCallback):
             model.actor.reset_noise(model.n_envs)  # type: ignore[operator]
 
     # ------------------------------------------------------------------ stopping
+
+    def _resume_or_stop(self) -> None:
+        self._resume()
+        if self.signals.received:
+            self._stop(0)
 
     def _begin_updates(self, planned: int) -> None:
         self._samples, self._planned, self._updates_before = 0, planned, self._algorithm._n_updates
@@ -197,6 +206,24 @@ class CheckpointCallback(BaseCallback):
             self.report(f"no checkpoint at step {self.num_timesteps}: {error.strerror or error}; those written before stay")
 
 
+def between_updates(callback: BaseCallback) -> Callable[[], None]:
+    """
+    For algorithms that learn before their first rollout, in ``_setup_learn``, where SB3 calls no callback.
+
+    :param callback: of this ``learn``, as SB3's ``_setup_learn`` returns it
+    :return: to be called before each of those updates: goes on from a checkpoint taken there, and saves and stops on a signal
+    """
+    savers = [one for one in callback_tree(callback) if isinstance(one, CheckpointCallback)]
+    for saver in savers:
+        saver._follow(callback)
+
+    def resume_or_stop() -> None:
+        for saver in savers:
+            saver._resume_or_stop()
+
+    return resume_or_stop
+
+
 # ---------------------------------------------------------------------- going on
 
 
@@ -209,7 +236,7 @@ def restore(model: OffPolicyAlgorithm, path: str | os.PathLike[str], report: Rep
     :param report: given a line for each damaged checkpoint, and when episodes must start again
     :return: the agent
     :raises FileNotFoundError: when there is no checkpoint
-    :raises ValueError: when it is damaged, does not fit or was written by a newer version
+    :raises ValueError: when it is damaged, does not fit or was written in another version of the format
     """
     restore_model(model, find_bundle(path, report), report)
     return model

@@ -15,6 +15,7 @@ from sb3_actpc.checkpoints.encoding import Decoder, Encoder, OpaqueValue
 _SKIPPED = {"venv", "env", "class_attributes", "results_writer", "obs_spaces", "metadata", "_metadata", "spec", "_cached_spec"}
 _SKIPPED_WALL_TIME = {"t_start"}
 _DUMMY_SKIPPED = {"envs", "buf_infos", "reset_infos", "keys", "actions"}
+_IN_ARENA = ("efc_", "contact", "iefc_", "iM", "iLD", "iacc", "ifrc_")  # of MuJoCo's data
 
 
 def vec_env_layers(env: VecEnv) -> list[VecEnv]:
@@ -214,7 +215,11 @@ def restore_physics(model: Any, data: Any, arrays: dict[str, np.ndarray]) -> Non
 
 
 def _physics_arrays(data: Any) -> dict[str, np.ndarray]:
-    """Real arrays whose size the model fixes: those of constraints and contacts change, indices are scratch memory."""
-    named = {name: getattr(data, name) for name in dir(data) if not name.startswith("_")}
+    """Real arrays of the model's sizes; indices are scratch memory.
+
+    Those in MuJoCo's arena are left out: constraints, contacts and what is ordered by islands are made anew in each step, and
+    where there are none their memory belongs to something else.
+    """
+    named = {name: getattr(data, name) for name in dir(data) if not name.startswith(("_", *_IN_ARENA))}
     fixed = {name: value for name, value in named.items() if isinstance(value, np.ndarray) and value.dtype.kind == "f"}
-    return {name: value for name, value in fixed.items() if value.size and not name.startswith(("efc_", "iefc_", "contact"))}
+    return {name: value for name, value in fixed.items() if value.size}

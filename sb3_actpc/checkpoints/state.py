@@ -223,9 +223,10 @@ def buffer_arrays(buffer: ReplayBuffer) -> dict[str, np.ndarray]:
 def _capture_buffer(buffer: ReplayBuffer, encoder: Encoder, writer: BundleWriter) -> dict[str, Any]:
     rows = stored_rows(buffer)
     arrays = buffer_arrays(buffer)
-    files = {name: f"buffer_{index:02d}_{_file_name(name)}.npy" for index, name in enumerate(arrays)}
-    for name, array in arrays.items():
-        writer.add_array(files[name], array[:rows])
+    files = {
+        name: writer.add_array(f"buffer_{index:02d}_{_file_name(name)}", array[:rows])
+        for index, (name, array) in enumerate(arrays.items())
+    }
     own: Callable[[], Any] | None = getattr(buffer, "checkpoint_state", None)
     infos = buffer.infos[:rows].tolist() if isinstance(buffer, HerReplayBuffer) and buffer.copy_info_dict else None
     return {
@@ -264,7 +265,7 @@ def _check_buffer(buffer: ReplayBuffer, record: dict[str, Any], bundle: Bundle) 
     if arrays.keys() != record["files"].keys():
         raise ValueError(f"{bundle.path}: its replay buffer holds {sorted(record['files'])}, this one {sorted(arrays)}")
     for name, array in arrays.items():
-        shape, dtype = bundle.array_header(record["files"][name])
+        shape, dtype = bundle.array_header(record["files"][name][0])
         if (shape[1:], dtype) != (array.shape[1:], array.dtype):
             raise ValueError(
                 f"{bundle.path}: its replay buffer's {name} have shape {shape[1:]} and type {dtype}, this one's "

@@ -48,7 +48,7 @@ def load_checkpoint(
     :param overrides: constructor keywords: those that could not be stored by name, and what may differ (``verbose``, ...)
     :return: the agent, for :func:`~sb3_actpc.checkpoints.continue_learning`
     :raises FileNotFoundError: when there is no checkpoint
-    :raises ValueError: when it is damaged, does not fit or was written by a newer version
+    :raises ValueError: when it is damaged, does not fit or was written in another version of the format
     """
     bundle = find_bundle(path, report)
     if bundle.manifest["agent"]["algorithm"] != algorithm.__name__:

@@ -20,6 +20,11 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("--episodes", type=int, default=10, metavar="N", help="episodes to play (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=0, help="seed of the first episode (default: %(default)s)")
     parser.add_argument("--video", metavar="FILE", help="video of the first episode, .mp4 or .gif (default: RUN/video.mp4)")
+    parser.add_argument("--frames", type=int, default=300, metavar="N", help="its most frames (default: %(default)s)")
+    parser.add_argument("--size", type=int, metavar="PIXELS", help="its height and width (default: the environment's)")
+    parser.add_argument(
+        "--beside-demonstrator", action="store_true", help="draw the run's first demonstrated episode on the agent's right"
+    )
     parser.add_argument("--no-video", action="store_true", help="no video")
 
 
@@ -36,6 +41,7 @@ def run(args: argparse.Namespace) -> int:
     folder = Path(args.folder)
     video = None if args.no_video else Path(args.video or folder / "video.mp4")
     if video is not None:
+        _check_video_options(args)
         check_video_path(video)
         choose_gl_backend()  # before MuJoCo is imported
 
@@ -44,17 +50,32 @@ def run(args: argparse.Namespace) -> int:
 
     print(result_table(evaluate_run(folder, args.episodes, args.seed)), flush=True)
     if video is not None:
-        _record(folder, video, args.seed)
+        _record(folder, video, args)
     return 0
 
 
-def _record(folder: Path, video: Path, seed: int) -> None:
+def _check_video_options(args: argparse.Namespace) -> None:
+    """:raises ValueError: when a number is too small"""
+    for option, value in (("--frames", args.frames), ("--size", args.size)):
+        if value is not None and value < 1:
+            raise ValueError(f"{option} must be at least 1, found {value}")
+
+
+def _record(folder: Path, video: Path, args: argparse.Namespace) -> None:
+    from sb3_actpc.common.demonstrations import Demonstrations
     from sb3_actpc.training.run import load_run
     from sb3_actpc.training.video import RenderingUnavailable, record_video
 
     record, model = load_run(folder)
+    size = {} if args.size is None else {"width": args.size, "height": args.size}
+    demonstrations = None
+    if args.beside_demonstrator:
+        if record.get("demonstrations") is None:
+            raise ValueError(f"{folder} was trained without demonstrations: leave --beside-demonstrator out")
+        demonstrations = Demonstrations.load(record["demonstrations"])
+    env_kwargs = {**record["env_kwargs"], **size}
     try:
-        n_frames = record_video(model, record["env"], record["env_kwargs"], video, seed)
+        n_frames = record_video(model, record["env"], env_kwargs, video, args.seed, args.frames, demonstrations)
     except RenderingUnavailable as error:
         print(f"no video: rendering is not available here ({' '.join(str(error).split())})")
     else:

@@ -30,7 +30,10 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="replace a setting of the preset")
     parser.add_argument("--env-kwarg", action="append", default=[], metavar="KEY=VALUE", help="keyword of the environment")
     parser.add_argument(
-        "--demonstrations", default="shipped", metavar="FILE", help="file, or 'none' (default: the one in the package)"
+        "--demonstrations",
+        default="shipped",
+        metavar="FILE",
+        help="file, 'weak' (the package's weaker ones) or 'none' (default: the ones in the package)",
     )
     parser.add_argument("--steps", type=int, metavar="N", help="environment steps (default: the preset's)")
     parser.add_argument("--seed", type=int, default=0, help="seed (default: %(default)s)")

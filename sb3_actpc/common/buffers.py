@@ -11,6 +11,7 @@ from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer
 from stable_baselines3.common.vec_env import VecNormalize
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
+from sb3_actpc.common.checks import LARGEST_SIZE, check_kinds, check_range
 from sb3_actpc.common.episodes import SelfImitationMemory, map_observations
 from sb3_actpc.common.type_aliases import Observations, SignalReplaySamples, TensorObservations
 
@@ -29,6 +30,7 @@ class _SignalReplay(ReplayBuffer):
     :param self_imitation_size: capacity of the self-imitation memory in transitions; 0 for none
     :param n_steps: length of n-step returns
     :param gamma: their discount
+    :raises ValueError: naming a value that is not allowed, or two that do not go together
     """
 
     def __init__(
@@ -41,6 +43,11 @@ class _SignalReplay(ReplayBuffer):
         gamma: float = 0.99,
         **kwargs: Any,
     ) -> None:
+        given = locals()
+        check_kinds(given, whole="history self_imitation_size n_steps", numbers="gamma", flags="combined")
+        check_range(given, "history self_imitation_size", 0, LARGEST_SIZE)
+        check_range(given, "n_steps", 1, LARGEST_SIZE)
+        check_range(given, "gamma", 0, 1)
         super().__init__(*args, **kwargs)
         if n_steps > 1 and (history or self.optimize_memory_usage):
             raise ValueError(
@@ -159,6 +166,7 @@ class _SignalReplay(ReplayBuffer):
             epistemic=self.to_torch(self._summed(self.epistemic, rows, envs, mask)),
             instrumental=self.to_torch(self._summed(self.instrumental, rows, envs, mask)),
             **self._history_at(rows, envs, env),
+            following_observations=None if mask is None else self._next_observations_at(rows, envs, env),
         )
 
     def _observations_at(self, rows: np.ndarray, envs: np.ndarray, env: VecNormalize | None) -> TensorObservations:
@@ -330,10 +338,10 @@ def combined_buffer_class(
         if given not in (names := {kind.__name__: kind for kind in _COUNTERPARTS}):
             raise ValueError(f"replay_buffer_class={given!r} is unknown; choose one of {list(names)}")
         given = names[given]
-    if n_steps > 1 and given is not None and issubclass(given, HerReplayBuffer):
-        raise ValueError(f"n_steps={n_steps} does not work with hindsight relabelling; use n_steps=1")
     if given is not None and not (isinstance(given, type) and issubclass(given, ReplayBuffer)):
         raise ValueError(f"replay_buffer_class={given!r} must be None or a subclass of SB3's ReplayBuffer")
+    if n_steps > 1 and given is not None and issubclass(given, HerReplayBuffer):
+        raise ValueError(f"n_steps={n_steps} does not work with hindsight relabelling; use n_steps=1")
     if given is None and isinstance(observation_space, spaces.Dict):
         return CombinedDictReplayBuffer
     if given is None:

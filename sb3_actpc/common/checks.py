@@ -1,11 +1,19 @@
 """Checks of what the user passes and of what circuits and environments produce."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from functools import partial
 from numbers import Integral, Real
 from types import NoneType
 from typing import Any
 
 import numpy as np
+import torch as th
+from stable_baselines3.common.utils import get_device
+
+LARGEST_NUMBER = float(np.finfo(np.float32).max)
+LARGEST_WHOLE = 2**63 - 1
+LARGEST_SIZE = 2**31 - 1
 
 
 def check_choices(given: Mapping[str, Any], **allowed: Sequence[str]) -> None:
@@ -15,44 +23,95 @@ def check_choices(given: Mapping[str, Any], **allowed: Sequence[str]) -> None:
     :raises ValueError: naming the first value that is not allowed
     """
     for name, choices in allowed.items():
-        if given[name] not in choices:
+        if not isinstance(given[name], str) or given[name] not in choices:
             raise ValueError(f"{name}={given[name]!r} is unknown; choose one of {list(choices)}")
 
 
-def check_numbers(given: Mapping[str, Any], at_least_0: str = "", at_least_1: str = "", fraction: str = "") -> None:
+def check_range(given: Mapping[str, Any], names: str, low: float, high: float = np.inf) -> None:
     """
-    :param given: keyword -> value
-    :param at_least_0: keywords (separated by spaces) that must be 0 or more
-    :param at_least_1: keywords that must be 1 or more
-    :param fraction: keywords that must lie in [0, 1]
+    :param given: keyword -> number, or None, which is left alone
+    :param names: keywords, separated by spaces
+    :param low: smallest allowed value
+    :param high: largest allowed value
     :raises ValueError: naming the first value out of range
     """
-    for names, low, high in ((at_least_0, 0.0, np.inf), (at_least_1, 1.0, np.inf), (fraction, 0.0, 1.0)):
-        for name in names.split():
-            if not low <= given[name] <= high:
-                bounds = f"at least {low:g}" if np.isinf(high) else f"between {low:g} and {high:g}"
-                raise ValueError(f"{name}={given[name]!r} must be {bounds}")
+    for name in names.split():
+        if given[name] is not None and not low <= given[name] <= high:
+            bounds = f"at least {low}" if np.isinf(high) else f"between {low} and {high}"
+            raise ValueError(f"{name}={given[name]!r} must be {bounds}")
 
 
-def check_kinds(given: Mapping[str, Any], numbers: str = "", whole: str = "", optional: str = "", mappings: str = "") -> None:
+def _is(kind: type, largest: float, value: Any) -> bool:
+    """Whether it is a number of the kind, finite and not too large (whole numbers of any size can be compared)."""
+    is_kind = isinstance(value, kind)
+    return is_kind and bool(abs(value) <= largest)
+
+
+_is_number = partial(_is, Real, LARGEST_NUMBER)
+_is_whole = partial(_is, Integral, LARGEST_WHOLE)
+
+
+# option of check_kinds -> (whether a value is of this kind, what it must be)
+_KINDS: dict[str, tuple[Callable[[Any], bool], str]] = {
+    "numbers": (_is_number, "a finite number"),
+    "whole": (_is_whole, "a whole number"),
+    "optional": (lambda value: value is None or _is_number(value), "a finite number or None"),
+    "optional_whole": (lambda value: value is None or _is_whole(value), "a whole number or None"),
+    "flags": (lambda value: isinstance(value, (bool, np.bool_)), "True or False"),
+    "texts": (lambda value: isinstance(value, (str, NoneType)), "a text or None"),
+    "mappings": (
+        lambda value: value is None or (isinstance(value, Mapping) and all(isinstance(key, str) for key in value)),
+        "a dictionary with text keys, or None",
+    ),
+}
+
+
+def check_kinds(given: Mapping[str, Any], **names: str) -> None:
     """
     :param given: keyword -> value
-    :param numbers: keywords (separated by spaces) that must be finite numbers
-    :param whole: keywords that must be whole numbers
-    :param optional: keywords that must be finite numbers or None
-    :param mappings: keywords that must be dictionaries or None
+    :param names: keywords (separated by spaces) that must be ``numbers`` (finite), ``whole`` numbers, ``optional`` (a number
+        or None), ``optional_whole``, ``flags``, ``texts`` or ``mappings`` (the last two may be None)
     :raises ValueError: naming the first value of another kind
     """
-    for names, kind, wanted in (
-        (numbers, Real, "a finite number"),
-        (whole, Integral, "a whole number"),
-        (optional, (Real, NoneType), "a finite number or None"),
-        (mappings, (Mapping, NoneType), "a dictionary or None"),
-    ):
-        for name in names.split():
-            value = given[name]
-            if not isinstance(value, kind) or (isinstance(value, Real) and not np.isfinite(float(value))):
-                raise ValueError(f"{name}={value!r} must be {wanted}")
+    for option, keywords in names.items():
+        is_kind, wanted = _KINDS[option]
+        for name in keywords.split():
+            if not is_kind(given[name]):
+                raise ValueError(f"{name}={given[name]!r} must be {wanted}")
+
+
+@contextmanager
+def named_in_errors(what: str, *passed_on: type[Exception]) -> Iterator[None]:
+    """
+    What a class of another package does not take becomes an error that says where the user gave it.
+
+    :param what: the keywords with their values
+    :param passed_on: errors that are clear already
+    :raises ValueError: for any other error
+    """
+    try:
+        yield
+    except passed_on:
+        raise
+    except Exception as error:
+        reason = " ".join(str(error).split())[:500] or type(error).__name__
+        raise ValueError(f"{what[:1000]}: {reason}") from error
+
+
+def check_device(device: Any) -> None:
+    """
+    :param device: what the user passed
+    :raises ValueError: when it is no torch device, or one that this machine cannot compute on
+    """
+    try:
+        if not isinstance(device, (str, th.device)):
+            raise RuntimeError(f"found a {type(device).__name__}")
+        th.zeros(1, device=get_device(device)).item()
+    except (RuntimeError, AssertionError, NotImplementedError, ImportError) as error:
+        reason = (str(error).strip() or type(error).__name__).splitlines()[0]
+        raise ValueError(
+            f"device={device!r} must be 'auto' or a torch device of this machine, such as 'cpu' or 'cuda:0': {reason}"
+        ) from error
 
 
 def check_finite(where: str, what: str, values: np.ndarray, step: int) -> None:

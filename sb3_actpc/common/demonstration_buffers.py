@@ -13,7 +13,7 @@ from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
-from sb3_actpc.common.checks import check_numbers
+from sb3_actpc.common.checks import check_range
 from sb3_actpc.common.demonstrations import Demonstrations, resolve
 from sb3_actpc.common.episodes import Episodes, map_observations, split_observations
 
@@ -103,7 +103,7 @@ class _DemonstrationReplay(ReplayBuffer):
         demonstration_fraction: float = 0.5,
         **kwargs: Any,
     ) -> None:
-        check_numbers({"demonstration_fraction": demonstration_fraction}, fraction="demonstration_fraction")
+        check_range({"demonstration_fraction": demonstration_fraction}, "demonstration_fraction", 0, 1)
         super().__init__(*args, **kwargs)
         self.demonstration_fraction = demonstration_fraction
         self.demonstrated: ReplayBuffer | None = None

@@ -486,19 +486,20 @@ def resolve(source: str | os.PathLike[str] | Demonstrations) -> Demonstrations:
     raise ValueError(f"demonstrations must be a file path or a Demonstrations object, found {source!r}")
 
 
-def shipped_demonstrations(env_id: str) -> Path:
+def shipped_demonstrations(env_id: str, weak: bool = False) -> Path:
     """The demonstrations file of a sparse task that comes with the package.
 
     :param env_id: Gymnasium id, such as ``SparseHalfCheetah-v5``
+    :param weak: the file of a weaker demonstrator, with about half the return; only the HalfCheetah has one
     :return: its path
     :raises FileNotFoundError: when none is shipped; the message says how to collect them
     """
     name = re.sub(r"-v\d+$", "", env_id.rpartition(":")[2])
-    path = DATA_FOLDER / f"sparse_{name.removeprefix('Sparse').lower()}.npz"
+    path = DATA_FOLDER / f"sparse_{name.removeprefix('Sparse').lower()}{'_weak' if weak else ''}.npz"
     if not path.is_file():
         raise FileNotFoundError(
-            f"no demonstrations of {env_id} are shipped: collect them (sb3-actpc demos collect --env {env_id}) and pass "
-            "--demonstrations FILE, or train without (--demonstrations none)"
+            f"no {'weak ' if weak else ''}demonstrations of {env_id} are shipped: collect them (sb3-actpc demos collect --env "
+            f"{env_id}) and pass --demonstrations FILE, or train without (--demonstrations none)"
         )
     return path
 
@@ -533,7 +534,8 @@ def _read_arrays(content: bytes, source: str) -> dict[str, np.ndarray]:
     with archive:
         version = _read_array(archive, "format_version", source)
         if version.shape != () or version.dtype.kind not in "iu" or version < 1:
-            raise _field_error(source, "format_version", "a whole number of at least 1", repr(version))
+            found = f"type {version.dtype}, shape {version.shape}" if version.shape else repr(version.item())
+            raise _field_error(source, "format_version", "a whole number of at least 1", found)
         if version > FORMAT_VERSION:
             raise _field_error(source, "format_version", f"at most {FORMAT_VERSION} (update sb3-actpc)", str(version))
         return {name: _read_array(archive, name, source) for name in _STORED_FIELDS}
@@ -545,7 +547,7 @@ def _read_array(archive: zipfile.ZipFile, name: str, source: str) -> np.ndarray:
     try:
         return np.lib.format.read_array(io.BytesIO(archive.read(f"{name}.npy")), allow_pickle=False)
     except _CORRUPT_FILE_ERRORS as error:
-        raise _field_error(source, name, "a readable array", f"{type(error).__name__}: {error}") from None
+        raise _field_error(source, name, "a readable array", f"{type(error).__name__}: {str(error)[:200]}") from None
 
 
 def _read_json(stored: dict[str, np.ndarray], name: str, source: str) -> Any:

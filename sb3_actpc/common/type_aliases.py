@@ -15,7 +15,7 @@ class SignalReplaySamples(NamedTuple):
 
     :param observations: (B, *obs_shape), or a dict of such
     :param actions: (B, A), scaled to [-1, 1]
-    :param next_observations: as ``observations``
+    :param next_observations: as ``observations``; with n-step returns those at the end of the n steps
     :param dones: (B, 1), 1 where the episode truly ended (a time limit does not count)
     :param rewards: (B, 1), the task's part alone (normalised or relabelled where asked for)
     :param discounts: (B, 1) with n-step returns, else None
@@ -24,6 +24,7 @@ class SignalReplaySamples(NamedTuple):
     :param history: the observations before each transition in its episode, (B, H, *obs_shape), oldest first; None without
         a working memory
     :param history_mask: (B, H), 1 where there was such an observation, or None
+    :param following_observations: with n-step returns, those one step on; None where that is ``next_observations``
     """
 
     observations: TensorObservations
@@ -36,6 +37,7 @@ class SignalReplaySamples(NamedTuple):
     instrumental: th.Tensor
     history: TensorObservations | None
     history_mask: th.Tensor | None
+    following_observations: TensorObservations | None = None
 
 
 class ImitationSamples(NamedTuple):

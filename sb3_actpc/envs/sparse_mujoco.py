@@ -78,6 +78,14 @@ class _SparseMujocoEnv(MujocoEnv, utils.EzPickle):
         """
         raise NotImplementedError
 
+    def demonstrated_positions(self, demonstrations: Demonstrations) -> np.ndarray:
+        """Generalised positions after every recorded transition, to draw the demonstrator with.
+
+        :param demonstrations: N transitions of the same task
+        :return: (N, nq) float64
+        """
+        raise NotImplementedError
+
     def _sparse_reward(self, info: dict[str, Any]) -> tuple[float, bool]:
         """Sparse reward and success of the state just reached."""
         raise NotImplementedError
@@ -118,6 +126,15 @@ class SparseReacherEnv(_SparseMujocoEnv):
         """
         distances = np.linalg.norm(demonstrations.next_observations[:, 8:], axis=1)  # fingertip minus target
         return np.where(distances <= self.threshold, 1.0, self.miss_reward).astype(np.float32)
+
+    def demonstrated_positions(self, demonstrations: Demonstrations) -> np.ndarray:
+        """Both joint angles and the target's position.
+
+        :param demonstrations: N transitions of the Reacher
+        :return: (N, 4) float64
+        """
+        cosines, sines, targets = np.split(demonstrations.next_observations[:, :6].astype(np.float64), 3, axis=1)
+        return np.concatenate([np.arctan2(sines, cosines), targets], axis=1)
 
     def _sparse_reward(self, info: dict[str, Any]) -> tuple[float, bool]:
         distance = np.linalg.norm(self.get_body_com("fingertip") - self.get_body_com("target"))
@@ -189,8 +206,25 @@ class SparseLocomotionEnv(_SparseMujocoEnv):
         velocities = self._demonstrated_velocities(demonstrations)
         if self.condition == "forward":
             return (velocities > self.velocity).astype(np.float32)
-        travelled = [np.cumsum(velocities[start:end]) * self.dt for start, end in demonstrations.episode_bounds]
-        return (np.concatenate(travelled) > self.distance).astype(np.float32)
+        return (self._travelled(velocities, demonstrations) > self.distance).astype(np.float32)
+
+    def demonstrated_positions(self, demonstrations: Demonstrations) -> np.ndarray:
+        """The observed positions, and the distance travelled along x (the Swimmer's y, not observed either, stays 0).
+
+        :param demonstrations: N transitions of the base task with its default weights and ``dense_rewards``
+        :return: (N, nq) float64
+        """
+        assert self.model is not None
+        positions = np.zeros((len(demonstrations), self.model.nq))
+        positions[:, 0] = self._travelled(self._demonstrated_velocities(demonstrations), demonstrations)
+        n_observed = demonstrations.next_observations.shape[1] - self.model.nv
+        positions[:, -n_observed:] = demonstrations.next_observations[:, :n_observed]
+        return positions
+
+    def _travelled(self, velocities: np.ndarray, demonstrations: Demonstrations) -> np.ndarray:
+        """x - x_0 in metres after each transition, (N,) float64."""
+        bounds = demonstrations.episode_bounds
+        return np.concatenate([np.cumsum(velocities[start:end]) * self.dt for start, end in bounds])
 
     def _demonstrated_velocities(self, demonstrations: Demonstrations) -> np.ndarray:
         """Forward velocities in metres per second, (N,) float64: the base reward without control cost and health."""

@@ -1,18 +1,21 @@
 """The neural generative coding (NGC) circuit: one stack of layers that predict, settle and learn by Hebbian changes."""
 
 from collections.abc import Sequence
+from math import inf
+from numbers import Integral, Real
 from typing import Any, NamedTuple
 
 import torch as th
 from torch import nn
 
-from sb3_actpc.ngc.activations import get_activation
+from sb3_actpc.ngc.activations import ACTIVATIONS, get_activation
 from sb3_actpc.ngc.dynamics import DYNAMICS, SettledState, SettlingChain, predict
 from sb3_actpc.ngc.plasticity import SYNAPTIC_SCALINGS, HebbianChanges, bound_columns_, hebbian_changes, soft_bound_
 from sb3_actpc.ngc.stability import arrival_fractions, power_iteration_, settling_rates
 
 SETTLINGS = ("iterative", "scheduled")
 FEEDBACKS = ("learned", "tied")
+LARGEST_SIZE = 2**20  # of a layer, and of the number of steps
 
 
 class Synapses(NamedTuple):
@@ -94,12 +97,24 @@ class NGCCircuit(nn.Module):
         _check_choice("dynamics", dynamics, DYNAMICS)
         _check_choice("synaptic_scaling", synaptic_scaling, SYNAPTIC_SCALINGS)
         _check_choice("feedback", feedback, FEEDBACKS)
-        _check_sizes([n_inputs, *hidden, n_outputs], n_settling_steps, n_memory, n_feedback_inputs)
-        if settling_rate != "auto" and not (isinstance(settling_rate, (int, float)) and 0.0 < settling_rate <= 1.0):
-            raise ValueError(f"settling_rate={settling_rate!r} must be 'auto' or a number in (0, 1]")
+        _check_choice("activation", activation, tuple(ACTIVATIONS))
+        _check_choice("output_activation", output_activation, tuple(ACTIVATIONS))
+        if not isinstance(hidden, Sequence) or isinstance(hidden, str):
+            raise ValueError(f"hidden={hidden!r} must be a list of layer sizes")
+        _check_sizes(1, n_inputs=n_inputs, n_outputs=n_outputs, n_settling_steps=n_settling_steps)
+        _check_sizes(1, **{f"hidden[{layer}]": size for layer, size in enumerate(hidden)})
+        _check_sizes(0, n_memory=n_memory, n_feedback_inputs=n_feedback_inputs)
+        if n_feedback_inputs > n_inputs:
+            raise ValueError(f"n_feedback_inputs={n_feedback_inputs} must lie between 0 and n_inputs={n_inputs}")
         _check_not_negative(
-            leak=leak, feedback_rate=feedback_rate, weight_bound=weight_bound, feedback_scale=feedback_scale
+            leak=leak,
+            feedback_rate=feedback_rate,
+            weight_bound=weight_bound,
+            feedback_scale=feedback_scale,
+            memory_weight=memory_weight,
         )
+        _check_rate(settling_rate)
+        _check_flags(compensate_arrival=compensate_arrival, derivative_free=derivative_free)
         if settling == "scheduled":
             _check_scheduled(
                 feedback=feedback,
@@ -322,25 +337,35 @@ def _uniform(n_out: int, n_in: int, fan_in: int) -> nn.Parameter:
     return nn.Parameter(th.empty(n_out, n_in).uniform_(-bound, bound), requires_grad=False)
 
 
-def _check_choice(name: str, value: str, allowed: Sequence[str]) -> None:
-    if value not in allowed:
-        raise ValueError(f"{name}={value!r} is unknown; choose one of {list(allowed)}")
+def _check_choice(name: str, value: Any, allowed: Sequence[str]) -> None:
+    if not isinstance(value, str) or value not in allowed:
+        raise ValueError(f"{name}={value!r} is unknown; choose one of {sorted(allowed)}")
 
 
-def _check_sizes(sizes: Sequence[int], n_settling_steps: int, n_memory: int, n_feedback_inputs: int) -> None:
-    if min(sizes) < 1 or n_settling_steps < 1 or n_memory < 0:
-        raise ValueError(
-            f"n_inputs={sizes[0]}, n_outputs={sizes[-1]}, hidden={list(sizes[1:-1])} and n_settling_steps={n_settling_steps} "
-            f"must be at least 1, n_memory={n_memory} at least 0"
-        )
-    if not 0 <= n_feedback_inputs <= sizes[0]:
-        raise ValueError(f"n_feedback_inputs={n_feedback_inputs} must lie between 0 and n_inputs={sizes[0]}")
-
-
-def _check_not_negative(**given: float) -> None:
+def _check_sizes(smallest: int, **given: Any) -> None:
     for name, value in given.items():
-        if value < 0.0:
-            raise ValueError(f"{name}={value} must not be negative")
+        is_whole = isinstance(value, Integral)
+        if not is_whole or not smallest <= value <= LARGEST_SIZE:
+            raise ValueError(f"{name}={value!r} must be a whole number from {smallest} to {LARGEST_SIZE}")
+
+
+def _check_not_negative(**given: Any) -> None:
+    for name, value in given.items():
+        is_number = isinstance(value, Real)
+        if not is_number or not 0.0 <= value < inf:
+            raise ValueError(f"{name}={value!r} must be a finite number that is not negative")
+
+
+def _check_rate(settling_rate: Any) -> None:
+    is_auto, is_number = isinstance(settling_rate, str) and settling_rate == "auto", isinstance(settling_rate, Real)
+    if not is_auto and not (is_number and 0.0 < settling_rate <= 1.0):
+        raise ValueError(f"settling_rate={settling_rate!r} must be 'auto' or a number in (0, 1]")
+
+
+def _check_flags(**given: Any) -> None:
+    for name, value in given.items():
+        if not isinstance(value, bool):
+            raise ValueError(f"{name}={value!r} must be True or False")
 
 
 def _check_scheduled(**given: Any) -> None:

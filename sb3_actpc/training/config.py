@@ -9,15 +9,16 @@ import inspect
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from math import inf
 from pathlib import Path
 from typing import Any
 
-import torch as th
 import yaml
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.utils import LinearSchedule
 
+from sb3_actpc.common.checks import check_device
 from sb3_actpc.common.demonstrations import shipped_demonstrations
 from sb3_actpc.envs import sparse_env_id
 
@@ -36,6 +37,9 @@ PACKAGE_FOLDER = Path(__file__).resolve().parents[1]
 # inside an installed wheel, or beside the package in a source checkout
 HYPERPARAMS_FOLDERS = (PACKAGE_FOLDER / "hyperparams", PACKAGE_FOLDER.parent / "hyperparams")
 
+MAX_SEED = 2**31 - 1  # other generators get a seed derived from it, which must be below 2**32
+MAX_THREADS = 1024
+MAX_ENVS = 1024
 NOISE_TYPES = ("normal", "ornstein-uhlenbeck")
 # constructor keywords that have an option of their own
 _OPTION_OF = {
@@ -57,7 +61,7 @@ class RunConfig:
     :param preset: name of a file of ``hyperparams/``, or a path ending in ``.yml``; by default the name of the algorithm
     :param n_timesteps: environment steps to train for; by default the preset's
     :param seed: seed of the agent and of the training environment
-    :param demonstrations: ``"shipped"`` (the file in the package for a sparse task), ``"none"``, or a path
+    :param demonstrations: ``"shipped"`` or ``"weak"`` (the files in the package for a sparse task), ``"none"``, or a path
     :param overrides: settings that replace the preset's
     :param env_kwargs: keywords of the environment, added to the preset's
     :param eval_freq: environment steps between two evaluations; by default a tenth of the training
@@ -91,15 +95,17 @@ class RunConfig:
     def __post_init__(self) -> None:
         if self.algo not in ALGORITHMS:
             raise ValueError(f"unknown algorithm {self.algo!r}: expected one of {', '.join(sorted(ALGORITHMS))}")
-        if self.seed < 0:
-            raise ValueError(f"seed must be at least 0, found {self.seed}")
+        if not 0 <= self.seed <= MAX_SEED:
+            raise ValueError(f"seed must be from 0 to {MAX_SEED}, found {self.seed}")
         for name in ("n_timesteps", "eval_freq", "eval_episodes", "n_envs", "threads"):
             value = getattr(self, name)
             if value is not None and value < 1:
                 raise ValueError(f"{name} must be at least 1, found {value}")
+        if self.threads > MAX_THREADS:
+            raise ValueError(f"threads must be at most {MAX_THREADS}, found {self.threads}")
         if self.checkpoint_freq is not None and self.checkpoint_freq < 0:
             raise ValueError(f"checkpoint_freq must be at least 0 (none), found {self.checkpoint_freq}")
-        _check_device(self.device)
+        check_device(self.device)
 
     @property
     def preset_name(self) -> str:
@@ -158,7 +164,7 @@ def resolve_run(config: RunConfig) -> RunPlan:
     algorithm = load_algorithm(config.algo)
     settings = {**load_preset(config.preset or config.algo, config.env), **config.overrides}
     n_timesteps = _whole_number("n_timesteps", config.n_timesteps or settings.pop("n_timesteps", None))
-    n_envs = _whole_number("n_envs", config.n_envs or settings.pop("n_envs", 1))
+    n_envs = _whole_number("n_envs", config.n_envs or settings.pop("n_envs", 1), MAX_ENVS)
     env_kwargs = settings.pop("env_kwargs", None) or {}
     if not isinstance(env_kwargs, Mapping):
         raise ValueError(f"env_kwargs must be a mapping, found {env_kwargs!r}")
@@ -218,16 +224,27 @@ def load_preset(preset: str, env_id: str) -> dict[str, Any]:
     :raises ValueError: when the file is not a YAML mapping, or has neither entry
     """
     path = _preset_path(preset)
-    try:
-        entries = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path}: not a YAML file ({' '.join(str(error).split())})") from error
+    entries = read_yaml(path.read_bytes(), str(path))
     if not isinstance(entries, Mapping):
         raise ValueError(f"{path}: expected a mapping from environment ids to settings")
     settings = entries.get(env_id, entries.get("default"))
     if not isinstance(settings, Mapping):
         raise ValueError(f"{path}: expected a mapping under {env_id!r} or 'default', found {settings!r}")
-    return {str(key): _with_floats(value) for key, value in settings.items()}
+    return {str(key): value for key, value in settings.items()}
+
+
+def read_yaml(text: str | bytes, source: str) -> Any:
+    """Plain values from YAML; nothing in it is run, and ``1e-3`` is a number.
+
+    :param text: YAML, UTF-8 when it is bytes
+    :param source: where it is from, for the message
+    :return: the values
+    :raises ValueError: naming the source, when the text is not YAML or contains itself
+    """
+    try:
+        return _with_floats(yaml.safe_load(text))
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        raise ValueError(f"{source}: not YAML of plain values ({' '.join(str(error).split())})") from error
 
 
 def parse_schedule(value: float | str) -> float | LinearSchedule:
@@ -261,10 +278,7 @@ def parse_assignments(assignments: Iterable[str]) -> dict[str, Any]:
         key, separator, text = assignment.partition("=")
         if not separator or not key.strip():
             raise ValueError(f"expected key=value, found {assignment!r}")
-        try:
-            values[key.strip()] = _with_floats(yaml.safe_load(text))
-        except yaml.YAMLError as error:
-            raise ValueError(f"the value of {assignment!r} is not YAML ({' '.join(str(error).split())})") from error
+        values[key.strip()] = read_yaml(text, f"the value of {assignment!r}")
     return values
 
 
@@ -289,27 +303,21 @@ def find_demonstrations(env_id: str, choice: str) -> Path | None:
     """The demonstrations file of a run.
 
     :param env_id: Gymnasium id of the task
-    :param choice: ``"shipped"`` (for a task whose name begins with ``Sparse``, or its goal version), ``"none"``, or a path
+    :param choice: ``"shipped"`` (for a task whose name begins with ``Sparse``, or its goal version), ``"weak"`` (a weaker
+        demonstrator's), ``"none"``, or a path
     :return: the file, or None for none
     :raises FileNotFoundError: when the path does not exist, or a sparse task has no shipped file
     """
     if choice == "none":
         return None
+    if choice == "weak":
+        return shipped_demonstrations(sparse_env_id(env_id), weak=True)
     if choice != "shipped":
         if not Path(choice).is_file():
             raise FileNotFoundError(f"no demonstrations file at {choice}")
         return Path(choice)
     env_id = sparse_env_id(env_id)
     return shipped_demonstrations(env_id) if env_id.rpartition(":")[2].startswith("Sparse") else None
-
-
-def _check_device(device: str) -> None:
-    if device == "auto":
-        return
-    try:
-        th.device(device)
-    except RuntimeError as error:
-        raise ValueError(f"device must be 'auto' or a torch device such as 'cpu' or 'cuda:0', found {device!r}") from error
 
 
 def _preset_path(preset: str) -> Path:
@@ -330,7 +338,7 @@ def _pop_noise(settings: dict[str, Any]) -> tuple[str, float] | None:
         return None
     if noise_type not in NOISE_TYPES:
         raise ValueError(f"noise_type must be one of {', '.join(NOISE_TYPES)}, found {noise_type!r}")
-    if not isinstance(noise_std, (int, float)) or isinstance(noise_std, bool) or noise_std < 0:
+    if not isinstance(noise_std, (int, float)) or isinstance(noise_std, bool) or not 0 <= noise_std < inf:
         raise ValueError(f"noise_std must be a number of at least 0, found {noise_std!r}")
     return noise_type, float(noise_std)
 
@@ -346,9 +354,11 @@ def _pop_normalize(settings: dict[str, Any]) -> dict[str, Any] | None:
     return {**own, **(given if isinstance(given, Mapping) else {})}
 
 
-def _whole_number(name: str, value: Any) -> int:
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not float(value).is_integer() or value < 1:
-        raise ValueError(f"{name} must be a whole number of at least 1, found {value!r}")
+def _whole_number(name: str, value: Any, largest: float = inf) -> int:
+    is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    if not is_number or not 1 <= value < inf or value != int(value) or value > largest:
+        bound = "of at least 1" if largest == inf else f"from 1 to {largest}"
+        raise ValueError(f"{name} must be a whole number {bound}, found {value!r}")
     return int(value)
 
 

@@ -26,7 +26,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_actpc.checkpoints import CheckpointCallback, list_bundles, restore
 from sb3_actpc.common.demonstrations import Demonstrations
 from sb3_actpc.common.files import atomic_write
-from sb3_actpc.training.config import RunConfig, RunPlan, load_algorithm, parse_schedule, resolve_run
+from sb3_actpc.training.config import RunConfig, RunPlan, load_algorithm, parse_schedule, read_yaml, resolve_run
 from sb3_actpc.training.environments import check_env_id, make_eval_envs, make_train_env
 from sb3_actpc.training.evaluation import EvaluationCallback, NormalizedPredictor, Predictor, play_episodes
 from sb3_actpc.training.report import plot_learning_curve
@@ -135,10 +135,7 @@ def load_run(folder: Path) -> tuple[dict[str, Any], Predictor]:
 
 
 def _read_config(folder: Path, needed: set[str]) -> dict[str, Any]:
-    try:
-        record = yaml.safe_load((folder / "config.yml").read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ValueError(f"{folder / 'config.yml'}: not a YAML file") from error
+    record = read_yaml((folder / "config.yml").read_bytes(), str(folder / "config.yml"))
     if not isinstance(record, dict) or not needed <= record.keys():
         raise ValueError(f"{folder / 'config.yml'}: expected the settings of a run ({', '.join(sorted(needed))})")
     return record
@@ -252,7 +249,7 @@ def _train(
     report(f"{config.env}: {config.algo}, {plan.n_timesteps} steps{since}, into {folder}")
     if not has_checkpoint:
         callback.begin(model)
-    _learn(model, plan.n_timesteps, _callbacks(folder, plan, callback, report), config.progress)
+    _learn(model, plan.n_timesteps, _callbacks(folder, plan, callback, report), config.progress, goes_on=has_checkpoint)
     seconds = callback.wall_seconds
     result = {
         **callback.last_summary,
@@ -285,12 +282,12 @@ def _callbacks(
     return [CheckpointCallback(folder / CHECKPOINTS, plan.checkpoint_freq, at_end=False, report=report), evaluation]
 
 
-def _learn(model: BaseAlgorithm, n_timesteps: int, callbacks: list[BaseCallback], progress: bool) -> None:
+def _learn(model: BaseAlgorithm, n_timesteps: int, callbacks: list[BaseCallback], progress: bool, goes_on: bool) -> None:
     # what progress_bar=True does, but closed when training stops early
     bar = [ProgressBarCallback()] if progress else []
     left = n_timesteps - model.num_timesteps
     try:
-        model.learn(max(left, 0), callback=[*callbacks, *bar], reset_num_timesteps=model.num_timesteps == 0)
+        model.learn(max(left, 0), callback=[*callbacks, *bar], reset_num_timesteps=not goes_on)
     finally:
         for callback in callbacks:
             if isinstance(callback, CheckpointCallback):

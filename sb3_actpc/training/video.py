@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from sb3_actpc.common.demonstrations import Demonstrations
 
 GL_BACKENDS = ("egl", "osmesa")
 VIDEO_SUFFIXES = (".mp4", ".gif")
@@ -52,33 +56,52 @@ def check_video_path(path: Path) -> None:
         raise ValueError(f"the video must end in {' or '.join(VIDEO_SUFFIXES)}, found {str(path)!r}")
 
 
-def record_video(model: Any, env_id: str, env_kwargs: dict[str, Any], path: Path, seed: int) -> int:
-    """Write a video of the first ``MAX_FRAMES`` steps of an episode with the deterministic policy.
+def record_video(
+    model: Any,
+    env_id: str,
+    env_kwargs: dict[str, Any],
+    path: Path,
+    seed: int,
+    n_frames: int = MAX_FRAMES,
+    demonstrations: Demonstrations | None = None,
+) -> int:
+    """Write a video of the first steps of an episode with the deterministic policy.
 
     :param model: SB3 algorithm or policy
     :param env_id: Gymnasium id
-    :param env_kwargs: keywords of the environment
+    :param env_kwargs: keywords of the environment; ``width`` and ``height`` in pixels where it takes them
     :param path: file to write, ``.mp4`` or ``.gif``
     :param seed: seed of the episode
+    :param n_frames: most frames to render
+    :param demonstrations: draw their first episode on the right of the agent, or None
     :return: number of frames, each (height, width, 3) uint8
     :raises RenderingUnavailable: when rendering does not work here
-    :raises ValueError: when the path has another suffix
+    :raises ValueError: when the path has another suffix, or the environment cannot draw demonstrations
     """
     check_video_path(path)
-    frames, frames_per_second = _render_episode(model, env_id, env_kwargs, seed)
+    with _rendering(env_id, env_kwargs) as env:
+        frames: list[Any] = _play(model, env, seed, n_frames)
+        if demonstrations is not None:
+            right = _replay(demonstrations, env, n_frames)
+            frames = [np.hstack(pair) for pair in zip(frames, right, strict=False)]
+        frames_per_second = float(env.metadata.get("render_fps", 30))
     import imageio.v2 as imageio
 
     path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}{path.suffix}")  # the suffix tells imageio the format
     if path.suffix.lower() == ".gif":
         # viewers slow down a GIF with delays below 20 ms
         stride = max(1, round(frames_per_second / 25))
-        imageio.mimsave(path, frames[::stride], duration=1000 * stride / frames_per_second, loop=0)
+        imageio.mimsave(temporary, frames[::stride], duration=1000 * stride / frames_per_second, loop=0)
     else:
-        imageio.mimsave(path, frames, fps=frames_per_second, macro_block_size=2)
+        imageio.mimsave(temporary, frames, fps=frames_per_second, macro_block_size=2)
+    temporary.replace(path)
     return len(frames)
 
 
-def _render_episode(model: Any, env_id: str, env_kwargs: dict[str, Any], seed: int) -> tuple[list[Any], float]:
+@contextlib.contextmanager
+def _rendering(env_id: str, env_kwargs: dict[str, Any]) -> Iterator[Any]:
+    """The environment, made to render, and closed in the end; what goes wrong in a renderer as ``RenderingUnavailable``."""
     import gymnasium as gym
     from mujoco import FatalError
 
@@ -87,8 +110,7 @@ def _render_episode(model: Any, env_id: str, env_kwargs: dict[str, Any], seed: i
     env = None
     try:
         env = make_env(env_id, env_kwargs, render_mode="rgb_array")
-        frames = _play(model, env, seed)
-        return frames, float(env.metadata.get("render_fps", 30))
+        yield env
     except (FatalError, gym.error.Error, ImportError, OSError, RuntimeError, AttributeError, NotImplementedError) as error:
         raise RenderingUnavailable(f"{type(error).__name__}: {error}") from error
     finally:
@@ -96,11 +118,24 @@ def _render_episode(model: Any, env_id: str, env_kwargs: dict[str, Any], seed: i
             env.close()
 
 
-def _play(model: Any, env: Any, seed: int) -> list[np.ndarray]:
+def _replay(demonstrations: Demonstrations, env: Any, n_frames: int) -> list[Any]:
+    """Frames of the first demonstrated episode."""
+    simulator = env.unwrapped
+    if not hasattr(simulator, "demonstrated_positions"):
+        raise ValueError(f"{env.spec.id} cannot draw demonstrations: leave --beside-demonstrator out")
+    end = min(n_frames, int(demonstrations.episode_bounds[0, 1]))
+    frames = []
+    for position in simulator.demonstrated_positions(demonstrations)[:end]:
+        simulator.set_state(position, np.zeros(simulator.model.nv))
+        frames.append(_frame(env))
+    return frames
+
+
+def _play(model: Any, env: Any, seed: int, n_frames: int) -> list[Any]:
     observation, _ = env.reset(seed=seed)
     frames = [_frame(env)]
     state, episode_start, finished = None, np.ones(1, dtype=bool), False
-    while not finished and len(frames) < MAX_FRAMES:
+    while not finished and len(frames) < n_frames:
         action, state = model.predict(_batch(observation), state=state, episode_start=episode_start, deterministic=True)
         observation, _, terminated, truncated, _ = env.step(action[0])
         episode_start = np.zeros(1, dtype=bool)

@@ -1,5 +1,6 @@
 """The agent: every part of Algorithm 1 is wired, and does what the paper says it does."""
 
+import dataclasses
 import warnings
 
 import gymnasium as gym
@@ -178,12 +179,16 @@ def test_critic_warmup_keeps_the_pressure_off_the_actor():
     assert differ(before, weights_of(model.actor.circuit))
 
 
-def test_scaled_pressure_is_divided_by_the_mean_absolute_action_value():
+@pytest.mark.parametrize("shift", [5.0, 0.0])
+def test_scaled_pressure_is_divided_by_the_mean_absolute_action_value_or_by_one_paid_step(shift):
+    """Near 0, before any reward was seen, dividing by the value would blow the critic's noise up."""
     steps = []
     for scale in (False, True):
-        policy_kwargs = {"net_arch": [16, 16], "optimizer_class": th.optim.SGD}
-        model = make(scale_pressure=scale, policy_kwargs=policy_kwargs, self_imitation_size=0, learning_starts=100)
+        policy_kwargs = {"net_arch": [16, 16], "optimizer_class": th.optim.SGD}  # its steps are the changes themselves
+        options = {"policy_kwargs": policy_kwargs, "learning_rate": 1.0, "self_imitation_size": 0, "learning_starts": 100}
+        model = make(scale_pressure=scale, **options)
         model.learn(50)
+        model.critic[0].synapses.biases[-1].add_(shift)
         np.random.seed(3)
         batch = model._sample_batch(16)
         before = weights_of(model.actor.circuit)
@@ -191,10 +196,10 @@ def test_scaled_pressure_is_divided_by_the_mean_absolute_action_value():
         value = model.critic[0].project(inputs).abs().mean()
         model._n_updates = 1
         model._update_actor(batch)
-        steps.append((value, [new - old for new, old in zip(weights_of(model.actor.circuit), before, strict=True)]))
-    value = steps[1][0]
-    for plain, scaled in zip(steps[0][1], steps[1][1], strict=True):
-        assert th.allclose(plain, scaled * value, rtol=1e-2, atol=1e-7)
+        steps.append([new - old for new, old in zip(weights_of(model.actor.circuit), before, strict=True)])
+    assert (value > 2.0) == (shift > 0.0)
+    for plain, scaled in zip(*steps, strict=True):
+        assert th.allclose(plain, scaled * value.clamp_min(1.0), rtol=1e-2, atol=1e-7)
 
 
 def test_soft_targets_move_by_tau_and_hard_ones_every_c_transitions():
@@ -246,9 +251,7 @@ def test_target_smoothing_is_bounded_noise():
     corners = [
         (next_actions + th.tensor(shift)).clamp(-1, 1) for shift in ([0.1, 0.1], [0.1, -0.1], [-0.1, 0.1], [-0.1, -0.1])
     ]
-    possible = th.stack(
-        [model.critic_target.first().project(th.cat([batch.next_features, a], dim=1)) for a in corners]
-    )
+    possible = th.stack([model.critic_target.first().project(th.cat([batch.next_features, a], dim=1)) for a in corners])
     expected = batch.rewards + (1 - batch.dones) * model.gamma * possible
     assert th.isclose(expected, model._critic_targets(batch), atol=1e-5).any(0).all()
 
@@ -283,6 +286,35 @@ def test_demonstrations_fill_their_share_of_the_critic_batch():
     demonstrated = [tuple(row) in rows for row in batch.features.tolist()]
     assert sum(demonstrated) == 8 and not demonstrated[0]  # the newest transition comes first
     assert batch.rewards.shape == (16, 1)
+
+
+def test_demonstrated_returns_reach_n_steps_ahead_and_end_with_the_episode():
+    data = demonstrations(n_episodes=2, length=5)
+    data = dataclasses.replace(data, rewards=np.arange(10.0), terminations=np.arange(10) == 9)
+    model = make(demonstrations=data, n_steps=3, alpha_ext=1.0)
+    batch = model.expert.batch(np.array([0, 3, 9]), model.inputs, (1.0, 0.0, 0.0), 0.5, n_steps=3)
+    assert batch.rewards.ravel().tolist() == [0 + 0.5 * 1 + 0.25 * 2, 3 + 0.5 * 4, 9]
+    assert batch.discounts.ravel().tolist() == [0.125, 0.25, 0.5]
+    assert batch.dones.ravel().tolist() == [0, 0, 1]
+    assert np.array_equal(batch.bootstrap_features, data.next_observations[[2, 4, 9]])
+    assert np.array_equal(batch.next_features, data.next_observations[[0, 3, 9]])
+
+
+def test_with_n_step_returns_generator_and_prior_still_predict_one_step():
+    """Their surprise is measured one step on; trained n steps on, they would be surprised by everything."""
+    model = make(demonstrations=demonstrations(), n_steps=3, alpha_ext=1.0, demonstration_fraction=0.5)
+    model.learn(40)
+    buffer, size = model.replay_buffer, model.replay_buffer.pos
+    pairs = zip(
+        [*buffer.observations[:size, 0], *model.demonstrations.observations],
+        [*buffer.next_observations[:size, 0], *model.demonstrations.next_observations],
+        strict=True,
+    )
+    following = {tuple(before.tolist()): tuple(after.tolist()) for before, after in pairs}
+    batch = model._sample_batch(64)
+    one_step_on = [following[tuple(row)] for row in batch.features.tolist()]
+    assert [tuple(row) for row in batch.next_features.tolist()] == one_step_on
+    assert differ([batch.next_features], [batch.bootstrap_features])
 
 
 def test_a_circuit_with_a_smaller_batch_takes_the_newest_and_a_fair_mixture_of_the_rest():
@@ -497,7 +529,7 @@ def test_discrete_actions_and_images_get_one_clear_line():
         ({"settling": "fast"}, "settling='fast'"),
         ({"circuit_kwargs": {"activation": "gelu"}}, "activation='gelu'"),
         ({"circuit_kwargs": {"n_steps": 3}}, "a circuit has no keywords"),
-        ({"critic_kwargs": {"hidden": [8]}}, "critic: a circuit has no keywords"),
+        ({"critic_kwargs": {"hidden": [8]}}, "critic_kwargs: a circuit has no keywords"),
     ],
 )
 def test_a_wrong_keyword_is_named(keywords, named):

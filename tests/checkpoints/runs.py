@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import multiprocessing
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -19,6 +20,8 @@ from sb3_actpc.checkpoints import CheckpointCallback, TrainingStopped, continue_
 from sb3_actpc.checkpoints.state import buffer_arrays
 
 WALL_TIME = {"time/fps", "time/time_elapsed", "wall_seconds"}
+# a forked process has imported everything already
+START_METHOD = "fork" if "fork" in multiprocessing.get_all_start_methods() else "spawn"
 MakeModel = Callable[[], OffPolicyAlgorithm]
 
 

@@ -1,120 +1,294 @@
-"""Generated bad inputs: the constructor, the demonstrations' reader and the command line answer with one clear error."""
+"""Generated bad inputs: constructor, demonstrations' reader and command line answer with one clear error, or they work."""
 
 import inspect
 import io
-import random
-import zipfile
+import math
+import tempfile
+import traceback
+from collections.abc import Callable
+from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
+import torch as th
+import yaml
+from gymnasium.envs.registration import EnvSpec
+from hypothesis import HealthCheck, example, given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hypothesis_numpy
 from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_actpc import ActPC
+from sb3_actpc.actpc.policies import CIRCUIT_KEYWORDS, ActPCPolicy
 from sb3_actpc.cli import main
 from sb3_actpc.common.demonstrations import Demonstrations
 from tests.actpc.envs import CountingEnv
 from tests.actpc.test_agent import demonstrations
 from tests.checkpoints.test_exact_resume import ACTPC
 
-N_CONSTRUCTOR, N_READER, N_COMMANDS = 80, 80, 40
-BAD_ARRAYS: tuple[Any, ...] = (
-    np.zeros(0),
-    np.zeros((2, 2, 2, 2)),
-    np.array(["text"]),
-    np.full((60, 3), np.nan),
-    np.array([-1, 5, 2]),
-    np.full(60, np.inf),
-    np.array(1.5),
-    np.zeros((61, 3)),
-    np.array([0, 2**62]),
-    np.array([1j, 2j]),
-    np.array([None, {}], dtype=object),
+HUGE = 10**30
+# these mean "go on for so long" or "from so late on": nothing is wrong with a large one
+LONG = {"prior_updates", "actor_warm_start", "gradient_steps", "n_settling_steps", "learning_starts", "critic_warmup"}
+
+
+def generated(n_examples: int) -> Callable[[Any], Any]:
+    """The same examples every time, none of which may take long."""
+    return settings(
+        max_examples=n_examples,
+        derandomize=True,
+        database=None,
+        deadline=timedelta(seconds=20),
+        suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
+    )
+
+
+def source_of(error: BaseException) -> str:
+    """The file whose line raised."""
+    return traceback.extract_tb(error.__traceback__)[-1].filename
+
+
+def assert_clear(error: Exception, *names: str) -> None:
+    """It was raised by this package (or by SB3), says which value is wrong, and is one short paragraph."""
+    text = str(error)
+    assert any(package in source_of(error) for package in ("sb3_actpc", "stable_baselines3")), source_of(error)
+    assert any(name in text for name in names), f"{text!r} names none of {names}"
+    assert "\n" not in text and len(text) < 2000
+
+
+# ---------------------------------------------------------------------- the constructor
+
+NUMBERS = st.sampled_from([math.nan, math.inf, -math.inf, -1, 0, 1, 2, 0.5, -0.5, 2.5, 1e300, HUGE, -HUGE, 10**400])
+TEXTS = st.sampled_from(["", "x", "cpu", "cuda:99", "auto", "None", "nowhere.npz", "\0", "tanh", "\u221e"])
+OBJECTS = st.sampled_from(
+    [None, True, False, b"x", 1j, object(), int, len, math.sqrt, th.zeros(2), np.zeros(2), np.array("x"), np.float32("nan")]
+)
+SCALARS = st.one_of(NUMBERS, TEXTS, OBJECTS)
+VALUES = st.recursive(
+    SCALARS,
+    lambda parts: st.one_of(
+        st.lists(parts, max_size=3),
+        st.tuples(parts, parts),
+        st.dictionaries(st.one_of(TEXTS, st.sampled_from([1, None])), parts, max_size=2),
+    ),
+    max_leaves=4,
+)
+CIRCUIT_VALUES = st.one_of(SCALARS, st.sampled_from(["learned", "tied", "error", "state", "column_norm", "iterative", "relu"]))
+OF_ONE_CIRCUIT = sorted({*CIRCUIT_KEYWORDS, "net_arch", "learning_rate", "batch_size", "n_inputs", "hiden"})
+OF_THE_POLICY = sorted({*inspect.signature(ActPCPolicy.__init__).parameters, "activation_fn"} - {"self"})
+ARCHITECTURES = st.one_of(
+    VALUES,
+    st.lists(st.one_of(st.integers(-1, 9), SCALARS), max_size=3),
+    st.dictionaries(st.sampled_from(["pi", "qf", "prior", "vf"]), st.lists(st.integers(0, 9), max_size=2), max_size=3),
+)
+KEYWORDS = sorted(set(inspect.signature(ActPC.__init__).parameters) - {"self", "_init_setup_model"})
+
+
+def keyword_values(name: str) -> st.SearchStrategy[Any]:
+    """Values for one keyword of the constructor, most of them bad."""
+    if name.endswith("_kwargs") and name not in ("policy_kwargs", "replay_buffer_kwargs"):
+        parts = {key: ARCHITECTURES if key == "net_arch" else CIRCUIT_VALUES for key in OF_ONE_CIRCUIT}
+        return st.one_of(VALUES, st.sampled_from(OF_ONE_CIRCUIT).flatmap(lambda key: st.fixed_dictionaries({key: parts[key]})))
+    if name == "policy_kwargs":
+        keys = st.sampled_from(OF_THE_POLICY)
+        some = keys.flatmap(lambda key: st.fixed_dictionaries({key: ARCHITECTURES if key == "net_arch" else VALUES}))
+        return st.one_of(VALUES, some)
+    if name == "replay_buffer_kwargs":
+        keys = st.sampled_from(["n_sampled_goal", "handle_timeout_termination", "history", "n_steps", "x", "buffer_size"])
+        return st.one_of(VALUES, st.dictionaries(keys, SCALARS, min_size=1, max_size=2))
+    return VALUES
+
+
+def is_long(name: str, value: Any) -> bool:
+    """Whether training would go on for ever, as asked."""
+    if isinstance(value, dict):
+        return any(is_long(str(key), part) for key, part in value.items())
+    return name in LONG and isinstance(value, (int, float)) and value > 100
+
+
+@given(st.sampled_from(KEYWORDS).flatmap(lambda name: st.tuples(st.just(name), keyword_values(name))))
+@generated(300)
+def test_the_constructor_names_what_is_wrong(keyword: tuple[str, Any]) -> None:
+    """A bad value is refused by a ValueError, or does no harm to a short training."""
+    name, value = keyword
+    if is_long(name, value):
+        return
+    keywords = {"policy": "MlpPolicy", "env": make_vec_env(CountingEnv), **ACTPC, "demonstrations": demonstrations()}
+    inner = [str(key) for key in value] if isinstance(value, dict) else []
+    try:
+        ActPC(**{**keywords, name: value}).learn(14)
+    except ValueError as error:
+        if "not finite at step" not in str(error):
+            assert_clear(error, name, *inner)
+    except FileNotFoundError as error:
+        assert name == "demonstrations"
+        assert_clear(error, str(value))
+    except gym.error.Error:  # no such task
+        assert name == "env" and isinstance(value, str)
+
+
+# ---------------------------------------------------------------------- the reader of demonstrations
+
+
+def good_file() -> bytes:
+    """What ``Demonstrations.save`` writes."""
+    with tempfile.TemporaryDirectory() as folder:
+        demonstrations().save(Path(folder) / "good.npz")
+        return (Path(folder) / "good.npz").read_bytes()
+
+
+GOOD = good_file()
+POSITIONS = st.integers(0, len(GOOD) - 1)
+DAMAGED = st.one_of(
+    st.binary(max_size=300),
+    POSITIONS.map(lambda end: GOOD[:end]),
+    POSITIONS.map(lambda start: GOOD[start:]),
+    st.tuples(POSITIONS, st.integers(1, 255)).map(
+        lambda flip: GOOD[: flip[0]] + bytes([GOOD[flip[0]] ^ flip[1]]) + GOOD[flip[0] + 1 :]
+    ),
+    st.tuples(POSITIONS, POSITIONS, st.binary(max_size=40)).map(lambda cut: GOOD[: cut[0]] + cut[2] + GOOD[cut[1] :]),
+)
+DTYPES = st.sampled_from(["?", "i1", "u8", "i8", "f2", "f4", "f8", "c8", "U3", "S2", "M8[s]"])
+ARRAYS = hypothesis_numpy.arrays(DTYPES, hypothesis_numpy.array_shapes(min_dims=0, max_dims=3, min_side=0, max_side=70))
+FIELDS = st.one_of(
+    ARRAYS,
+    NUMBERS.map(lambda number: np.full((60, 3), min(number, 1e300))),
+    st.sampled_from([np.array("[]"), np.array("{"), np.array('"x"'), np.array([0, 2**62]), np.zeros((60, 0)), np.arange(60)]),
+    st.just(np.array([None, {}], dtype=object)),
 )
 
 
-def damaged_bytes(rng: random.Random, good: bytes) -> bytes:
-    """Cut, flipped, doubled or replaced bytes."""
-    kind = rng.randrange(4)
-    if kind == 0:
-        return good[: rng.randrange(len(good))]
-    if kind == 1:
-        data = bytearray(good)
-        for _ in range(rng.randrange(1, 20)):
-            data[rng.randrange(len(data))] ^= 1 << rng.randrange(8)
-        return bytes(data)
-    return good[::-1] if kind == 2 else rng.randbytes(rng.randrange(200))
-
-
-def with_bad_field(rng: random.Random, good: bytes) -> bytes:
-    """One field left out, or with another content."""
-    with np.load(io.BytesIO(good)) as stored:
-        fields = dict(stored)
-    name = rng.choice(sorted(fields))
-    del fields[name]
-    if rng.random() < 0.8:
-        fields[name] = rng.choice(BAD_ARRAYS)
+def with_fields(changes: dict[str, Any]) -> bytes:
+    """The good file with some fields replaced, or left out where the value is None."""
+    with np.load(io.BytesIO(GOOD)) as stored:
+        fields = {name: value for name, value in {**stored, **changes}.items() if value is not None}
     target = io.BytesIO()
     np.savez(target, **fields)
     return target.getvalue()
 
 
-def test_the_reader_of_demonstrations_names_the_file(tmp_path: Path) -> None:
-    demonstrations().save(tmp_path / "good.npz")
-    good = (tmp_path / "good.npz").read_bytes()
-    assert zipfile.is_zipfile(tmp_path / "good.npz")
-    rng = random.Random(0)
-    file = tmp_path / "bad.npz"
-    refused = 0
-    for number in range(N_READER):
-        file.write_bytes((damaged_bytes if number % 2 else with_bad_field)(rng, good))
+def names_of_fields() -> list[str]:
+    with np.load(io.BytesIO(GOOD)) as stored:
+        return sorted(stored)
+
+
+CHANGES = st.dictionaries(st.sampled_from([*names_of_fields(), "more"]), st.one_of(st.none(), FIELDS), min_size=1, max_size=2)
+
+
+@given(st.one_of(DAMAGED, CHANGES.map(with_fields)))
+@generated(300)
+def test_the_reader_of_demonstrations_names_the_file(content: bytes) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "bad.npz"
+        file.write_bytes(content)
         try:
             Demonstrations.load(file)
         except ValueError as error:
-            refused += 1
-            assert str(file) in str(error), f"{number}: {error}"
-    assert refused > 0.8 * N_READER  # a flipped bit may fall where nothing is stored
+            assert_clear(error, str(file))
 
 
-def test_the_constructor_names_what_is_wrong() -> None:
-    """A bad value is refused by a ValueError, or does no harm to a short training."""
-    rng = random.Random(0)
-    numbers = (float("nan"), float("inf"), -1, -0.5, 0, 2.5)
-    bad: tuple[Any, ...] = (*numbers, "x", "", None, [], {}, (), object(), True, [-1], {"net_arch": [-1]})
-    chosen_elsewhere = {"self", "policy", "env", "_init_setup_model", "tensorboard_log", "device"}
-    names = [name for name in inspect.signature(ActPC.__init__).parameters if name not in chosen_elsewhere]
-    refused = 0
-    for _ in range(N_CONSTRUCTOR):
-        name, value = rng.choice(names), rng.choice(bad)
-        try:
-            ActPC("MlpPolicy", make_vec_env(CountingEnv), **{**ACTPC, name: value}).learn(12)
-        except ValueError:
-            refused += 1
-        except Exception as error:
-            raise AssertionError(f"{name}={value!r}") from error
-    assert refused > N_CONSTRUCTOR / 2
+# ---------------------------------------------------------------------- the command line
+
+WORDS = st.one_of(
+    st.sampled_from(["nan", "inf", "-1", "0", "2", "1e400", "9" * 400, str(HUGE), "text", "", " ", "--", "[", "{a: 1}", "~"]),
+    st.sampled_from(["!!python/name:os.system", "\u221e", "none", "shipped", ".", "/", "bad.yml", "bad.npz", "cuda:99", "\0"]),
+    st.text(max_size=5),
+)
+SETTINGS = st.sampled_from([*KEYWORDS, "noise_type", "noise_std", "n_timesteps", "n_envs", "env_kwargs", "learing_rate"])
+YAML_VALUES = st.one_of(
+    WORDS,
+    st.sampled_from(["[1, x]", "{net_arch: [-1]}", "{net_arch: [8, .nan]}", "{settling_rate: -1}", "lin_x", "&a [*a]"]),
+)
+ASSIGNMENTS = st.one_of(WORDS, st.tuples(SETTINGS, YAML_VALUES).map("=".join))
+OPTIONS = (
+    "--steps --seed --eval-freq --eval-episodes --n-envs --threads --checkpoint-freq --env --algo --preset --demonstrations "
+    "--device --output --resume --episodes --unknown --video --rounds"
+).split()
+ARGUMENTS = st.lists(
+    st.one_of(
+        st.tuples(st.sampled_from(OPTIONS), WORDS),
+        st.tuples(st.sampled_from(["--set", "--env-kwarg"]), ASSIGNMENTS),
+    ).map("=".join),
+    max_size=2,
+)
+SMALL = ["--env=CountingEnv-v0", "--preset=small.yml", "--demonstrations=none", "--steps=12", "--eval-episodes=1"]
+COMMANDS = st.one_of(
+    ARGUMENTS.map(lambda more: ["train", *SMALL, "--no-progress", *more]),
+    ARGUMENTS.map(lambda more: ["train", *more]),
+    st.tuples(WORDS, ARGUMENTS).map(lambda words: ["evaluate", words[0], "--no-video", *words[1]]),
+    st.tuples(st.sampled_from(["collect", "info"]), WORDS).map(lambda words: ["demos", *words]),
+    st.lists(WORDS, max_size=3),
+)
+ENTRIES = st.one_of(
+    st.binary(max_size=40),
+    st.dictionaries(SETTINGS, st.one_of(NUMBERS, TEXTS, st.lists(NUMBERS, max_size=2)), max_size=2).map(
+        lambda settings: yaml.safe_dump({"default": settings}).encode()
+    ),
+    st.sampled_from([b"", b"default:", b"default: []", b"[1]", b"default: {1: 2}", b"default: &a {policy_kwargs: *a}"]),
+)
 
 
-VALUES = ("nan", "inf", "-1", "0", "1e400", "text", "", "[", "{a: 1}", "~", "!!python/name:os.system", "\u221e", "9" * 400)
-
-
-def test_the_command_line_answers_in_one_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+@pytest.fixture(autouse=True)
+def small_preset(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A small preset, and a task that takes no time."""
     monkeypatch.chdir(tmp_path)
-    rng = random.Random(0)
-    options = ("--steps", "--seed", "--eval-freq", "--eval-episodes", "--n-envs", "--threads", "--checkpoint-freq", "--device")
-    texts = ("--env", "--algo", "--preset", "--demonstrations", "--set", "--env-kwarg")
-    for number in range(N_COMMANDS):
-        arguments = ["train", "--env", "SparseNothing-v9"]
-        for option in rng.sample(options + texts, 2):
-            arguments += [f"{option}={rng.choice(VALUES)}"]
-        try:
-            code = main(arguments)
-        except SystemExit as stop:  # argparse's own answer
-            code = int(stop.code or 0)
-        errors = capsys.readouterr().err.strip()
-        assert code == 2 and errors, f"{number}: {arguments}"
-        assert "Traceback" not in errors and ("\n" not in errors or errors.startswith("usage:")), errors
-    assert not list(tmp_path.iterdir())
+    monkeypatch.setitem(gym.registry, "CountingEnv-v0", EnvSpec("CountingEnv-v0", entry_point=CountingEnv))
+    small = {"settling": "scheduled", "learning_starts": 4, "batch_size": 4, "buffer_size": 50}
+    small["policy_kwargs"] = {"net_arch": [4]}
+    Path("small.yml").write_text(yaml.safe_dump({"default": small}), encoding="utf-8")
+
+
+def assert_answers(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    """It works, or there is one line (after argparse's usage) and an exit code."""
+    try:
+        code = main(arguments)
+    except SystemExit as stop:  # argparse's own answer
+        code = int(stop.code or 0)
+    errors = capsys.readouterr().err.strip()
+    assert code in (0, 2)
+    assert "Traceback" not in errors
+    if code:
+        assert errors.startswith("usage:") or errors.count("\n") == 0, errors
+        assert "error:" in errors and len(errors) < 3000, errors
+
+
+def preset_of(**settings: Any) -> bytes:
+    return yaml.safe_dump({"default": settings}).encode()
+
+
+TRAIN_BAD_PRESET = ["train", *SMALL, "--no-progress", "--preset=bad.yml"]
+
+
+@given(COMMANDS, ENTRIES)
+@example(TRAIN_BAD_PRESET, b"default: &a {policy_kwargs: *a}")
+@example(TRAIN_BAD_PRESET, preset_of(n_envs=10**400))
+@example(TRAIN_BAD_PRESET, preset_of(n_envs=math.nan))
+@example(TRAIN_BAD_PRESET, preset_of(noise_type="normal", noise_std=math.nan))
+@example(TRAIN_BAD_PRESET, preset_of(learning_rate="lin_nan"))
+@example(TRAIN_BAD_PRESET, preset_of(action_noise="normal"))
+@example(TRAIN_BAD_PRESET, preset_of(policy="CnnPolicy"))
+@example(TRAIN_BAD_PRESET, preset_of(replay_buffer_class="HerReplayBuffer"))
+@example(TRAIN_BAD_PRESET, preset_of(policy_kwargs={"net_arch": [2**20, 2**20, 2**20]}))
+@example(["train", *SMALL, "--no-progress", f"--n-envs={HUGE}"], b"")
+@example(["train", *SMALL, "--no-progress", f"--threads={HUGE}"], b"")
+@example(["train", *SMALL, "--no-progress", f"--seed={2**32}"], b"")
+@example(["train", *SMALL, "--no-progress", "--env-kwarg=nothing=1"], b"")
+@example(["evaluate", "."], b"")
+@example(["demos", "info", "bad.npz"], b"PK")
+@generated(100)
+def test_the_command_line_answers_in_one_line(
+    capsys: pytest.CaptureFixture[str], arguments: list[str], preset: bytes
+) -> None:
+    Path("bad.yml").write_bytes(preset)
+    Path("bad.npz").write_bytes(preset)
+    if any(is_long_option(word) for word in arguments):
+        return
+    assert_answers(arguments, capsys)
+
+
+def is_long_option(word: str) -> bool:
+    """Options that ask for something that takes for ever."""
+    option, _, value = word.partition("=")
+    return option in ("--steps", "--eval-episodes", "--episodes", "--rounds") and value == str(HUGE)

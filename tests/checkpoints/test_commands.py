@@ -9,6 +9,7 @@ import threading
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import yaml
 from stable_baselines3 import SAC, TD3
@@ -18,6 +19,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from sb3_actpc import ActPC
 from sb3_actpc.checkpoints import EXIT_STOPPED, CheckpointCallback, TrainingStopped, continue_learning, list_bundles, restore
 from sb3_actpc.cli import main
+from sb3_actpc.common.demonstrations import Demonstrations
 from tests.actpc.envs import CountingEnv
 from tests.checkpoints.runs import assert_equal, log_rows
 from tests.checkpoints.test_exact_resume import make_actpc
@@ -29,6 +31,22 @@ TRAIN += ["--eval-freq", "60", "--eval-episodes", "1", "--checkpoint-freq", "40"
 @pytest.fixture(autouse=True)
 def small_preset(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
+    write_preset()
+
+
+@pytest.fixture(scope="module")
+def straight(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of the run that is never stopped."""
+    folder = tmp_path_factory.mktemp("straight")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        write_preset()
+        assert main([*TRAIN, "--output", "run"]) == 0
+    return folder / "run"
+
+
+def write_preset(**more: Any) -> None:
+    """``small.yml``, a run of seconds."""
     settings = {
         "n_timesteps": 180,
         "settling": "scheduled",
@@ -41,14 +59,22 @@ def small_preset(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         "learning_rate": "lin_1e-3",
         "noise_type": "ornstein-uhlenbeck",
         "noise_std": 0.1,
+        **more,
     }
     Path("small.yml").write_text(yaml.safe_dump({"default": settings}), encoding="utf-8")
 
 
-def signal_at(step: int, number: int, monkeypatch: pytest.MonkeyPatch, in_update: bool = False) -> None:
-    """Send this process a real signal once, at an environment step or in the updates after it."""
+def assert_same_run(straight: Path, stopped: Path) -> None:
+    """Evaluations, logs and agents are equal."""
+    assert log_rows(straight / "evaluations.csv") == log_rows(stopped / "evaluations.csv")
+    assert log_rows(straight / "progress.csv") == log_rows(stopped / "progress.csv")
+    one, two = (ActPC.load(folder / "model.zip") for folder in (straight, stopped))
+    assert_equal(one.policy.state_dict(), two.policy.state_dict(), "policy")
+
+
+def signal_at(step: int, number: int, monkeypatch: pytest.MonkeyPatch, name: str = "_store_transition") -> None:
+    """Send this process a real signal once, in the first call of a method from an environment step on."""
     sent = []
-    name = "_update_critic" if in_update else "_store_transition"
     original = getattr(ActPC, name)
 
     def send(self: ActPC, *arguments: Any) -> Any:
@@ -63,12 +89,11 @@ def signal_at(step: int, number: int, monkeypatch: pytest.MonkeyPatch, in_update
 @pytest.mark.parametrize("in_update", [False, True])
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_a_stopped_run_goes_on_as_if_it_never_was(
-    number: int, in_update: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    number: int, in_update: bool, straight: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     handlers = [signal.getsignal(one) for one in (signal.SIGTERM, signal.SIGINT)]
-    assert main([*TRAIN, "--output", "straight"]) == 0
     with monkeypatch.context() as patch:
-        signal_at(97, number, patch, in_update)
+        signal_at(97, number, patch, "_update_critic" if in_update else "_store_transition")
         assert main([*TRAIN, "--output", "stopped"]) == EXIT_STOPPED
     assert "saved in stopped/checkpoints/" in (message := capsys.readouterr().err)
     assert "sb3-actpc train --resume stopped" in message
@@ -76,10 +101,7 @@ def test_a_stopped_run_goes_on_as_if_it_never_was(
     assert not Path("stopped/result.json").exists()
     assert main([*TRAIN, "--output", "stopped"]) == 2  # it is not overwritten
     assert main(["train", "--resume", "stopped", "--no-progress"]) == 0
-    assert log_rows(Path("straight/evaluations.csv")) == log_rows(Path("stopped/evaluations.csv"))
-    assert log_rows(Path("straight/progress.csv")) == log_rows(Path("stopped/progress.csv"))
-    one, two = (ActPC.load(f"{name}/model.zip") for name in ("straight", "stopped"))
-    assert_equal(one.policy.state_dict(), two.policy.state_dict(), "policy")
+    assert_same_run(straight, Path("stopped"))
     with open("stopped/evaluations.csv", encoding="utf-8") as file:
         seconds = [float(row["wall_seconds"]) for row in csv.DictReader(file)]
     assert seconds == sorted(seconds)
@@ -87,17 +109,33 @@ def test_a_stopped_run_goes_on_as_if_it_never_was(
     assert main(["train", "--resume", "stopped"]) == 2
 
 
-def test_a_damaged_checkpoint_is_named_and_the_one_before_used(
+def test_a_run_stopped_in_its_pretraining_goes_on_as_if_it_never_was(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main([*TRAIN, "--output", "straight"]) == 0
+    write_preset(n_timesteps=90, prior_updates=6)
+    rows = np.random.default_rng(0).uniform(-1.0, 1.0, (30, 10))
+    nothing = np.zeros(30)
+    Demonstrations(rows, rows[:, :2], rows, nothing, nothing, np.array([0]), "SparseReacher-v5").save("demonstrations.npz")
+    train = ["demonstrations.npz" if word == "none" else word for word in TRAIN]
+    assert main([*train, "--output", "straight"]) == 0
+    with monkeypatch.context() as patch:
+        signal_at(0, signal.SIGINT, patch, "_update_prior")
+        assert main([*train, "--output", "stopped"]) == EXIT_STOPPED
+    assert "stopped by SIGINT at step 0" in capsys.readouterr().err
+    assert main(["train", "--resume", "stopped", "--no-progress"]) == 0
+    assert_same_run(Path("straight"), Path("stopped"))
+
+
+def test_a_damaged_checkpoint_is_named_and_the_one_before_used(
+    straight: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     with monkeypatch.context() as patch:
         signal_at(97, signal.SIGTERM, patch)
         assert main([*TRAIN, "--output", "stopped"]) == EXIT_STOPPED
     (list_bundles("stopped/checkpoints")[-1] / "state.json").write_bytes(b"{")
     assert main(["train", "--resume", "stopped", "--no-progress"]) == 0
     assert "damaged checkpoint skipped: stopped/checkpoints/000003_step_98: state.json" in capsys.readouterr().out
-    assert log_rows(Path("straight/evaluations.csv")) == log_rows(Path("stopped/evaluations.csv"))
+    assert_same_run(straight, Path("stopped"))
 
 
 def test_a_run_with_checkpoints_is_left_alone_and_the_next_gets_another_folder(monkeypatch: pytest.MonkeyPatch) -> None:

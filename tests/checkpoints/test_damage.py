@@ -4,6 +4,7 @@ import errno
 import json
 import os
 import pickle
+import random
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -13,12 +14,21 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from stable_baselines3 import TD3
+from stable_baselines3 import SAC, TD3
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_actpc import ActPC
-from sb3_actpc.checkpoints import CheckpointCallback, DamagedCheckpoint, find_bundle, list_bundles, restore
+from sb3_actpc.checkpoints import (
+    CheckpointCallback,
+    DamagedCheckpoint,
+    continue_learning,
+    find_bundle,
+    list_bundles,
+    restore,
+)
 from sb3_actpc.checkpoints.bundle import _manifest_hash
+from sb3_actpc.checkpoints.state import check_weights
 from tests.actpc.envs import CountingEnv
 from tests.checkpoints.runs import assert_same
 from tests.checkpoints.test_exact_resume import make_actpc
@@ -127,14 +137,14 @@ def test_a_checkpoint_of_something_else_is_refused_and_changes_nothing(saved: Pa
     del untouched
 
 
-def test_a_newer_version_is_not_read(tmp_path: Path, saved: Path) -> None:
+def test_another_version_is_not_read(tmp_path: Path, saved: Path) -> None:
     shutil.copytree(saved, tmp_path / "newer")
     file = list_bundles(tmp_path / "newer")[-1] / "manifest.json"
     manifest = json.loads(file.read_text())
     manifest["version"] += 1
     del manifest["sha256"]
     file.write_text(json.dumps({**manifest, "sha256": _manifest_hash(manifest)}))
-    with pytest.raises(ValueError, match="format version 2, this sb3_actpc reads up to 1"):
+    with pytest.raises(ValueError, match="format version 3, this sb3_actpc reads 2"):
         find_bundle(tmp_path / "newer")
 
 
@@ -169,9 +179,9 @@ def test_the_watched_buffer_is_pickled_as_its_own_class(tmp_path: Path) -> None:
 
 
 class PoisonEnv(CountingEnv):
-    """Gives a wrong number at one step."""
+    """Gives one wrong number at one step."""
 
-    def __init__(self, what: str = "rewards", value: float = np.nan, at: int = 37) -> None:
+    def __init__(self, what: str, value: float, at: int) -> None:
         super().__init__()
         self.what, self.value, self.at, self.n_steps = what, value, at, 0
 
@@ -181,43 +191,84 @@ class PoisonEnv(CountingEnv):
         if self.n_steps == self.at and self.what == "rewards":
             reward = self.value
         elif self.n_steps == self.at:
-            observation = np.full_like(observation, self.value)
+            observation[self.at % len(observation)] = self.value
         return observation, reward, terminated, truncated, info
 
 
-@pytest.mark.parametrize("algorithm", [ActPC, TD3])
+class PoisonWeights(BaseCallback):
+    """Makes one weight wrong after one step."""
+
+    def __init__(self, value: float, at: int, chosen: random.Random, part: str = "") -> None:
+        super().__init__()
+        self.value, self.at, self.chosen, self.part = value, at, chosen, part
+
+    def _on_step(self) -> bool:
+        if self.num_timesteps == self.at:
+            parameters = [value for name, value in self.model.policy.named_parameters() if name.startswith(self.part)]
+            weights = self.chosen.choice(parameters).data.view(-1)
+            weights[self.chosen.randrange(len(weights))] = self.value
+        return True
+
+
+def random_moment(seed: int) -> tuple[random.Random, float, int]:
+    """A generator, a wrong number, and the step at which it comes, after the first checkpoint (step 10)."""
+    chosen = random.Random(seed)
+    return chosen, chosen.choice([np.nan, np.inf, -np.inf]), chosen.randrange(11, 60)
+
+
+def small_agent(algorithm: Any, make_env: Any = CountingEnv) -> Any:
+    keywords = {"policy_kwargs": {"net_arch": [8]}, "learning_starts": 5, "batch_size": 8, "buffer_size": 99, "seed": 0}
+    return algorithm("MlpPolicy", make_vec_env(make_env), **keywords)
+
+
+def assert_good_checkpoint(folder: Path, model: Any, latest: int) -> None:
+    """The newest one is from that step, and once the cause is mended an agent goes on from it."""
+    restore(model, folder, pytest.fail)
+    model.env.envs[0].unwrapped.at = 0
+    assert model.num_timesteps == latest
+    check_weights(model)
+    continue_learning(model, CheckpointCallback(folder, 10))
+    assert model.num_timesteps == 70
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
 @pytest.mark.parametrize("what", ["rewards", "observations"])
-@pytest.mark.parametrize("value", [np.nan, np.inf])
+@pytest.mark.parametrize("algorithm", [ActPC, TD3, SAC])
 def test_what_is_not_finite_is_named_and_the_last_good_checkpoint_is_there(
-    tmp_path: Path, algorithm: Any, what: str, value: float
+    tmp_path: Path, algorithm: Any, what: str, seed: int
 ) -> None:
     gym.logger.min_level = gym.logger.ERROR
-    env = make_vec_env(lambda: PoisonEnv(what, value))
-    model = algorithm("MlpPolicy", env, policy_kwargs={"net_arch": [8]}, learning_starts=10, batch_size=8, buffer_size=99)
-    with pytest.raises(ValueError, match=f"environment: {what} are not finite at step 37"):
-        model.learn(60, CheckpointCallback(tmp_path, 10))
-    assert find_bundle(tmp_path).num_timesteps == 30
-
-
-@pytest.mark.parametrize(("algorithm", "name"), [(ActPC, r"critic\.0\.weights\.1"), (TD3, r"critic\.qf0\.2\.weight")])
-def test_weights_that_are_not_finite_are_never_saved(tmp_path: Path, algorithm: Any, name: str) -> None:
-    model = algorithm("MlpPolicy", make_vec_env(CountingEnv), policy_kwargs={"net_arch": [8]}, buffer_size=99)
+    _, value, at = random_moment(seed)
+    make = lambda: small_agent(algorithm, lambda: PoisonEnv(what, value, at))  # noqa: E731
     callback = CheckpointCallback(tmp_path, 10)
-    model.learn(20, callback)
-    model.policy.state_dict()[name.replace("\\", "")].fill_(np.nan)
-    with pytest.raises(ValueError, match=f"{name}: weights are not finite at step 30"):
-        model.learn(60, callback, reset_num_timesteps=False)
+    with pytest.raises(ValueError, match=f"environment: {what} are not finite at step {at}"):
+        make().learn(70, callback)
     callback.close()
-    assert find_bundle(tmp_path).num_timesteps == 20
+    assert_good_checkpoint(tmp_path, make(), (at - 1) // 10 * 10)
 
 
-def test_actions_that_are_not_finite_are_named(tmp_path: Path) -> None:
-    model = make_actpc(CountingEnv)
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("algorithm", [ActPC, TD3])
+def test_a_weight_that_is_not_finite_is_named_and_never_saved(tmp_path: Path, algorithm: Any, seed: int) -> None:
+    """By the next checkpoint at the latest."""
+    chosen, value, at = random_moment(seed)
     callback = CheckpointCallback(tmp_path, 10)
-    model.learn(20, callback)
-    model.actor.circuit.weights[0].fill_(np.nan)
-    with pytest.raises(ValueError, match="actor: actions are not finite at step 20"):
-        model.learn(60, callback, reset_num_timesteps=False)
+    with pytest.raises(ValueError, match=r"(agent|actor|critic|generator|prior).*: .* not finite at step") as error:
+        small_agent(algorithm).learn(70, [callback, PoisonWeights(value, at, chosen)])
+    callback.close()
+    step = int(str(error.value).partition("at step ")[2].partition(";")[0])
+    assert at <= step <= at // 10 * 10 + 10
+    assert_good_checkpoint(tmp_path, small_agent(algorithm), (at - 1) // 10 * 10)
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(("algorithm", "name"), [(ActPC, "actor"), (TD3, "agent")])
+def test_actions_that_are_not_finite_are_named(tmp_path: Path, algorithm: Any, name: str, seed: int) -> None:
+    """NaN in the actor reaches its next action, or the critic's next update before it."""
+    chosen, _, at = random_moment(seed)
+    callback = CheckpointCallback(tmp_path, 100)
+    with pytest.raises(ValueError, match=f"{name}: actions are not finite at step"):
+        small_agent(algorithm).learn(70, [callback, PoisonWeights(np.nan, at, chosen, "actor.")])
     callback.close()
 
 

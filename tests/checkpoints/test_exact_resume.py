@@ -1,9 +1,12 @@
 """A run that is stopped and resumed is, bit for bit, the run that was never stopped."""
 
+import os
+import signal
 from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
@@ -17,9 +20,11 @@ from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 import sb3_actpc.envs  # noqa: F401, registers the sparse tasks
 from sb3_actpc import ActPC
+from sb3_actpc.checkpoints import list_bundles, restore
+from sb3_actpc.checkpoints.simulators import _physics_arrays
 from tests.actpc.envs import CountingEnv
 from tests.actpc.test_agent import demonstrations
-from tests.checkpoints.runs import assert_equal, assert_same, learn_in_two, learn_straight, log_rows
+from tests.checkpoints.runs import START_METHOD, assert_equal, assert_same, learn_in_two, learn_straight, log_rows
 
 SMALL: dict[str, Any] = {"policy_kwargs": {"net_arch": [16, 16]}, "learning_starts": 10, "batch_size": 16, "seed": 3}
 ACTPC: dict[str, Any] = {**SMALL, "settling": "scheduled", "prior_updates": 5, "buffer_size": 200, "device": "cpu"}
@@ -114,12 +119,28 @@ def test_state_dependent_exploration(tmp_path: Path) -> None:
     check(make, tmp_path / "within", 60, 33, stop_in_update=0)
 
 
-@pytest.mark.parametrize("env_id", ["SparseReacher-v5", "SparseHopper-v4", "HalfCheetah-v5", "Pendulum-v1"])
-def test_the_simulator_goes_on_in_the_middle_of_an_episode(tmp_path: Path, env_id: str) -> None:
+@pytest.mark.parametrize(
+    ("env_id", "stop_at"), [("SparseReacher-v5", 71), ("SparseHopper-v4", 71), ("HalfCheetah-v5", 51), ("Pendulum-v1", 231)]
+)
+def test_the_simulator_goes_on_in_the_middle_of_an_episode(tmp_path: Path, env_id: str, stop_at: int) -> None:
     def make() -> Any:
         return make_actpc(env_id, learning_starts=20, normalize=True)
 
-    check(make, tmp_path, 260, 231)
+    check(make, tmp_path, stop_at + 30, stop_at)
+
+
+@pytest.mark.parametrize("env_id", ["SparseReacher-v5", "HalfCheetah-v5"])
+def test_only_memory_that_belongs_to_the_simulator_is_stored(env_id: str) -> None:
+    """MuJoCo has one buffer for all arrays of fixed size; its arena, from which the others come, lies elsewhere."""
+    env = gym.make(env_id)
+    env.reset(seed=0)
+    data = env.unwrapped.data
+    arrays = _physics_arrays(data)
+    assert {"qpos", "qvel", "qacc_warmstart", "ctrl", "xpos", "cfrc_ext"} <= arrays.keys()
+    of_the_struct = {"energy", "solver_fwdinv"}
+    starts = [array.ctypes.data for name, array in arrays.items() if name not in of_the_struct]
+    assert max(starts) - min(starts) < data.nbuffer
+    env.close()
 
 
 class OpaqueEnv(CountingEnv):
@@ -147,7 +168,7 @@ def test_sb3s_evaluation_callback_remembers_its_best_and_its_rows(tmp_path: Path
     make = lambda: make_actpc("Pendulum-v1", learning_starts=20)  # noqa: E731
 
     def evaluation(folder: Path) -> EvalCallback:
-        env = make_vec_env("Pendulum-v1", seed=5)
+        env = make_vec_env("Pendulum-v1", seed=5, env_kwargs={"max_episode_steps": 20})
         return EvalCallback(env, n_eval_episodes=1, eval_freq=40, log_path=str(folder), verbose=0)
 
     one, two = evaluation(tmp_path / "one"), evaluation(tmp_path / "two")
@@ -164,19 +185,46 @@ def test_a_stop_inside_a_long_train_loses_no_update(tmp_path: Path) -> None:
         folder = tmp_path / algorithm.__name__
 
         def make(algorithm: Any = algorithm) -> Any:
-            keywords = {**(ACTPC if algorithm is ActPC else SMALL), "gradient_steps": 40, "train_freq": 10, "buffer_size": 99}
+            keywords = {**(ACTPC if algorithm is ActPC else SMALL), "gradient_steps": 12, "train_freq": 10, "buffer_size": 99}
             return algorithm("MlpPolicy", make_vec_env(CountingEnv), **deepcopy(keywords))
 
         straight = learn_straight(make, folder / "straight", 50)
-        resumed = learn_in_two(make, folder / "resumed", 50, 25, stop_in_update=17)
+        resumed = learn_in_two(make, folder / "resumed", 50, 25, stop_in_update=5)
         assert_same(straight, resumed)
         if algorithm is ActPC:
             assert log_rows(folder / "straight" / "progress.csv") == log_rows(folder / "resumed" / "progress.csv")
 
 
+@pytest.mark.parametrize("stop_after", [1, 3, 5, 8])
+def test_a_stop_in_the_pretraining_loses_no_update(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stop_after: int) -> None:
+    """Five updates of the prior, then five of the actor."""
+
+    def make() -> ActPC:
+        noise = NormalActionNoise(np.zeros(2), np.ones(2))
+        return make_actpc(CountingEnv, 2, demonstrations=demonstrations(), actor_warm_start=5, action_noise=noise)
+
+    straight = learn_straight(make, tmp_path / "straight", 60)
+    name, number = ("_update_prior", stop_after) if stop_after <= 5 else ("_refresh_changes", stop_after - 5)
+    original, calls = getattr(ActPC, name), []
+
+    def send_signal(self: ActPC, *arguments: Any) -> Any:
+        calls.append(name)
+        if len(calls) == number:
+            os.kill(os.getpid(), signal.SIGTERM)
+        return original(self, *arguments)
+
+    monkeypatch.setattr(ActPC, name, send_signal)
+    resumed = learn_in_two(make, tmp_path / "resumed", 60, stop_at=0)
+    stopped = make()
+    restore(stopped, list_bundles(tmp_path / "resumed" / "checkpoints")[0])
+    assert stopped.n_pretraining_updates == stop_after
+    assert_same(straight, resumed)
+    assert log_rows(tmp_path / "straight" / "progress.csv") == log_rows(tmp_path / "resumed" / "progress.csv")
+
+
 def test_environments_in_other_processes_start_again_from_seeded_states(tmp_path: Path) -> None:
     def make() -> TD3:
-        env = make_vec_env("Pendulum-v1", n_envs=2, vec_env_cls=SubprocVecEnv)
+        env = make_vec_env("Pendulum-v1", 2, vec_env_cls=SubprocVecEnv, vec_env_kwargs={"start_method": START_METHOD})
         return TD3("MlpPolicy", env, buffer_size=200, **deepcopy(SMALL))
 
     results = []
