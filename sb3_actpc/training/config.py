@@ -311,7 +311,7 @@ def find_demonstrations(env_id: str, choice: str) -> Path | None:
     if choice == "none":
         return None
     if choice == "weak":
-        return shipped_demonstrations(env_id, weak=True)
+        return shipped_demonstrations(sparse_env_id(env_id), weak=True)
     if choice != "shipped":
         if not Path(choice).is_file():
             raise FileNotFoundError(f"no demonstrations file at {choice}")

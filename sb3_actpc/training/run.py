@@ -240,9 +240,7 @@ def _checkpoints(folder: Path, plan: RunPlan, report: Callable[[str], None]) -> 
     return [CheckpointCallback(folder / CHECKPOINTS, plan.checkpoint_freq, at_end=False, report=report)]
 
 
-def _learn(
-    model: BaseAlgorithm, n_timesteps: int, callbacks: list[BaseCallback], progress: bool, goes_on: bool
-) -> None:
+def _learn(model: BaseAlgorithm, n_timesteps: int, callbacks: list[BaseCallback], progress: bool, goes_on: bool) -> None:
     # what progress_bar=True does, but closed when training stops early
     bar = [ProgressBarCallback()] if progress else []
     left = n_timesteps - model.num_timesteps
