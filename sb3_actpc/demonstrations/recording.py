@@ -66,8 +66,8 @@ def record_successes(
     if len(episodes) < n_episodes:
         task = env.spec.id if env.spec is not None else type(env.unwrapped).__name__
         raise ValueError(
-            f"only {len(episodes)} of {n_tries} episodes succeeded in {task}, {n_episodes} are needed: train the expert longer "
-            "(--steps), raise --max-tries, or ask for fewer episodes (--episodes)"
+            f"only {len(episodes)} of {n_tries} episodes succeeded in {task}, {n_episodes} are needed: train the expert "
+            "longer (--steps), raise --max-tries, or ask for fewer episodes (--episodes)"
         )
     return episodes, n_tries
 
