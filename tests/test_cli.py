@@ -26,15 +26,8 @@ from sb3_actpc.training.video import RenderingUnavailable, choose_gl_backend
 EPISODE_LENGTH = 10
 ENV_ID = "SparseLine-v0"
 TRAIN = ["train", "--env", ENV_ID, "--algo", "td3", "--preset", "small.yml"]
-EVALUATION_COLUMNS = [
-    "timesteps",
-    "dense_return",
-    "dense_return_std",
-    "sparse_return",
-    "success_rate",
-    "episode_length",
-    "wall_seconds",
-]
+RESULTS = {"dense_return": 20.0, "dense_return_std": 0.0, "sparse_return": 10.0, "sparse_return_std": 0.0}
+RESULTS |= {"success_rate": 1.0, "episode_length": 10.0}
 
 
 class LineEnv(gym.Env[np.ndarray, np.ndarray]):
@@ -111,7 +104,7 @@ def train(*arguments: str) -> int:
 
 
 def rows_of(folder: str | Path) -> list[dict[str, str]]:
-    with open(Path(folder) / "evaluations.csv", newline="", encoding="utf-8") as file:
+    with open(Path(folder) / "progress.csv", newline="", encoding="utf-8") as file:
         return list(csv.DictReader(file))
 
 
@@ -135,7 +128,15 @@ def write_demonstrations(path: Path, dense_reward: float) -> None:
 def test_training_writes_every_file_and_prints_the_table(capsys: pytest.CaptureFixture[str]) -> None:
     assert train("--demonstrations", "none", "--eval-freq", "20", "--eval-episodes", "2") == 0
     names = {path.name for path in RUN.iterdir()}
-    assert {"model.zip", "config.yml", "result.json", "evaluations.csv", "progress.csv", "learning_curve.png"} <= names
+    assert names == {
+        "model.zip",
+        "config.json",
+        "result.json",
+        "progress.csv",
+        "episodes.csv",
+        "diagnostics.csv",
+        "learning_curve.png",
+    }
     assert (RUN / "learning_curve.png").read_bytes().startswith(b"\x89PNG")
     printed = capsys.readouterr().out
     for text in ("dense return", "demonstrators", "sparse return", "success rate", "steps per second", "20.0 ± 0.0"):
@@ -145,12 +146,44 @@ def test_training_writes_every_file_and_prints_the_table(capsys: pytest.CaptureF
 def test_evaluations_are_of_the_dense_task_from_step_zero_to_the_last() -> None:
     assert train("--demonstrations", "none", "--eval-freq", "25") == 0
     rows = rows_of(RUN)
-    assert list(rows[0]) == EVALUATION_COLUMNS
+    assert list(rows[0]) == ["timesteps", "updates", "seconds", "evaluation_seconds", *RESULTS]
     assert [int(row["timesteps"]) for row in rows] == [0, 25, 50, 60]
+    # an update after every step beyond the 20 random ones; an evaluation comes before the update of its step, the last after
+    assert [int(row["updates"]) for row in rows] == [0, 4, 29, 40]
     for row in rows:
-        assert [float(row[name]) for name in EVALUATION_COLUMNS[1:6]] == [20.0, 0.0, 10.0, 1.0, 10.0]
-    seconds = [float(row["wall_seconds"]) for row in rows]
+        assert {name: float(row[name]) for name in RESULTS} == RESULTS
+        assert float(row["evaluation_seconds"]) <= float(row["seconds"])
+    seconds = [float(row["seconds"]) for row in rows]
     assert seconds == sorted(seconds)
+
+
+def test_every_training_episode_is_recorded() -> None:
+    """Six episodes of ten steps, each with a sparse return of 10 and a dense one of 2 * 10 * 1.5."""
+    assert train("--demonstrations", "none", "--env-kwarg", "gain=1.5") == 0
+    with open(RUN / "episodes.csv", newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert [int(row["episode"]) for row in rows] == [1, 2, 3, 4, 5, 6]
+    assert [int(row["timesteps"]) for row in rows] == [10, 20, 30, 40, 50, 60]
+    for row in rows:
+        values = [float(row[name]) for name in ("length", "sparse_return", "dense_return", "success")]
+        assert values == [10.0, 10.0, 30.0, 1.0]
+    assert len({row["actions_crc32"] for row in rows}) == 6
+
+
+def test_the_episodes_of_parallel_environments_are_kept_apart() -> None:
+    assert train("--demonstrations", "none", "--n-envs", "2", "--steps", "40") == 0
+    with open(RUN / "episodes.csv", newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert [(int(row["episode"]), int(row["timesteps"])) for row in rows] == [(1, 20), (2, 20), (3, 40), (4, 40)]
+    assert {float(row["dense_return"]) for row in rows} == {20.0}
+
+
+def test_the_settings_say_how_to_repeat_the_run() -> None:
+    assert train("--demonstrations", "none", "--steps", "20", "--seed", "3", "--threads", "1") == 0
+    record = json.loads(Path(f"runs/{ENV_ID}/td3_small_seed3/config.json").read_text(encoding="utf-8"))
+    assert (record["seed"], record["threads"], record["n_timesteps"], record["demonstrations"]) == (3, 1, 20, "none")
+    assert record["versions"]["stable-baselines3"].startswith("2.")
+    assert record["git_commit"] is None or len(record["git_commit"].removesuffix("+changes")) == 40
 
 
 def test_the_result_is_the_last_evaluation() -> None:
@@ -163,7 +196,8 @@ def test_the_result_is_the_last_evaluation() -> None:
     assert result["timesteps"] == 30
     assert result["demonstrators_return"] is None
     assert result["steps_per_second"] > 0
-    assert json.loads(Path(result["folder"], "result.json").read_text(encoding="utf-8")) == result
+    stored = json.loads(Path(result["folder"], "result.json").read_text(encoding="utf-8"))
+    assert {**stored, "folder": result["folder"]} == result
 
 
 def test_the_demonstrators_return_is_the_mean_over_their_episodes() -> None:
@@ -204,7 +238,7 @@ def test_settings_given_on_the_command_line_replace_the_presets() -> None:
     model = TD3.load(RUN / "model.zip")
     assert (model.gamma, model.learning_rate, model.n_envs) == (0.5, 1e-4, 2)
     assert model.train_freq == TrainFreq(2, TrainFrequencyUnit.STEP)
-    record = yaml.safe_load((RUN / "config.yml").read_text(encoding="utf-8"))
+    record = json.loads((RUN / "config.json").read_text(encoding="utf-8"))
     assert record["settings"]["gamma"] == 0.5
     assert record["settings"]["learning_starts"] == 20
 
@@ -328,7 +362,7 @@ def test_a_graphics_backend_that_does_not_work_is_set_aside(monkeypatch: pytest.
         (["train", "--env", ENV_ID, "--device", "abacus"], "'abacus'"),
         ([*TRAIN, "--demonstrations", "none", "--env-kwarg", "colour=red"], "colour"),
         (["train", "--env", "CartPole-v1", "--algo", "td3", "--preset", "small.yml"], "only supports"),
-        (["evaluate", "nowhere"], "no run in nowhere: config.yml is missing"),
+        (["evaluate", "nowhere"], "no run in nowhere: config.json is missing"),
         (["evaluate", "nowhere", "--video", "film.avi"], "must end in .mp4, .gif or .png"),
     ],
 )
@@ -351,10 +385,11 @@ def test_debug_shows_where_an_error_came_from() -> None:
 def test_a_damaged_run_is_named(capsys: pytest.CaptureFixture[str]) -> None:
     Path("run").mkdir()
     Path("run/model.zip").write_bytes(b"nonsense")
-    Path("run/config.yml").write_text("[]", encoding="utf-8")
+    Path("run/config.json").write_text("[]", encoding="utf-8")
     assert main(["evaluate", "run"]) == 2
     assert "expected the settings of a run" in capsys.readouterr().err
-    Path("run/config.yml").write_text(f"{{env: {ENV_ID}, env_kwargs: {{}}, algo: td3, seed: 0}}", encoding="utf-8")
+    settings = {"env": ENV_ID, "env_kwargs": {}, "algo": "td3", "seed": 0}
+    Path("run/config.json").write_text(json.dumps(settings), encoding="utf-8")
     assert main(["evaluate", "run"]) == 2
     assert capsys.readouterr().err.count("\n") == 1
 

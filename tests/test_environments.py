@@ -112,7 +112,7 @@ def test_algorithms_are_evaluated_on_the_same_episodes_at_the_same_steps(tmp_pat
         options = {"eval_freq": 16, "eval_episodes": 3, "progress": False, "output": str(tmp_path / algo)}
         train_run(RunConfig("Logged-v0", algo, n_timesteps=32, overrides=overrides, checkpoint_freq=0, **options))
         logs[algo] = LoggedEnv.log
-        rows = (tmp_path / algo / "evaluations.csv").read_text(encoding="utf-8").splitlines()
+        rows = (tmp_path / algo / "progress.csv").read_text(encoding="utf-8").splitlines()
         assert [row.split(",")[0] for row in rows[1:]] == ["0", "16", "32"]
     evaluated = [row for row in logs["td3"] if (row[0] or 0) >= 1_000_000]
     assert len(evaluated) == 9

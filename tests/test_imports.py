@@ -10,13 +10,14 @@ import pytest
 
 PACKAGE = Path(__file__).resolve().parents[1] / "sb3_actpc"
 # each is large, or an extra that may not be installed
-LAZY = ("h5py", "minari", "rl_zoo3", "robosuite")
+LAZY = ("h5py", "minari", "ray", "rl_zoo3", "robosuite", "scipy")
 HEAVY = (
     "torch",
     "stable_baselines3",
     "matplotlib",
     "mujoco",
     "sb3_actpc.actpc",
+    "sb3_actpc.comparison",
     "sb3_actpc.demonstrations",
     "sb3_actpc.experts",
     "sb3_actpc.ngc",
@@ -115,6 +116,12 @@ def test_demonstrations_know_neither_torch_nor_the_agent(forbidden: str) -> None
 @pytest.mark.parametrize("package", ["sb3_actpc.actpc", "sb3_actpc.ngc"])
 def test_the_agent_does_not_import_the_training_runs(package: str) -> None:
     assert [entry for entry in imports_in(package) if is_within(entry.target, "sb3_actpc.training")] == []
+
+
+@pytest.mark.parametrize("package", ["actpc", "checkpoints", "common", "envs", "ngc", "training"])
+def test_a_run_knows_nothing_of_comparisons(package: str) -> None:
+    imports = imports_in(f"sb3_actpc.{package}")
+    assert imports and [entry for entry in imports if is_within(entry.target, "sb3_actpc.comparison")] == []
 
 
 def test_nobody_imports_the_command_line() -> None:

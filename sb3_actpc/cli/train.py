@@ -72,7 +72,8 @@ def run(args: argparse.Namespace) -> int:
         run_folder = Path(stop.checkpoint).parents[1]
         print(f"sb3-actpc: {stop}; go on with: sb3-actpc train --resume {shlex.quote(str(run_folder))}", file=sys.stderr)
         return EXIT_STOPPED
-    print(f"\n{result_table(result)}\n\nwritten to {result['folder']}: model.zip, evaluations.csv, learning_curve.png")
+    written = "model.zip, progress.csv, episodes.csv, learning_curve.png"
+    print(f"\n{result_table(result)}\n\nwritten to {result['folder']}: {written}")
     return 0
 
 

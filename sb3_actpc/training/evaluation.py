@@ -17,14 +17,18 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_actpc.common.files import atomic_write
 
-EVALUATION_COLUMNS = (
+PROGRESS = "progress.csv"
+PROGRESS_COLUMNS = (
     "timesteps",
+    "updates",
+    "seconds",
+    "evaluation_seconds",
     "dense_return",
     "dense_return_std",
     "sparse_return",
+    "sparse_return_std",
     "success_rate",
     "episode_length",
-    "wall_seconds",
 )
 
 
@@ -166,8 +170,9 @@ def _stack(observations: list[Any]) -> Any:
 class EvaluationCallback(BaseCallback):
     """Evaluates the untrained agent (:meth:`begin`), then every ``eval_freq`` steps, and once more at the end.
 
-    Each evaluation starts its episodes from the same seeds, appends a row to ``evaluations.csv`` and saves
-    ``model.zip`` (written under another name and renamed, so that a stopped run leaves a whole one).
+    Each evaluation starts its episodes from the same seeds, appends a row to ``progress.csv`` and saves
+    ``model.zip`` (written under another name and renamed, so that a stopped run leaves a whole one). ``seconds`` are those
+    since :meth:`begin`, the evaluations' own (``evaluation_seconds``) among them; ``updates`` are the agent's.
 
     :param envs: environments that only this callback uses, closed by whoever made them
     :param folder: run folder
@@ -205,8 +210,8 @@ class EvaluationCallback(BaseCallback):
         """
         self.model = model
         self._started = time.perf_counter()
-        with open(self.folder / "evaluations.csv", "w", newline="", encoding="utf-8") as file:
-            csv.writer(file).writerow(EVALUATION_COLUMNS)
+        with atomic_write(self.folder / PROGRESS, "w") as file:
+            csv.writer(file, lineterminator="\n").writerow(PROGRESS_COLUMNS)
         self._evaluate()
 
     @property
@@ -221,7 +226,7 @@ class EvaluationCallback(BaseCallback):
             "evaluation_seconds": self.evaluation_seconds,
             "last_summary": self.last_summary,
             "last_timesteps": self._last_timesteps,
-            "rows": (self.folder / "evaluations.csv").read_text(encoding="utf-8"),
+            "rows": (self.folder / PROGRESS).read_text(encoding="utf-8"),
         }
 
     def restore_checkpoint_state(self, state: dict[str, Any]) -> None:
@@ -233,7 +238,7 @@ class EvaluationCallback(BaseCallback):
         self.evaluation_seconds = state["evaluation_seconds"]
         self.last_summary = state["last_summary"]
         self._last_timesteps = state["last_timesteps"]
-        with atomic_write(self.folder / "evaluations.csv", "w") as file:
+        with atomic_write(self.folder / PROGRESS, "w") as file:
             file.write(state["rows"])
 
     def _on_step(self) -> bool:
@@ -257,15 +262,25 @@ class EvaluationCallback(BaseCallback):
         self.evaluation_seconds += now - started
         self._last_timesteps = self.num_timesteps
         self.last_summary = statistics.summary()
-        self._append_row({**self.last_summary, "timesteps": self.num_timesteps, "wall_seconds": round(self.wall_seconds, 2)})
+        self._append_row(
+            {
+                **self.last_summary,
+                "timesteps": self.num_timesteps,
+                "updates": getattr(self.model, "_n_updates", 0),
+                "seconds": round(self.wall_seconds, 2),
+                "evaluation_seconds": round(self.evaluation_seconds, 2),
+            }
+        )
         for name in ("dense_return", "sparse_return", "success_rate"):
             if self.last_summary[name] is not None:
                 self.logger.record(f"eval/{name}", self.last_summary[name])
+        self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
+        self.logger.dump(self.num_timesteps)  # a row of the agent's own figures beside each evaluation
         self.report(_evaluation_line(self.num_timesteps, self.last_summary))
 
     def _append_row(self, values: dict[str, Any]) -> None:
-        with open(self.folder / "evaluations.csv", "a", newline="", encoding="utf-8") as file:
-            csv.writer(file).writerow([values[name] for name in EVALUATION_COLUMNS])
+        with open(self.folder / PROGRESS, "a", newline="", encoding="utf-8") as file:
+            csv.writer(file, lineterminator="\n").writerow([values[name] for name in PROGRESS_COLUMNS])
 
 
 def _evaluation_line(timesteps: int, summary: dict[str, float | None]) -> str:

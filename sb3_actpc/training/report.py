@@ -30,10 +30,10 @@ def result_table(result: Mapping[str, Any]) -> str:
     return "\n".join([title, "-" * len(title), *(f"{name:<{width}}  {value}" for name, value in rows)])
 
 
-def plot_learning_curve(evaluations: Path, output: Path, title: str, demonstrators_return: float | None) -> None:
+def plot_learning_curve(progress: Path, output: Path, title: str, demonstrators_return: float | None) -> None:
     """Draw the dense and the sparse return against the environment steps.
 
-    :param evaluations: an ``evaluations.csv``
+    :param progress: a ``progress.csv``
     :param output: PNG file to write
     :param title: title of the figure
     :param demonstrators_return: mean dense return of the demonstrations, drawn as a dashed line; None for none
@@ -42,7 +42,7 @@ def plot_learning_curve(evaluations: Path, output: Path, title: str, demonstrato
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    with open(evaluations, newline="", encoding="utf-8") as file:
+    with open(progress, newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     steps, dense, spread, sparse = (
         [float(row[name]) for row in rows] for name in ("timesteps", "dense_return", "dense_return_std", "sparse_return")

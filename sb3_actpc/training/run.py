@@ -3,85 +3,90 @@
 from __future__ import annotations
 
 import copy
-import dataclasses
-import importlib.metadata
-import json
-import platform
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import torch as th
-import yaml
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, ProgressBarCallback
-from stable_baselines3.common.logger import configure
+from stable_baselines3.common.logger import CSVOutputFormat, Logger
 from stable_baselines3.common.noise import ActionNoise, NormalActionNoise, OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_actpc.checkpoints import CheckpointCallback, list_bundles, restore
 from sb3_actpc.common.demonstrations import Demonstrations
-from sb3_actpc.common.files import atomic_write
-from sb3_actpc.training.config import RunConfig, RunPlan, load_algorithm, parse_schedule, read_yaml, resolve_run
+from sb3_actpc.training.config import RunConfig, RunPlan, load_algorithm, parse_schedule, resolve_run
 from sb3_actpc.training.environments import check_env_id, make_eval_envs, make_train_env
-from sb3_actpc.training.evaluation import EvaluationCallback, NormalizedPredictor, Predictor, play_episodes
+from sb3_actpc.training.episodes import EpisodeLog
+from sb3_actpc.training.evaluation import PROGRESS, EvaluationCallback, NormalizedPredictor, Predictor, play_episodes
+from sb3_actpc.training.record import read_config, read_plan, write_config, write_result
 from sb3_actpc.training.report import plot_learning_curve
 
 # the evaluation's episodes start from other states than the training's
 EVALUATION_SEED_OFFSET = 1_000_000
 CHECKPOINTS = "checkpoints"  # folder in the run's folder
-_RECORDED_PACKAGES = ("sb3-actpc", "stable-baselines3", "torch", "gymnasium", "mujoco", "robosuite", "numpy")
+DIAGNOSTICS = "diagnostics.csv"  # what the agent logs about itself
 
 
-def train_run(config: RunConfig, report: Callable[[str], None] = lambda line: None) -> dict[str, Any]:
-    """Train one agent; its folder then holds the model, the settings, the evaluations, the plot and the result.
+def train_run(
+    config: RunConfig, report: Callable[[str], None] = lambda line: None, callbacks: Sequence[BaseCallback] = ()
+) -> dict[str, Any]:
+    """Train one agent; its folder then holds ``config.json``, ``progress.csv`` (the evaluations), ``episodes.csv`` (every
+    training episode), ``diagnostics.csv`` (what the agent logs), ``model.zip``, the plot and, last, ``result.json``.
 
     Works with any algorithm of ``ALGORITHMS``; those that learn on policy keep no checkpoints. Sets the number of torch
     threads of the process.
 
     :param config: what to train
     :param report: given a line of text when the run starts and after each evaluation
-    :return: the content of ``result.json``: the last evaluation's means, the demonstrators' mean dense return (or
-        None), training steps per second (evaluations left out), seconds, versions, the folder
+    :param callbacks: further ones to watch the training with
+    :return: the content of ``result.json`` (see :func:`~sb3_actpc.training.record.write_result`), and the folder
     :raises FileNotFoundError: when the preset or the demonstrations do not exist
     :raises ValueError: when a setting is unknown or has a wrong value
     :raises gymnasium.error.Error: when the environment is unknown
     """
     check_env_id(config.env)
-    return _run(config, resolve_run(config), report, None)
+    return _run(config, resolve_run(config), report, None, callbacks)
 
 
-def resume_run(folder: Path, report: Callable[[str], None] = lambda line: None, progress: bool = True) -> dict[str, Any]:
-    """Go on with a run that was stopped, from its newest whole checkpoint, with the settings in its ``config.yml``.
+def resume_run(
+    folder: Path,
+    report: Callable[[str], None] = lambda line: None,
+    progress: bool = True,
+    callbacks: Sequence[BaseCallback] = (),
+) -> dict[str, Any]:
+    """Go on with a run that was stopped, from its newest whole checkpoint, with the settings in its ``config.json``.
 
     :param folder: run folder
     :param report: given a line of text when the run goes on, after each evaluation and for each damaged checkpoint
     :param progress: show a progress bar
+    :param callbacks: further ones to watch the training with
     :return: as :func:`train_run`
     :raises FileNotFoundError: when the folder is not that of a run
     :raises ValueError: when the run is finished, or its checkpoints do not fit or are all damaged
     """
     if (folder / "result.json").exists():
         raise ValueError(f"the run in {folder} is finished: start another with more --steps")
-    if not (folder / "config.yml").is_file():
-        raise FileNotFoundError(f"no run in {folder}: config.yml is missing")
-    config, plan = _read_plan(folder, progress)
+    config, plan = read_plan(folder, progress)
     if not plan.learns_off_policy:
         raise ValueError(f"{config.algo} learns on policy and keeps no checkpoints: start the run again, in another folder")
     check_env_id(config.env)
-    return _run(config, plan, report, folder)
+    return _run(config, plan, report, folder, callbacks)
 
 
-def _run(config: RunConfig, plan: RunPlan, report: Callable[[str], None], resumed: Path | None) -> dict[str, Any]:
+def _run(
+    config: RunConfig, plan: RunPlan, report: Callable[[str], None], resumed: Path | None, more: Sequence[BaseCallback]
+) -> dict[str, Any]:
     th.set_num_threads(config.threads)
     eval_envs = make_eval_envs(config.env, plan.env_kwargs, config.eval_episodes)
     train_env = make_train_env(config.env, plan.env_kwargs, plan.n_envs, config.seed, plan.normalize)
     try:
-        return _train(config, plan, train_env, eval_envs, report, resumed)
+        return _train(config, plan, train_env, eval_envs, report, resumed, more)
     finally:
         train_env.close()
         for env in eval_envs:
@@ -122,47 +127,15 @@ def load_run(folder: Path) -> tuple[dict[str, Any], Predictor]:
     """The recorded settings and the model of a run. The model is unpickled: open only runs that you trust.
 
     :param folder: run folder
-    :return: the content of ``config.yml``, and the model on the CPU, with its normalisation of observations where it has one
-    :raises FileNotFoundError: when the folder, ``config.yml`` or ``model.zip`` does not exist
+    :return: the content of ``config.json``, and the model on the CPU, with its normalisation of observations where it has one
+    :raises FileNotFoundError: when the folder, ``config.json`` or ``model.zip`` does not exist
     :raises ValueError: when one of the two cannot be read
     """
-    for name in ("config.yml", "model.zip"):
-        if not (folder / name).is_file():
-            raise FileNotFoundError(f"no run in {folder}: {name} is missing")
-    record = _read_config(folder, {"env", "env_kwargs", "algo", "seed"})
+    record = read_config(folder)
+    if not (folder / "model.zip").is_file():
+        raise FileNotFoundError(f"no run in {folder}: model.zip is missing")
     model = load_algorithm(record["algo"]).load(folder / "model.zip", device="cpu")
     return record, NormalizedPredictor.wrap_saved(model, folder)
-
-
-def _read_config(folder: Path, needed: set[str]) -> dict[str, Any]:
-    record = read_yaml((folder / "config.yml").read_bytes(), str(folder / "config.yml"))
-    if not isinstance(record, dict) or not needed <= record.keys():
-        raise ValueError(f"{folder / 'config.yml'}: expected the settings of a run ({', '.join(sorted(needed))})")
-    return record
-
-
-def _read_plan(folder: Path, progress: bool) -> tuple[RunConfig, RunPlan]:
-    """The choices and the plan of a run from what :func:`_write_config` wrote."""
-    choices = {field.name for field in dataclasses.fields(RunConfig)}
-    record = _read_config(folder, {*choices, "policy", "noise", "settings"})
-    config = RunConfig(**{**{name: record[name] for name in choices}, "output": str(folder), "progress": progress})
-    settings = dict(record["settings"])
-    if isinstance(settings.get("train_freq"), list):
-        settings["train_freq"] = tuple(settings["train_freq"])
-    plan = RunPlan(
-        algorithm=load_algorithm(record["algo"]),
-        policy=record["policy"],
-        n_timesteps=record["n_timesteps"],
-        n_envs=record["n_envs"],
-        eval_freq=record["eval_freq"],
-        env_kwargs=record["env_kwargs"],
-        noise=None if record["noise"] is None else (record["noise"][0], record["noise"][1]),
-        algorithm_kwargs=settings,
-        demonstrations=None if record["demonstrations"] is None else Path(record["demonstrations"]),
-        checkpoint_freq=record["checkpoint_freq"],
-        normalize=record.get("normalize"),
-    )
-    return config, plan
 
 
 def run_folder(config: RunConfig) -> Path:
@@ -230,6 +203,7 @@ def _train(
     eval_envs: list[gym.Env[Any, Any]],
     report: Callable[[str], None],
     resumed: Path | None,
+    more: Sequence[BaseCallback],
 ) -> dict[str, Any]:
     reference = demonstrators_return(plan.demonstrations)
     model = build_model(plan, config, train_env)
@@ -240,46 +214,30 @@ def _train(
         restore(model, folder / CHECKPOINTS, report)
     folder.mkdir(parents=True, exist_ok=True)
     if resumed is None:
-        _write_config(folder, config, plan, reference)
-    model.set_logger(configure(str(folder), ["csv"]))
-    callback = EvaluationCallback(
+        write_config(folder, config, plan, reference)
+    model.set_logger(Logger(str(folder), [CSVOutputFormat(str(folder / DIAGNOSTICS))]))
+    evaluation = EvaluationCallback(
         eval_envs, folder, plan.eval_freq, config.eval_episodes, config.seed + EVALUATION_SEED_OFFSET, report
     )
+    episodes = EpisodeLog(folder, lambda: evaluation.wall_seconds)
     since = f" from step {model.num_timesteps}" if has_checkpoint else ""
     report(f"{config.env}: {config.algo}, {plan.n_timesteps} steps{since}, into {folder}")
     if not has_checkpoint:
-        callback.begin(model)
-    _learn(model, plan.n_timesteps, _callbacks(folder, plan, callback, report), config.progress, goes_on=has_checkpoint)
-    seconds = callback.wall_seconds
-    result = {
-        **callback.last_summary,
-        "env": config.env,
-        "algo": config.algo,
-        "preset": config.preset_name,
-        "seed": config.seed,
-        "timesteps": model.num_timesteps,
-        "eval_episodes": config.eval_episodes,
-        "demonstrators_return": reference,
-        "steps_per_second": model.num_timesteps / max(seconds - callback.evaluation_seconds, 1e-9),
-        "wall_seconds": seconds,
-        "evaluation_seconds": callback.evaluation_seconds,
-        "versions": _versions(),
-        "folder": str(folder),
-    }
-    plot_learning_curve(folder / "evaluations.csv", folder / "learning_curve.png", f"{config.env}, {config.algo}", reference)
-    with atomic_write(folder / "result.json", "w") as file:
-        json.dump(result, file, indent=2)
+        episodes.begin()
+        evaluation.begin(model)
+    callbacks = [*_checkpoints(folder, plan, report), evaluation, episodes, *more]
+    _learn(model, plan.n_timesteps, callbacks, config.progress, goes_on=has_checkpoint)
+    plot_learning_curve(folder / PROGRESS, folder / "learning_curve.png", f"{config.env}, {config.algo}", reference)
+    result = write_result(folder)
     shutil.rmtree(folder / CHECKPOINTS, ignore_errors=True)  # there is nothing left to resume
-    return result
+    return {**result, "folder": str(folder)}
 
 
-def _callbacks(
-    folder: Path, plan: RunPlan, evaluation: EvaluationCallback, report: Callable[[str], None]
-) -> list[BaseCallback]:
-    """The checkpoints, where they are wanted, and the evaluation."""
+def _checkpoints(folder: Path, plan: RunPlan, report: Callable[[str], None]) -> list[BaseCallback]:
+    """The one that saves checkpoints, where they are wanted."""
     if not plan.checkpoint_freq:
-        return [evaluation]
-    return [CheckpointCallback(folder / CHECKPOINTS, plan.checkpoint_freq, at_end=False, report=report), evaluation]
+        return []
+    return [CheckpointCallback(folder / CHECKPOINTS, plan.checkpoint_freq, at_end=False, report=report)]
 
 
 def _learn(
@@ -299,39 +257,8 @@ def _learn(
                 one.pbar.close()
 
 
-def _write_config(folder: Path, config: RunConfig, plan: RunPlan, reference: float | None) -> None:
-    record = {
-        **dataclasses.asdict(config),
-        "preset": config.preset_name,
-        "policy": plan.policy,
-        "n_timesteps": plan.n_timesteps,
-        "n_envs": plan.n_envs,
-        "eval_freq": plan.eval_freq,
-        "checkpoint_freq": plan.checkpoint_freq,
-        "env_kwargs": plan.env_kwargs,
-        "noise": None if plan.noise is None else list(plan.noise),
-        "normalize": plan.normalize,
-        "settings": {key: list(value) if isinstance(value, tuple) else value for key, value in plan.algorithm_kwargs.items()},
-        "demonstrations": None if plan.demonstrations is None else str(plan.demonstrations),
-        "demonstrators_return": reference,
-        "versions": _versions(),
-    }
-    with atomic_write(folder / "config.yml", "w") as file:
-        yaml.safe_dump(record, file, sort_keys=False)
-
-
 def _action_noise(noise_type: str, noise_std: float, size: int) -> ActionNoise:
     mean, sigma = np.zeros(size), noise_std * np.ones(size)
     if noise_type == "normal":
         return NormalActionNoise(mean, sigma)
     return OrnsteinUhlenbeckActionNoise(mean, sigma)
-
-
-def _versions() -> dict[str, str]:
-    versions = {"python": platform.python_version()}
-    for name in _RECORDED_PACKAGES:
-        try:
-            versions[name] = importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:  # a source checkout that is not installed
-            versions[name] = "unknown"
-    return versions

@@ -19,7 +19,7 @@ from stable_baselines3.common.save_util import recursive_getattr
 from sb3_actpc.checkpoints import CheckpointCallback, TrainingStopped, continue_learning, restore
 from sb3_actpc.checkpoints.state import buffer_arrays
 
-WALL_TIME = {"time/fps", "time/time_elapsed", "wall_seconds"}
+WALL_TIME = {"time/fps", "time/time_elapsed", "seconds", "evaluation_seconds"}
 # a forked process has imported everything already
 START_METHOD = "fork" if "fork" in multiprocessing.get_all_start_methods() else "spawn"
 MakeModel = Callable[[], OffPolicyAlgorithm]

@@ -1,0 +1,135 @@
+"""``sb3-actpc compare``: many runs, brought to their end however often they are stopped."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from sb3_actpc.comparison import PlannedRun
+    from sb3_actpc.comparison.schedule import Summary
+
+# options that say which runs are compared; a file may say the same
+_COMPARISON = (
+    "envs",
+    "algos",
+    "ablate",
+    "seeds",
+    "steps",
+    "demonstrations",
+    "eval_freq",
+    "eval_episodes",
+    "checkpoint_freq",
+    "device",
+    "threads",
+)
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the sub-command.
+
+    :param subparsers: where to add it
+    """
+    parser = subparsers.add_parser(
+        "compare",
+        help="train several algorithms on several tasks with several seeds",
+        description="Train every algorithm on every task with every seed. Stopped at any moment, even killed, the same "
+        "command goes on: finished runs are not repeated, the others continue from their last checkpoint. "
+        "`sb3-actpc report` shows what has come of it.",
+    )
+    parser.add_argument(
+        "file", nargs="?", metavar="FILE", help="YAML file with these options as keys; options replace its values"
+    )
+    parser.add_argument("--envs", nargs="+", metavar="ID", help="tasks, such as SparseHopper-v5")
+    parser.add_argument(
+        "--algos", nargs="+", metavar="NAME", help="algorithms or named variants, such as actpc refresh_alone td3"
+    )
+    parser.add_argument("--ablate", action="store_true", default=None, help="ActPC with every part, and without each in turn")
+    parser.add_argument("--seeds", type=int, metavar="N", help="seeds 0 to N-1 (default: 3)")
+    parser.add_argument("--steps", type=int, metavar="N", help="environment steps of each run (default: the presets')")
+    parser.add_argument("--out", metavar="DIR", help="folder of the comparison (default: runs/comparison)")
+    parser.add_argument("--demonstrations", metavar="FILE", help="as in train (default: the ones in the package)")
+    parser.add_argument("--eval-freq", type=int, metavar="N", help="steps between evaluations (default: a tenth of all)")
+    parser.add_argument("--eval-episodes", type=int, metavar="N", help="episodes in each (default: 10)")
+    parser.add_argument("--checkpoint-freq", type=int, metavar="N", help="steps between checkpoints (default: as --eval-freq)")
+    parser.add_argument("--device", help="torch device (default: cpu)")
+    parser.add_argument("--threads", type=int, metavar="N", help="threads of each run (default: 1)")
+    parser.add_argument("--workers", type=int, metavar="N", help="runs at a time (default: one for each core)")
+    parser.add_argument(
+        "--engine", default="local", metavar="{local,ray}", help="processes, or a Ray cluster (default: local)"
+    )
+    parser.add_argument("--address", help="Ray cluster to use (default: one is started on this machine)")
+    parser.add_argument("--retry-failed", action="store_true", help="try runs again that failed before")
+    parser.add_argument("--dry-run", action="store_true", help="print the table of runs and the time it will take, and end")
+    parser.add_argument("--no-progress", action="store_true", help="lines instead of progress bars")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Bring the runs to their end.
+
+    :param args: parsed arguments
+    :return: exit code: 0, 1 when runs have failed, 75 when a signal or a full disk stopped the command
+    :raises ValueError: when a name, a number or a setting is wrong, or another command works in the folder
+    :raises FileNotFoundError: when a file is missing
+    """
+    from sb3_actpc.comparison import plan_runs, read_comparison
+    from sb3_actpc.comparison.display import make_display
+    from sb3_actpc.comparison.engines import make_engine
+    from sb3_actpc.comparison.schedule import run_comparison
+
+    given = _given(args)
+    folder = Path(args.out or given.pop("out", None) or "runs/comparison")
+    given.pop("out", None)
+    comparison = read_comparison(given)
+    runs = plan_runs(comparison, folder)
+    if args.dry_run:
+        _print_table(runs, args, comparison.threads)
+        return 0
+    with make_display(not args.no_progress) as display:
+        summary = run_comparison(
+            runs,
+            folder,
+            lambda: make_engine(args.engine, args.workers, comparison.threads, args.address),
+            display,
+            args.retry_failed,
+        )
+    return _conclude(summary, folder)
+
+
+def _given(args: argparse.Namespace) -> dict[str, Any]:
+    from sb3_actpc.comparison.table import read_yaml
+
+    given = {} if args.file is None else read_yaml(Path(args.file))
+    options = {name: getattr(args, name) for name in _COMPARISON}
+    return {**given, **{name: value for name, value in options.items() if value is not None}}
+
+
+def _print_table(runs: Sequence[PlannedRun], args: argparse.Namespace, threads: int) -> None:
+    from sb3_actpc.comparison.engines.local import usable_cores
+    from sb3_actpc.comparison.estimate import describe_table
+
+    print(describe_table(runs, args.workers or max(1, usable_cores() // threads), args.retry_failed))
+
+
+def _conclude(summary: Summary, folder: Path) -> int:
+    """The last lines, and the exit code."""
+    from sb3_actpc.checkpoints import EXIT_STOPPED
+
+    n_runs = len(summary.finished) + len(summary.failed) + len(summary.unfinished)
+    print(f"{len(summary.finished)} of {n_runs} runs are finished; see them with: sb3-actpc report {folder}")
+    for run, message in summary.failed:
+        print(f"sb3-actpc: failed: {run.name} ({run.folder}): {message}", file=sys.stderr)
+    if summary.stopped_by is not None:
+        reason = f"the disk is full ({summary.message}), free some space" if summary.message else summary.stopped_by
+        print(
+            f"sb3-actpc: stopped by {reason}; {len(summary.unfinished)} runs are left, the same command goes on with them",
+            file=sys.stderr,
+        )
+        return EXIT_STOPPED
+    if summary.failed:
+        print("sb3-actpc: try failed runs again with --retry-failed", file=sys.stderr)
+        return 1
+    return 0
