@@ -64,9 +64,10 @@ def record_successes(
             sparse, dense = episode["rewards"].sum(), episode["dense_rewards"].sum()
             report(f"episode {len(episodes)}/{n_episodes} (try {n_tries}): sparse return {sparse:.1f}, dense {dense:.1f}")
     if len(episodes) < n_episodes:
+        task = env.spec.id if env.spec is not None else type(env.unwrapped).__name__
         raise ValueError(
-            f"only {len(episodes)} of {n_tries} episodes succeeded, {n_episodes} are needed: train the expert longer "
-            "(--steps), raise --max-tries, or ask for fewer episodes (--episodes)"
+            f"only {len(episodes)} of {n_tries} episodes succeeded in {task}, {n_episodes} are needed: train the expert "
+            "longer (--steps), raise --max-tries, or ask for fewer episodes (--episodes)"
         )
     return episodes, n_tries
 
