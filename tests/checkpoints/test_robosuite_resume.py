@@ -1,11 +1,11 @@
 """Robosuite runs that are stopped in the middle of an episode, and several environments in processes of their own."""
 
+import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import yaml
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
@@ -93,6 +93,6 @@ def test_the_command_trains_with_the_shipped_settings(n_envs: int, tmp_path: Pat
     result = train_run(config)
     assert result["timesteps"] == 60
     assert result["success_rate"] in (0.0, 1.0)
-    recorded = yaml.safe_load((tmp_path / "run" / "config.yml").read_text())
+    recorded = json.loads((tmp_path / "run" / "config.json").read_text())
     assert (recorded["n_envs"], recorded["settings"]["target_update_interval"]) == (n_envs, 500)
     assert result["versions"]["robosuite"].startswith("1.5")
