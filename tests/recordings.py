@@ -9,9 +9,9 @@ import sb3_actpc  # noqa: F401  (registers the tasks)
 from sb3_actpc.common.demonstrations import Demonstrations
 
 
-def record(env_id: str, n_episodes: int = 2, n_steps: int = 12) -> Demonstrations:
+def record(env_id: str, n_episodes: int = 2, n_steps: int = 12, **env_kwargs: object) -> Demonstrations:
     """Episodes cut after ``n_steps``, as a time limit would cut them; paid as the environment pays."""
-    env = gym.make(env_id, max_episode_steps=n_steps)
+    env = gym.make(env_id, max_episode_steps=n_steps, **env_kwargs)
     env.action_space.seed(0)
     rows: list[tuple] = []
     starts = []

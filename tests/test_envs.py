@@ -12,8 +12,8 @@ from stable_baselines3.common.env_checker import check_env as sb3_check_env
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
-from sb3_actpc.common.demonstrations import Demonstrations
 from sb3_actpc.envs import SPARSE_MUJOCO_IDS, dense_env_id, register_envs
+from tests.recordings import record
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*out of date.*", "ignore:.*infinity.*")
 
@@ -300,36 +300,14 @@ def test_dense_env_id_names_the_base_task_or_lists_the_known_ids() -> None:
             dense_env_id(unknown)
 
 
-def record(env_id: str, n_episodes: int, **env_kwargs: object) -> Demonstrations:
-    """Random episodes as they are paid live, falls and time limits included."""
-    env = gym.make(env_id, max_episode_steps=50, **env_kwargs)
-    env.action_space.seed(0)
-    rows: list[tuple] = []
-    starts = []
-    for episode in range(n_episodes):
-        starts.append(len(rows))
-        observation, _ = env.reset(seed=episode)
-        done = False
-        while not done:
-            action = env.action_space.sample()
-            next_observation, reward, terminated, truncated, info = env.step(action)
-            rows.append((observation, action, next_observation, reward, terminated, info["dense_reward"]))
-            observation, done = next_observation, terminated or truncated
-    env.close()
-    observations, actions, next_observations, rewards, terminations, dense_rewards = map(np.array, zip(*rows, strict=True))
-    return Demonstrations(
-        observations, actions, next_observations, rewards, terminations, np.array(starts), env_id, dense_rewards
-    )
-
-
 @pytest.mark.parametrize("env_id", SPARSE_MUJOCO_IDS)
 def test_demonstrations_recorded_under_one_condition_are_paid_as_live_under_another(env_id: str) -> None:
     """Otherwise the critic would learn two rewards at once: the demonstrations' and the environment's."""
     thresholds = {"Reacher": 0.2, "Walker2d": 1e-4, "Swimmer": 0.02}
     threshold = thresholds.get(task_of(env_id), 0.1)
-    recorded = record(env_id, 10)
+    recorded = record(env_id, 10, 50)
     for kwargs in [{}] if "Reacher" in env_id else [{"condition": "displacement"}, {"condition": "forward"}]:
-        live = record(env_id, 10, threshold=threshold, **kwargs)
+        live = record(env_id, 10, 50, threshold=threshold, **kwargs)
         env = make_vec_env(env_id, env_kwargs={"threshold": threshold, **kwargs})
         rewarded = recorded.rewarded_by(env)
         env.close()
@@ -355,7 +333,7 @@ def test_demonstrations_of_a_task_without_conditions_keep_their_rewards() -> Non
 @pytest.mark.parametrize("env_id", SPARSE_MUJOCO_IDS)
 def test_the_demonstrator_is_drawn_where_it_was(env_id: str) -> None:
     """Angles and travelled distance; the Swimmer's and the start's sideways position are in no recording."""
-    recorded = record(env_id, 1)
+    recorded = record(env_id, 1, 50)
     env = gym.make(env_id)
     env.reset(seed=0)
     simulator = env.unwrapped
