@@ -69,8 +69,9 @@ def test_the_interval_over_seeds_is_students() -> None:
 
 
 def test_against_rliable() -> None:
-    metrics = pytest.importorskip("rliable.metrics", exc_type=Exception)
-    library = pytest.importorskip("rliable.library", exc_type=Exception)
+    pytest.importorskip("rliable.metrics", exc_type=Exception)
+    from rliable import library, metrics
+
     joined, others = np.stack(SCORES, axis=1), np.stack(OTHERS, axis=1)  # (n_runs, n_tasks)
     assert statistics.interquartile_mean(SCORES) == pytest.approx(metrics.aggregate_iqm(joined))
     assert statistics.probability_of_improvement(SCORES, OTHERS) == pytest.approx(
