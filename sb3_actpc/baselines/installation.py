@@ -33,7 +33,7 @@ RECIPES = {
     "d3rlpy": Recipe((_TORCH, ("d3rlpy==2.8.1",)), "import d3rlpy"),
     # without its dependencies: egl_probe has to be compiled, torchvision must fit torch, and neither is used without images
     "robomimic": Recipe(
-        (_TORCH, ("h5py==3.16.0", "psutil==7.2.2", "termcolor==3.3.0", "tqdm==4.67.3"), ("--no-deps", "robomimic==0.3.0")),
+        (_TORCH, ("matplotlib==3.9.2", "six==1.17.0", "termcolor==2.5.0", "tqdm==4.67.1"), ("--no-deps", "robomimic==0.3.0")),
         "import robomimic",
     ),
 }

@@ -1,7 +1,7 @@
 """Offline methods of other packages (BCQ and CQL by d3rlpy, HBC and IRIS by robomimic), evaluated like every other algorithm.
 
-Each trains and acts in a process of its own, in the virtual environment that ``sb3-actpc baselines install`` makes: the packages
-pin other versions than this one. Demonstrations go in and actions come out through pipes
+Each trains and acts in a process of its own, in the virtual environment that ``sb3-actpc baselines install`` makes: the
+packages pin other versions than this one. Demonstrations go in and actions come out through pipes
 (:mod:`sb3_actpc.baselines.servers.frames`), so the episodes are played here, in our environments.
 """
 
@@ -35,8 +35,8 @@ class ServedPolicy(BasePolicy):
     """
     A policy whose actions another process chooses.
 
-    ``predict`` takes and returns that process's state as SB3's recurrent ``state``, arrays with a row for each environment; None
-    where the method has none.
+    ``predict`` takes and returns that process's state as SB3's recurrent ``state``, arrays with a row for each environment;
+    None where the method has none.
 
     :param observation_space: a Box
     :param action_space: a Box with bounds
@@ -96,6 +96,7 @@ class ServedAlgorithm(OfflineAlgorithm):
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": ServedPolicy}
     package: ClassVar[str]
     method: ClassVar[str]
+    policy: ServedPolicy
 
     def __init__(
         self,
@@ -112,6 +113,7 @@ class ServedAlgorithm(OfflineAlgorithm):
         self.method_kwargs = _plain(method_kwargs or {})
         self.timeout = timeout
         self._process: ServerProcess | None = None
+        self._state_names: list[str] = []
         super().__init__(policy, env, batch_size=batch_size, **options)
 
     # ------------------------------------------------------------------ setting up
@@ -138,12 +140,11 @@ class ServedAlgorithm(OfflineAlgorithm):
             spread = np.maximum(shown.observations.std(axis=0), SMALLEST_SPREAD)
             self.normalization = th.from_numpy(np.stack([shown.observations.mean(axis=0), spread]))
         bounds = shown.episode_bounds
+        actions = Episodes.from_demonstrations(shown, self.observation_space, self.action_space).actions
         self._shown = {
             "observations": self._normalized(shown.observations),
             "next_observations": self._normalized(shown.next_observations),
-            "actions": Episodes.from_demonstrations(shown, self.observation_space, self.action_space).actions.astype(
-                np.float32
-            ),
+            "actions": actions.astype(np.float32),
             "rewards": shown.rewards,
             "terminations": shown.terminations,
             "last_rows": np.repeat(bounds[:, 1] - 1, bounds[:, 1] - bounds[:, 0]),
@@ -283,7 +284,7 @@ class CQL(ServedAlgorithm):
 @with_keywords_of(ServedAlgorithm)
 class HBC(ServedAlgorithm):
     """
-    Hierarchical behaviour cloning (Mandlekar et al., arXiv 2003.06085) by robomimic: a planner of subgoals and a recurrent actor.
+    Hierarchical behaviour cloning (Mandlekar et al., arXiv 2003.06085) by robomimic: a planner of subgoals, a recurrent actor.
 
     Difference from robomimic's runs: the observation is one key, not one for each of robosuite's parts.
 
@@ -304,8 +305,8 @@ class HBC(ServedAlgorithm):
 @with_keywords_of(ServedAlgorithm)
 class IRIS(ServedAlgorithm):
     """
-    Implicit reinforcement without interaction at scale (Mandlekar et al., arXiv 1911.05321) by robomimic: as :class:`HBC`, with a
-    value function (BCQ) that chooses among sampled subgoals.
+    Implicit reinforcement without interaction at scale (Mandlekar et al., arXiv 1911.05321) by robomimic: as :class:`HBC`, with
+    a value function (BCQ) that chooses among sampled subgoals.
 
     :param policy: "MlpPolicy"
     :param env: as :class:`ServedAlgorithm`'s
