@@ -305,7 +305,7 @@ class HBC(ServedAlgorithm):
 @with_keywords_of(ServedAlgorithm)
 class IRIS(ServedAlgorithm):
     """
-    Implicit reinforcement without interaction at scale (Mandlekar et al., arXiv 1911.05321) by robomimic: as :class:`HBC`, with
+    Implicit reinforcement without interaction at scale (Mandlekar et al., arXiv 1911.05321) by robomimic: :class:`HBC` with
     a value function (BCQ) that chooses among sampled subgoals.
 
     :param policy: "MlpPolicy"
