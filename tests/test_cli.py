@@ -21,6 +21,7 @@ from sb3_actpc.cli import main
 from sb3_actpc.common.demonstrations import DATA_FOLDER, Demonstrations
 from sb3_actpc.training import ALGORITHMS, RunConfig, play_episodes, train_run
 from sb3_actpc.training.config import find_demonstrations, load_preset, parse_assignments, parse_schedule
+from sb3_actpc.training.evaluation import EpisodeStatistics
 from sb3_actpc.training.video import RenderingUnavailable, choose_gl_backend
 
 EPISODE_LENGTH = 10
@@ -293,6 +294,15 @@ def test_episodes_are_played_once_each_with_the_recurrent_state_carried() -> Non
         assert (observation[:, 1] + 1 == state).all()
     drawn = [env.reset(seed=seed)[0][0] for env, seed in zip([envs[0]] * 3, (5, 6, 7), strict=True)]
     assert [*policy.calls[0][0][:, 0], *policy.calls[10][0][:, 0]] == drawn
+
+
+def test_failed_episodes_are_counted_by_their_farthest_stage() -> None:
+    rewards = np.zeros(5)
+    successes = np.array([0.0, 1.0, 0.0, 0.0, 1.0])
+    stages = ("grasp", "lift", "reach", "grasp", "lift")
+    assert EpisodeStatistics(rewards, rewards, successes, rewards, stages).failed_after() == {"grasp": 2, "reach": 1}
+    unknown = EpisodeStatistics(rewards, rewards, np.full(5, np.nan), rewards, ("",) * 5)
+    assert unknown.failed_after() == {}
 
 
 def test_success_is_unknown_where_the_environment_does_not_report_it() -> None:
