@@ -326,6 +326,24 @@ def test_evaluate_replays_a_run_and_writes_a_video(capsys: pytest.CaptureFixture
     assert (RUN / "video.mp4").stat().st_size > 0
 
 
+@pytest.mark.parametrize("choice", ["shipped", "weak"])
+def test_the_demonstrator_beside_is_the_one_that_the_run_had(
+    choice: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert train("--demonstrations", "none", "--steps", "20") == 0
+    beside = ["evaluate", str(RUN), "--episodes", "1", "--video", "line.gif", "--beside-demonstrator"]
+    assert main(beside) == 2
+    assert "leave --beside-demonstrator out" in capsys.readouterr().err
+    config = json.loads((RUN / "config.json").read_text(encoding="utf-8"))
+    (RUN / "config.json").write_text(json.dumps({**config, "demonstrations": choice}), encoding="utf-8")
+    write_demonstrations(Path("others.npz"), dense_reward=1.0)
+    monkeypatch.setattr("sb3_actpc.training.config.shipped_demonstrations", lambda env_id, weak=False: Path("others.npz"))
+    recorded: list[Any] = []
+    monkeypatch.setattr("sb3_actpc.training.video.record_video", lambda *arguments: recorded.append(arguments) or 1)
+    assert main(beside) == 0
+    assert recorded[0][-1].n_episodes == 2
+
+
 def test_evaluate_goes_on_where_nothing_can_be_rendered(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
