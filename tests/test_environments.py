@@ -124,6 +124,8 @@ def test_on_policy_algorithms_say_that_they_keep_no_checkpoints(tmp_path: Path) 
     with pytest.raises(ValueError, match="logo learns on policy and keeps no checkpoints: leave --checkpoint-freq out"):
         resolve_run(RunConfig("Pendulum-v1", "logo", checkpoint_freq=10))
     assert resolve_run(RunConfig("Pendulum-v1", "logo")).checkpoint_freq == 0
+    with pytest.raises(ValueError, match="bc is quick enough to be run again and keeps no checkpoints"):
+        resolve_run(RunConfig("Pendulum-v1", "bc", checkpoint_freq=10))
     with pytest.raises(ValueError, match="PPO takes no action noise"):
         resolve_run(RunConfig("Pendulum-v1", "ppo", overrides={"noise_type": "normal", "noise_std": 0.1}))
 

@@ -27,6 +27,8 @@ OFF_POLICY = {"learning_starts": 0, "buffer_size": 1000, "batch_size": 8}
 FEWER: dict[str, dict[str, Any]] = {
     "actpc": {**OFF_POLICY, "prior_updates": 2, "actor_warm_start": 2, "critic_warmup": 0},
     "her": {**OFF_POLICY, "demonstration_fraction": 1.0},
+    "bc": {"batch_size": 8},
+    "bc_rnn": {"batch_size": 8},
     "td3": OFF_POLICY,
     "ddpg": OFF_POLICY,
     "sac_rlpd": OFF_POLICY,

@@ -1,8 +1,9 @@
 """The systems that ActPC is compared with, as Stable-Baselines3 algorithms on the same tasks and demonstrations."""
 
+from sb3_actpc.baselines.bc import BC, BCRNN
 from sb3_actpc.baselines.her import HER
 from sb3_actpc.baselines.logo import LOGO
 from sb3_actpc.baselines.rlpd import RLPD
 from sb3_actpc.baselines.td3 import DDPGDemo, TD3Demo
 
-__all__ = ["HER", "LOGO", "RLPD", "DDPGDemo", "TD3Demo"]
+__all__ = ["BC", "BCRNN", "HER", "LOGO", "RLPD", "DDPGDemo", "TD3Demo"]

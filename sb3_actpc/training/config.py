@@ -16,6 +16,7 @@ from typing import Any
 import yaml
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_actpc.common.checks import check_device
@@ -25,6 +26,8 @@ from sb3_actpc.envs import sparse_env_id
 # name on the command line -> "module:class", imported only when it is used
 ALGORITHMS = {
     "actpc": "sb3_actpc.actpc:ActPC",
+    "bc": "sb3_actpc.baselines:BC",
+    "bc_rnn": "sb3_actpc.baselines:BCRNN",
     "ddpg": "sb3_actpc.baselines:DDPGDemo",
     "her": "sb3_actpc.baselines:HER",
     "logo": "sb3_actpc.baselines:LOGO",
@@ -148,6 +151,12 @@ class RunPlan:
         return issubclass(self.algorithm, OffPolicyAlgorithm)
 
     @property
+    def without_checkpoints(self) -> str:
+        """Why there are none, where there are none."""
+        on_policy = issubclass(self.algorithm, OnPolicyAlgorithm)
+        return f"{'learns on policy' if on_policy else 'is quick enough to be run again'} and keeps no checkpoints"
+
+    @property
     def uses_demonstrations(self) -> bool:
         """Whether the algorithm is given the demonstrations (TD3, say, has no keyword for them)."""
         return self.demonstrations is not None and "demonstrations" in constructor_parameters(self.algorithm)
@@ -197,7 +206,7 @@ def resolve_run(config: RunConfig) -> RunPlan:
     if plan.learns_off_policy:
         return plan
     if config.checkpoint_freq:
-        raise ValueError(f"{config.algo} learns on policy and keeps no checkpoints: leave --checkpoint-freq out, or give 0")
+        raise ValueError(f"{config.algo} {plan.without_checkpoints}: leave --checkpoint-freq out, or give 0")
     return dataclasses.replace(plan, checkpoint_freq=0)
 
 

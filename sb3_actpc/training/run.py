@@ -74,7 +74,7 @@ def resume_run(
         raise ValueError(f"the run in {folder} is finished: start another with more --steps")
     config, plan = read_plan(folder, progress)
     if not plan.learns_off_policy:
-        raise ValueError(f"{config.algo} learns on policy and keeps no checkpoints: start the run again, in another folder")
+        raise ValueError(f"{config.algo} {plan.without_checkpoints}: start the run again, in another folder")
     check_env_id(config.env)
     return _run(config, plan, report, folder, callbacks)
 

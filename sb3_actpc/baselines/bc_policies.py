@@ -1,0 +1,234 @@
+"""The networks of behaviour cloning: normalised observations in, actions out, with or without a memory."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.torch_layers import create_mlp
+from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
+from torch import nn
+
+from sb3_actpc.common.checks import check_choices, check_kinds, check_range
+
+CELLS: dict[str, type[nn.GRU] | type[nn.LSTM]] = {"gru": nn.GRU, "lstm": nn.LSTM}
+SMALLEST_SPREAD = 1e-3  # an entry that hardly varies in the demonstrations is not blown up
+LARGEST_INPUT = 10.0  # as in SB3's VecNormalize
+
+
+class CloningPolicy(BasePolicy):
+    """
+    What both policies share: the normalisation of observations, the optimiser, and actions cut to [-1, 1] before they are
+    given the environment's units.
+
+    :param observation_space: a Box
+    :param action_space: a Box with bounds
+    :param lr_schedule: learning rate
+    :param optimizer_class: of torch
+    :param optimizer_kwargs: its keywords, without the learning rate
+    :raises ValueError: for other spaces
+    """
+
+    mean: th.Tensor
+    spread: th.Tensor
+
+    def __init__(
+        self,
+        observation_space: spaces.Space,
+        action_space: spaces.Box,
+        lr_schedule: Schedule,
+        optimizer_class: type[th.optim.Optimizer] = th.optim.AdamW,
+        optimizer_kwargs: dict[str, Any] | None = None,
+    ) -> None:
+        if not isinstance(observation_space, spaces.Box):
+            raise ValueError(f"behaviour cloning needs Box observations, found {observation_space}")
+        super().__init__(
+            observation_space,
+            action_space,
+            optimizer_class=optimizer_class,
+            optimizer_kwargs=optimizer_kwargs,
+            normalize_images=False,
+            squash_output=True,  # actions are scaled to [-1, 1]
+        )
+        self.n_inputs, self.n_outputs = (int(np.prod(space.shape or ())) for space in (observation_space, action_space))
+        self.register_buffer("mean", th.zeros(self.n_inputs))
+        self.register_buffer("spread", th.ones(self.n_inputs))
+        self._build()
+        self.optimizer = self.optimizer_class(self.parameters(), lr=lr_schedule(1), **self.optimizer_kwargs)  # type: ignore[call-arg]
+
+    def _build(self) -> None:
+        """Make the network."""
+        raise NotImplementedError
+
+    def fit_normalization(self, rows: th.Tensor) -> None:
+        """
+        :param rows: demonstrated observations, (N, obs_dim), whose entries get mean 0 and standard deviation 1
+        """
+        self.mean.copy_(rows.mean(dim=0))
+        self.spread.copy_(rows.std(dim=0, correction=0).clamp(min=SMALLEST_SPREAD))
+
+    def normalized(self, observations: th.Tensor) -> th.Tensor:
+        """
+        :param observations: (..., obs_dim)
+        :return: the same, normalised
+        """
+        return ((observations - self.mean) / self.spread).clamp(-LARGEST_INPUT, LARGEST_INPUT)
+
+
+class BCPolicy(CloningPolicy):
+    """
+    A multilayer perceptron.
+
+    :param args: as :class:`CloningPolicy`'s
+    :param net_arch: hidden sizes; by default two of 512
+    :param kwargs: as :class:`CloningPolicy`'s
+    """
+
+    def __init__(self, *args: Any, net_arch: list[int] | None = None, **kwargs: Any) -> None:
+        self.net_arch = [512, 512] if net_arch is None else list(net_arch)
+        super().__init__(*args, **kwargs)
+
+    def _build(self) -> None:
+        self.network = nn.Sequential(*create_mlp(self.n_inputs, self.n_outputs, self.net_arch, nn.ReLU))
+
+    def forward(self, inputs: th.Tensor) -> th.Tensor:
+        """
+        :param inputs: normalised observations, (B, obs_dim)
+        :return: actions, (B, A), not cut to [-1, 1]
+        """
+        return self.network(inputs)
+
+    def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        assert isinstance(observation, th.Tensor)
+        return self(self.normalized(observation.float().flatten(1))).clamp(-1, 1)
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        return {**_shared_parameters(self), "net_arch": self.net_arch}
+
+
+class BCRNNPolicy(CloningPolicy):
+    """
+    A recurrent network.
+
+    Its state is a tuple of arrays, as in sb3-contrib's RecurrentPPO: (n_layers, n, hidden_size) of the cells (two for an
+    LSTM), and last the steps since it began, (n,).
+
+    :param args: as :class:`CloningPolicy`'s
+    :param cell: "gru" or "lstm"
+    :param hidden_size: units of each layer
+    :param n_layers: recurrent layers
+    :param restart_every: steps after which the state begins anew, as it does in the sequences that it learned from; None
+        carries it through the episode
+    :param kwargs: as :class:`CloningPolicy`'s
+    :raises ValueError: for a keyword with a value that is not allowed
+    """
+
+    def __init__(
+        self,
+        *args: Any,
+        cell: str = "gru",
+        hidden_size: int = 256,
+        n_layers: int = 1,
+        restart_every: int | None = None,
+        **kwargs: Any,
+    ) -> None:
+        given = locals()
+        check_choices(given, cell=list(CELLS))
+        check_kinds(given, whole="hidden_size n_layers", optional_whole="restart_every")
+        check_range(given, "hidden_size n_layers restart_every", 1)
+        self.cell, self.hidden_size, self.n_layers, self.restart_every = cell, hidden_size, n_layers, restart_every
+        super().__init__(*args, **kwargs)
+
+    def _build(self) -> None:
+        self.memory = CELLS[self.cell](self.n_inputs, self.hidden_size, self.n_layers, batch_first=True)
+        self.head = nn.Linear(self.hidden_size, self.n_outputs)
+
+    def forward(
+        self, inputs: th.Tensor, hidden: tuple[th.Tensor, ...] | None = None
+    ) -> tuple[th.Tensor, tuple[th.Tensor, ...]]:
+        """
+        :param inputs: normalised observations, (B, T, obs_dim)
+        :param hidden: of the cells, each (n_layers, B, hidden_size); None for zeros
+        :return: actions, (B, T, A), not cut to [-1, 1], and the hidden state after the last
+        """
+        if hidden is None:
+            outputs, after = self.memory(inputs)
+        else:
+            outputs, after = self.memory(inputs, hidden if self.cell == "lstm" else hidden[0])
+        return self.head(outputs), after if self.cell == "lstm" else (after,)
+
+    def initial_state(self, n: int) -> tuple[np.ndarray, ...]:
+        """
+        :param n: episodes side by side
+        :return: the state before their first step
+        """
+        n_parts = 2 if self.cell == "lstm" else 1
+        hidden = [np.zeros((self.n_layers, n, self.hidden_size), dtype=np.float32) for _ in range(n_parts)]
+        return *hidden, np.zeros(n, dtype=np.int64)
+
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """
+        :param observation: of one environment, or of n
+        :param state: what the call before returned; None at the beginning
+        :param episode_start: (n,), true where an episode begins, and so the state
+        :param deterministic: has no effect
+        :return: actions in the environment's units, and the next state
+        :raises ValueError: when the state is not that of n episodes of this network
+        """
+        self.set_training_mode(False)
+        rows, is_batch = self.obs_to_tensor(observation)
+        assert isinstance(rows, th.Tensor)
+        *hidden, steps = self._state_of(len(rows), state)
+        begins = np.zeros(len(rows), dtype=bool)
+        if episode_start is not None:
+            begins = np.asarray(episode_start, dtype=bool).reshape(-1)
+        if len(begins) != len(rows):
+            raise ValueError(f"episode_start has {len(begins)} entries for {len(rows)} observations")
+        if self.restart_every is not None:
+            begins = begins | (steps >= self.restart_every)
+        kept = [np.where(begins[None, :, None], np.float32(0.0), part) for part in hidden]
+        with th.no_grad():
+            before = tuple(th.as_tensor(part, device=self.device) for part in kept)
+            outputs, after = self(self.normalized(rows.float().flatten(1))[:, None], before)
+        shape = self.action_space.shape or ()
+        actions = np.asarray(self.unscale_action(outputs[:, 0].clamp(-1, 1).cpu().numpy().reshape(-1, *shape)))
+        next_state = *(part.cpu().numpy() for part in after), np.where(begins, 0, steps) + 1
+        return actions if is_batch else actions[0], next_state
+
+    def _state_of(self, n: int, state: tuple[np.ndarray, ...] | None) -> tuple[np.ndarray, ...]:
+        initial = self.initial_state(n)
+        if state is None:
+            return initial
+        wanted, found = [part.shape for part in initial], [np.shape(part) for part in state]
+        if found != wanted:
+            raise ValueError(f"state has arrays of shapes {found}: this network's, for {n} observations, have {wanted}")
+        return state
+
+    def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        """The first step of an episode; :meth:`predict` carries the state."""
+        assert isinstance(observation, th.Tensor)
+        return self(self.normalized(observation.float().flatten(1))[:, None])[0][:, 0].clamp(-1, 1)
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        names = ("cell", "hidden_size", "n_layers", "restart_every")
+        return {**_shared_parameters(self), **{name: getattr(self, name) for name in names}}
+
+
+def _shared_parameters(policy: CloningPolicy) -> dict[str, Any]:
+    """What :meth:`BasePolicy.save` keeps to build the policy again; the learning rate is of no use then."""
+    return {
+        "observation_space": policy.observation_space,
+        "action_space": policy.action_space,
+        "lr_schedule": policy._dummy_schedule,
+        "optimizer_class": policy.optimizer_class,
+        "optimizer_kwargs": policy.optimizer_kwargs,
+    }
