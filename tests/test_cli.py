@@ -21,6 +21,7 @@ from sb3_actpc.cli import main
 from sb3_actpc.common.demonstrations import DATA_FOLDER, Demonstrations
 from sb3_actpc.training import ALGORITHMS, RunConfig, play_episodes, train_run
 from sb3_actpc.training.config import find_demonstrations, load_preset, parse_assignments, parse_schedule
+from sb3_actpc.training.evaluation import EpisodeStatistics
 from sb3_actpc.training.video import RenderingUnavailable, choose_gl_backend
 
 EPISODE_LENGTH = 10
@@ -295,6 +296,15 @@ def test_episodes_are_played_once_each_with_the_recurrent_state_carried() -> Non
     assert [*policy.calls[0][0][:, 0], *policy.calls[10][0][:, 0]] == drawn
 
 
+def test_failed_episodes_are_counted_by_their_farthest_stage() -> None:
+    rewards = np.zeros(5)
+    successes = np.array([0.0, 1.0, 0.0, 0.0, 1.0])
+    stages = ("grasp", "lift", "reach", "grasp", "lift")
+    assert EpisodeStatistics(rewards, rewards, successes, rewards, stages).failed_after() == {"grasp": 2, "reach": 1}
+    unknown = EpisodeStatistics(rewards, rewards, np.full(5, np.nan), rewards, ("",) * 5)
+    assert unknown.failed_after() == {}
+
+
 def test_success_is_unknown_where_the_environment_does_not_report_it() -> None:
     model = TD3("MlpPolicy", "Pendulum-v1", policy_kwargs={"net_arch": [4]}, buffer_size=10)
     episodes = play_episodes(model, [gym.make("Pendulum-v1")], n_episodes=1, seed=0)
@@ -314,6 +324,24 @@ def test_evaluate_replays_a_run_and_writes_a_video(capsys: pytest.CaptureFixture
     assert imageio.imread("line.png").shape == (16, 6 * 24, 3)  # six pictures at half the size
     assert main(["evaluate", str(RUN), "--episodes", "1"]) == 0
     assert (RUN / "video.mp4").stat().st_size > 0
+
+
+@pytest.mark.parametrize("choice", ["shipped", "weak"])
+def test_the_demonstrator_beside_is_the_one_that_the_run_had(
+    choice: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert train("--demonstrations", "none", "--steps", "20") == 0
+    beside = ["evaluate", str(RUN), "--episodes", "1", "--video", "line.gif", "--beside-demonstrator"]
+    assert main(beside) == 2
+    assert "leave --beside-demonstrator out" in capsys.readouterr().err
+    config = json.loads((RUN / "config.json").read_text(encoding="utf-8"))
+    (RUN / "config.json").write_text(json.dumps({**config, "demonstrations": choice}), encoding="utf-8")
+    write_demonstrations(Path("others.npz"), dense_reward=1.0)
+    monkeypatch.setattr("sb3_actpc.training.config.shipped_demonstrations", lambda env_id, weak=False: Path("others.npz"))
+    recorded: list[Any] = []
+    monkeypatch.setattr("sb3_actpc.training.video.record_video", lambda *arguments: recorded.append(arguments) or 1)
+    assert main(beside) == 0
+    assert recorded[0][-1].n_episodes == 2
 
 
 def test_evaluate_goes_on_where_nothing_can_be_rendered(

@@ -17,6 +17,7 @@ from stable_baselines3.common.env_checker import check_env as sb3_check_env
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
+from sb3_actpc.demonstrations import ScriptedOperator
 from sb3_actpc.envs import ROBOSUITE_IDS
 from sb3_actpc.envs.robosuite_layouts import ROBOSUITE_TASKS, robosuite_task
 
@@ -193,6 +194,33 @@ def test_a_can_in_its_quarter_of_the_right_bin_ends_the_episode_with_reward_1(en
         move_object(env, position)
         _, reward, terminated, _, info = env.step(np.zeros(7))
         assert (reward, terminated, info["is_success"]) == (float(expected), expected, expected), position
+
+
+@pytest.mark.parametrize("env_id", ROBOSUITE_IDS)
+def test_a_sure_operator_passes_every_stage_in_order(env_id: str, envs: dict[str, Any]) -> None:
+    env, operator = envs[env_id], ScriptedOperator(env_id)
+    operator.start(seed=0)
+    observation, info = env.reset(seed=0)
+    passed, terminated = [info["stage"]], False
+    while not terminated:
+        observation, _, terminated, truncated, info = env.step(operator.predict(observation))
+        assert not truncated
+        if info["stage"] != passed[-1]:
+            passed.append(info["stage"])
+    assert tuple(passed) == env.stages
+
+
+def test_the_stage_is_the_farthest_of_the_episode(envs: dict[str, Any]) -> None:
+    env = envs["SparsePickPlaceCan-v0"]
+    env.reset(seed=0)
+    for _ in range(3):
+        assert env.step(np.zeros(7))[4]["stage"] == "start"
+    gripper = env.data.site_xpos[env._simulation.robots[0].eef_site_id["right"]].copy()
+    move_object(env, [*gripper[:2], gripper[2] - 0.03])
+    assert env.step(np.zeros(7))[4]["stage"] == "reach"
+    move_object(env, [gripper[0] + 0.1, *gripper[1:]])
+    assert env.step(np.zeros(7))[4]["stage"] == "reach"
+    assert env.reset(seed=0)[1]["stage"] == "start"
 
 
 @pytest.mark.parametrize("env_id", ROBOSUITE_IDS)

@@ -65,6 +65,7 @@ def _check_video_options(args: argparse.Namespace) -> None:
 
 def _record(folder: Path, video: Path, args: argparse.Namespace) -> None:
     from sb3_actpc.common.demonstrations import Demonstrations
+    from sb3_actpc.training.config import find_demonstrations
     from sb3_actpc.training.run import load_run
     from sb3_actpc.training.video import RenderingUnavailable, record_video
 
@@ -72,9 +73,10 @@ def _record(folder: Path, video: Path, args: argparse.Namespace) -> None:
     size = {} if args.size is None else {"width": args.size, "height": args.size}
     demonstrations = None
     if args.beside_demonstrator:
-        if record.get("demonstrations") is None:
+        path = find_demonstrations(record["env"], record["demonstrations"])
+        if path is None:
             raise ValueError(f"{folder} was trained without demonstrations: leave --beside-demonstrator out")
-        demonstrations = Demonstrations.load(record["demonstrations"])
+        demonstrations = Demonstrations.load(path)
     env_kwargs = {**record["env_kwargs"], **size}
     try:
         n_frames = record_video(model, record["env"], env_kwargs, video, args.seed, args.frames, demonstrations)

@@ -29,6 +29,8 @@ CONTROL_FREQUENCY = 20
 # of robosuite 1.5.2 (environments/manipulation/lift.py): half edges in metres, density in kg/m^3
 CUBE_HALF_EDGES = (0.020, 0.022)
 CUBE_DENSITY = 1000.0
+REACH = 0.05  # metres between gripper and object's centre within which it is reached
+LIFTED = 0.1  # metres above the bin's floor at which a held can counts as lifted (at rest its centre is at some 6 cm)
 
 
 class SparseRobosuiteEnv(gym.Env[np.ndarray, np.ndarray], utils.EzPickle):
@@ -36,7 +38,7 @@ class SparseRobosuiteEnv(gym.Env[np.ndarray, np.ndarray], utils.EzPickle):
 
     Actions are (7,) in [-1, 1]: translation of the gripper (1 is 5 cm), its rotation (1 is 0.5 rad), both in the frame of
     the robot's base, and the fingers (positive closes). ``info["dense_reward"]`` is robosuite's shaped reward,
-    ``info["is_success"]`` its success.
+    ``info["is_success"]`` its success, ``info["stage"]`` the farthest stage of the episode so far: one of ``stages``.
 
     A reset takes milliseconds: robosuite's soft reset, after which the state depends on the seed alone.
 
@@ -54,6 +56,7 @@ class SparseRobosuiteEnv(gym.Env[np.ndarray, np.ndarray], utils.EzPickle):
 
     metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": CONTROL_FREQUENCY}  # type: ignore[misc]
     env_id: ClassVar[str]
+    stages: ClassVar[tuple[str, ...]]
 
     # what robosuite holds is put into checkpoints by checkpoint_state
     checkpoint_skipped: ClassVar[tuple[str, ...]] = ("_simulation", "_renderer", "_layout", "task")
@@ -87,34 +90,36 @@ class SparseRobosuiteEnv(gym.Env[np.ndarray, np.ndarray], utils.EzPickle):
             raise ValueError(f"camera={camera!r} does not exist: choose one of {', '.join(cameras)}")
         self._renderer: mujoco.Renderer | None = None
         self._elapsed_steps = 0
+        self._stage = 0
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
         """Start an episode: the arm near its rest pose, the object at a random place.
 
         :param seed: of the generator; the same seed gives the same state bit for bit, None goes on with the generator
         :param options: not used
-        :return: observation (obs_dim,) and ``{"is_success": False}``
+        :return: observation (obs_dim,) and ``{"is_success": False, "stage": "start"}``
         """
         super().reset(seed=seed)
         share_generator(self._simulation, self.np_random)
         self._randomize_model()
         self._simulation.reset()
-        self._elapsed_steps = 0
-        return self._observe(), {"is_success": False}
+        self._elapsed_steps = self._stage = 0
+        return self._observe(), {"is_success": False, "stage": self.stages[0]}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Advance by one control step, 1/20 s.
 
         :param action: (7,)
         :return: observation (obs_dim,), reward (1 on success, else 0), terminated (success), truncated (the horizon), info
-            with ``dense_reward`` (float) and ``is_success`` (bool)
+            with ``dense_reward`` (float), ``is_success`` (bool) and ``stage`` (str)
         """
         dense_reward = float(self._simulation.step(np.asarray(action, dtype=np.float64))[1])
         self._elapsed_steps += 1
         observation = self._observe()
         is_success = bool(self._simulation._check_success())
         is_truncated = not is_success and self._elapsed_steps >= self.horizon
-        info = {"dense_reward": dense_reward, "is_success": is_success}
+        self._stage = max(self._stage, len(self.stages) - 1 if is_success else self._present_stage())
+        info = {"dense_reward": dense_reward, "is_success": is_success, "stage": self.stages[self._stage]}
         return observation, float(is_success), is_success, is_truncated, info
 
     def observe_state(self, state: np.ndarray) -> np.ndarray:
@@ -192,6 +197,17 @@ class SparseRobosuiteEnv(gym.Env[np.ndarray, np.ndarray], utils.EzPickle):
             "object": self.task.object_states(position[None], quat[None], eef_position[None], eef_quat[None])[0],
         }
 
+    def _present_stage(self) -> int:
+        """Index in ``stages`` of what the gripper is at, success left aside."""
+        gripper = self.data.site_xpos[self._simulation.robots[0].eef_site_id["right"]]
+        if self._simulation._check_grasp(gripper=self._simulation.robots[0].gripper, object_geoms=self._graspable()):
+            return self.stages.index("grasp")
+        return int(np.linalg.norm(self.data.xpos[self._object_body()] - gripper) < REACH)
+
+    def _graspable(self) -> Any:
+        """robosuite's model of the object."""
+        raise NotImplementedError
+
     def _object_body(self) -> int:
         """Index of the object's body in the model."""
         raise NotImplementedError
@@ -204,9 +220,13 @@ class SparseLiftEnv(SparseRobosuiteEnv):
     """
 
     env_id = "SparseLift-v0"
+    stages = ("start", "reach", "grasp", "lift")
 
     def _randomize_model(self) -> None:
         resize_cube(self._simulation, self.np_random.uniform(*CUBE_HALF_EDGES, size=3))
+
+    def _graspable(self) -> Any:
+        return self._simulation.cube
 
     def _object_body(self) -> int:
         return self._simulation.cube_body_id
@@ -229,6 +249,16 @@ class SparsePickPlaceCanEnv(SparseRobosuiteEnv):
     """
 
     env_id = "SparsePickPlaceCan-v0"
+    stages = ("start", "reach", "grasp", "lift", "place")
+
+    def _present_stage(self) -> int:
+        stage = super()._present_stage()
+        height = self.data.xpos[self._object_body()][2] - self._simulation.bin1_pos[2]
+        is_lifted = self.stages[stage] == "grasp" and height > LIFTED
+        return self.stages.index("lift") if is_lifted else stage
+
+    def _graspable(self) -> Any:
+        return self._simulation.objects[self._simulation.object_id]
 
     def _object_body(self) -> int:
         return self._simulation.obj_body_id[self._simulation.obj_to_use]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import time
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from io import BufferedIOBase
@@ -97,12 +98,14 @@ class EpisodeStatistics:
     :param sparse_returns: sums of the reward
     :param successes: 1 where ``info["is_success"]`` was true at the end, NaN where the environment does not report it
     :param lengths: steps
+    :param stages: ``info["stage"]`` at the end of each, "" where the environment does not report it
     """
 
     dense_returns: np.ndarray
     sparse_returns: np.ndarray
     successes: np.ndarray
     lengths: np.ndarray
+    stages: tuple[str, ...]
 
     def summary(self) -> dict[str, float | None]:
         """Means and standard deviations over the episodes; ``success_rate`` is None where it is not reported."""
@@ -115,6 +118,11 @@ class EpisodeStatistics:
             "success_rate": None if np.isnan(success_rate) else success_rate,
             "episode_length": float(self.lengths.mean()),
         }
+
+    def failed_after(self) -> dict[str, int]:
+        """Farthest stage of the episodes without success -> how many; empty where stages are not reported."""
+        stages = (stage for stage, success in zip(self.stages, self.successes, strict=True) if not success)
+        return dict(Counter(filter(None, stages)))
 
 
 def play_episodes(model: Predictor, envs: Sequence[gym.Env[Any, Any]], n_episodes: int, seed: int) -> EpisodeStatistics:
@@ -133,17 +141,22 @@ def play_episodes(model: Predictor, envs: Sequence[gym.Env[Any, Any]], n_episode
     """
     if n_episodes < 1 or not envs:
         raise ValueError(f"expected at least one episode and one environment, found {n_episodes} and {len(envs)}")
-    rows = []
+    rows: list[list[float]] = []
+    stages: list[str] = []
     for first in range(0, n_episodes, len(envs)):
         n_playing = min(len(envs), n_episodes - first)
-        rows += _play_side_by_side(model, envs[:n_playing], seed + first)
-    return EpisodeStatistics(*np.array(rows, dtype=np.float64).T)
+        more_rows, more_stages = _play_side_by_side(model, envs[:n_playing], seed + first)
+        rows += more_rows
+        stages += more_stages
+    dense_returns, sparse_returns, successes, lengths = np.array(rows, dtype=np.float64).T
+    return EpisodeStatistics(dense_returns, sparse_returns, successes, lengths, tuple(stages))
 
 
-def _play_side_by_side(model: Predictor, envs: Sequence[gym.Env[Any, Any]], seed: int) -> list[list[float]]:
-    """One episode in each environment: [dense return, sparse return, success, length] of each."""
+def _play_side_by_side(model: Predictor, envs: Sequence[gym.Env[Any, Any]], seed: int) -> tuple[list[list[float]], list[str]]:
+    """One episode in each environment: [dense return, sparse return, success, length] and the last stage of each."""
     observations = [env.reset(seed=seed + i)[0] for i, env in enumerate(envs)]
     rows = [[0.0, 0.0, float("nan"), 0.0] for _ in envs]
+    stages = ["" for _ in envs]
     playing = np.ones(len(envs), dtype=bool)
     episode_start = np.ones(len(envs), dtype=bool)
     state = None
@@ -156,8 +169,9 @@ def _play_side_by_side(model: Predictor, envs: Sequence[gym.Env[Any, Any]], seed
             rows[i][1] += float(reward)
             rows[i][2] = float(info.get("is_success", np.nan))
             rows[i][3] += 1
+            stages[i] = info.get("stage", "")
             playing[i] = not (terminated or truncated)
-    return rows
+    return rows, stages
 
 
 def _stack(observations: list[Any]) -> Any:

@@ -23,6 +23,8 @@ def result_table(result: Mapping[str, Any]) -> str:
         ("success rate", _number(result["success_rate"], ".2f")),
         ("episode length", f"{result['episode_length']:.1f}"),
     ]
+    if result.get("failed_after"):
+        rows.append(("failed, farthest stage", ", ".join(f"{stage} {n}" for stage, n in result["failed_after"].items())))
     if "steps_per_second" in result:
         rows.append(("training steps per second", f"{result['steps_per_second']:.0f}"))
     title = f"{result['env']}, {result['algo']}, seed {result['seed']}: mean ± std of {result['eval_episodes']} episodes"

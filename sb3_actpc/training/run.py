@@ -99,7 +99,7 @@ def evaluate_run(folder: Path, n_episodes: int = 10, seed: int = 0) -> dict[str,
     :param folder: run folder
     :param n_episodes: how many episodes
     :param seed: seed of the first episode
-    :return: means and standard deviations over the episodes, and what identifies the run
+    :return: means and standard deviations over the episodes, where those without success ended, and what identifies the run
     :raises FileNotFoundError: when the folder is not that of a run
     :raises ValueError: when its files are damaged
     :raises gymnasium.error.Error: when the environment is unknown
@@ -115,6 +115,7 @@ def evaluate_run(folder: Path, n_episodes: int = 10, seed: int = 0) -> dict[str,
             env.close()
     return {
         **statistics.summary(),
+        "failed_after": statistics.failed_after(),
         "env": record["env"],
         "algo": record["algo"],
         "seed": record["seed"],
