@@ -124,6 +124,16 @@ def test_a_run_knows_nothing_of_comparisons(package: str) -> None:
     assert imports and [entry for entry in imports if is_within(entry.target, "sb3_actpc.comparison")] == []
 
 
+def test_servers_import_nothing_that_only_this_environment_has() -> None:
+    """They run in virtual environments where neither this package nor what it needs is installed."""
+    allowed = {"numpy", "frames", "d3rlpy", "robomimic", "torch", "torchvision", *sys.stdlib_module_names}
+    others = [entry for entry in imports_in("sb3_actpc.baselines.servers") if entry.target.split(".")[0] not in allowed]
+    assert others == []
+    heavy = {"d3rlpy", "robomimic", "torch", "torchvision"}
+    at_once = [entry for entry in imports_in("sb3_actpc.baselines.servers") if not entry.is_lazy]
+    assert [entry for entry in at_once if entry.target.split(".")[0] in heavy] == []
+
+
 def test_nobody_imports_the_command_line() -> None:
     importers = {entry.module for entry in IMPORTS if is_within(entry.target, "sb3_actpc.cli")}
     assert {name for name in importers if not is_within(name, "sb3_actpc.cli")} == set()

@@ -30,6 +30,7 @@ class ServerProcess:
 
     def __init__(self, command: Sequence[str], name: str, timeout: float, threads: int = 1) -> None:
         self.name, self.timeout = name, timeout
+        self._is_closed = False
         environment = {key: value for key, value in os.environ.items() if key not in ("PYTHONPATH", "PYTHONHOME")}
         environment |= {"OMP_NUM_THREADS": str(threads), "PYTHONDONTWRITEBYTECODE": "1"}
         self._log = tempfile.TemporaryFile()
@@ -60,8 +61,8 @@ class ServerProcess:
         :raises ServerFailed: when there is none; the process is then ended
         :raises ValueError: when the answer is that the question was wrong; likewise
         """
-        if self._process.poll() is not None:
-            raise ServerFailed(self._ending())
+        if self._is_closed:
+            raise ServerFailed(f"{self.name} has ended before")
         deadline = time.monotonic() + self.timeout
         try:
             self._write(pack({"ask": what, **values}, arrays or {}), deadline)
@@ -115,6 +116,7 @@ class ServerProcess:
 
     def close(self) -> None:
         """End the process, at once."""
+        self._is_closed = True
         if self._process.poll() is None:
             self._process.kill()
         self._process.wait()

@@ -142,15 +142,19 @@ class ServedAlgorithm(OfflineAlgorithm):
         bounds = shown.episode_bounds
         actions = Episodes.from_demonstrations(shown, self.observation_space, self.action_space).actions
         self._shown = {
-            "observations": self._normalized(shown.observations),
-            "next_observations": self._normalized(shown.next_observations),
+            "observations": shown.observations,
+            "next_observations": shown.next_observations,
             "actions": actions.astype(np.float32),
             "rewards": shown.rewards,
             "terminations": shown.terminations,
             "last_rows": np.repeat(bounds[:, 1] - 1, bounds[:, 1] - bounds[:, 0]),
         }
         if self._process is not None:
-            self._process.ask("show", self._shown)
+            self._process.ask("show", self._normalized_demonstrations())
+
+    def _normalized_demonstrations(self) -> Arrays:
+        rows = {name: self._normalized(self._shown[name]) for name in ("observations", "next_observations")}
+        return {**self._shown, **rows}
 
     def _normalized(self, rows: np.ndarray) -> np.ndarray:
         mean, spread = self.normalization.numpy()
@@ -178,7 +182,7 @@ class ServedAlgorithm(OfflineAlgorithm):
             if len(self.trained):
                 process.ask("load", {"parameters": self.trained.numpy()})
             if self._shown:
-                process.ask("show", self._shown)
+                process.ask("show", self._normalized_demonstrations())
             self._process = process
         return self._process
 
