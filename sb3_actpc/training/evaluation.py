@@ -16,6 +16,7 @@ import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 
+from sb3_actpc.baselines.offline import OfflineAlgorithm
 from sb3_actpc.common.files import atomic_write
 
 PROGRESS = "progress.csv"
@@ -182,7 +183,7 @@ def _stack(observations: list[Any]) -> Any:
 
 
 class EvaluationCallback(BaseCallback):
-    """Evaluates the untrained agent (:meth:`begin`), then every ``eval_freq`` steps, and once more at the end.
+    """Evaluates the untrained agent (:meth:`begin`; not an offline method's), then every ``eval_freq`` steps, and once more at the end.
 
     Each evaluation starts its episodes from the same seeds, appends a row to ``progress.csv`` and saves
     ``model.zip`` (written under another name and renamed, so that a stopped run leaves a whole one). ``seconds`` are those
@@ -220,13 +221,16 @@ class EvaluationCallback(BaseCallback):
     def begin(self, model: BaseAlgorithm) -> None:
         """Evaluate before ``learn``, which may begin with demonstrations and not with steps.
 
+        An offline method is not: its untrained networks have seen nothing, and fail for as long as an episode may last.
+
         :param model: the agent
         """
         self.model = model
         self._started = time.perf_counter()
         with atomic_write(self.folder / PROGRESS, "w") as file:
             csv.writer(file, lineterminator="\n").writerow(PROGRESS_COLUMNS)
-        self._evaluate()
+        if not isinstance(model, OfflineAlgorithm):
+            self._evaluate()
 
     @property
     def wall_seconds(self) -> float:
