@@ -189,6 +189,10 @@ def _training_arguments(arguments: Sequence[str], folder: Path, optimize: bool) 
     if ours.trained_agent:
         passed += ["--trained-agent", ours.trained_agent]
     if optimize:
+        samplers = _import("rl_zoo3.hyperparams_opt").HYPERPARAMS_SAMPLER
+        if ours.algo not in samplers:
+            known = ", ".join(sorted(set(samplers) & set(ALGORITHMS)))
+            raise ValueError(f"zoo optimize does not know what to vary for {ours.algo!r}: choose one of {known}")
         passed.append("--optimize-hyperparameters")
         ours.study_name = ours.study_name or f"{ours.algo}_{ours.env}"
         # a journal: several processes can work on it, and a stopped search goes on

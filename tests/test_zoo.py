@@ -165,6 +165,7 @@ def test_sampled_parameters_become_keywords() -> None:
         ([], "zoo has no command ''"),
         (["dance"], "zoo has no command 'dance': choose one of train, optimize, enjoy"),
         (["train", "--algo", "actpc"], "--env is missing"),
+        (["optimize", "--algo", "bc", "--env", "SparseReacher-v5"], "zoo optimize does not know what to vary for 'bc'"),
         (["enjoy", "--env", "SparseReacher-v5", "--folder", "nowhere"], "no runs of actpc in nowhere"),
         (["train", "--env", "SparseReacher-v5", "--demonstrations", "no.npz"], "no demonstrations file at no.npz"),
     ],
