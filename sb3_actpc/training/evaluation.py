@@ -183,7 +183,7 @@ def _stack(observations: list[Any]) -> Any:
 
 
 class EvaluationCallback(BaseCallback):
-    """Evaluates the untrained agent (:meth:`begin`; not an offline method's), then every ``eval_freq`` steps, and once more at the end.
+    """Evaluates the untrained agent (:meth:`begin`; offline methods excepted), then every ``eval_freq`` steps, and at the end.
 
     Each evaluation starts its episodes from the same seeds, appends a row to ``progress.csv`` and saves
     ``model.zip`` (written under another name and renamed, so that a stopped run leaves a whole one). ``seconds`` are those
