@@ -446,7 +446,7 @@ class ActPC(OffPolicyAlgorithm):
         assert self.replay_buffer is not None
         newest = self.replay_buffer.newest_transitions(self._vec_normalize_env)
         features, next_features = map(self.inputs.features, (newest.observations, newest.next_observations))
-        memory, _ = self.inputs.memories(newest.history, newest.history_mask, features)
+        memory = self.inputs.memory(newest.history, newest.history_mask)
         raw_ep, raw_in = self._raw_signals(features, newest.actions, next_features, memory)
         epistemic = self.epistemic_normalizer(raw_ep) if alpha_ep else raw_ep
         instrumental = -self.instrumental_normalizer(raw_in) if alpha_in else raw_in
@@ -510,8 +510,9 @@ class ActPC(OffPolicyAlgorithm):
         features = inputs.features(replayed.observations)
         memory, next_memory = inputs.memories(replayed.history, replayed.history_mask, features)
         next_features = bootstrap_features = inputs.features(replayed.next_observations)
-        if replayed.following_observations is not None:
+        if replayed.following_observations is not None:  # returns of several steps
             next_features = inputs.features(replayed.following_observations)
+            next_memory = inputs.memory(replayed.next_history, replayed.next_history_mask)
         internal = weights[1] * replayed.epistemic + weights[2] * replayed.instrumental
         self.diagnostics.follow(internal_reward=internal.mean, task_reward=replayed.rewards.mean)
         batch = Batch(
@@ -620,9 +621,7 @@ class ActPC(OffPolicyAlgorithm):
         inputs, n = self.inputs, self.policy.batch_size_of("actor", self.batch_size)
         samples = sample_union(self._imitated(), n, self.history)
         features = inputs.features(inputs.observations(samples.observations))
-        history = None if samples.history is None else inputs.observations(samples.history, batch_dims=2)
-        mask = None if samples.history_mask is None else inputs.tensor(samples.history_mask)
-        memory, _ = inputs.memories(history, mask, features)
+        memory = inputs.memory(*inputs.past(samples.history, samples.history_mask))
         state = self.actor.circuit.settle(features, inputs.tensor(samples.actions), memory)
         self.diagnostics.settled("actor", state)
         return self.actor.circuit.hebbian_update(state)

@@ -63,9 +63,7 @@ class DemonstrationReplay:
         """
         samples = self.episodes.take(rows, self.history)
         features = inputs.features(inputs.observations(samples.observations))
-        history = None if samples.history is None else inputs.observations(samples.history, batch_dims=2)
-        history_mask = None if samples.history_mask is None else inputs.tensor(samples.history_mask)
-        memory, next_memory = inputs.memories(history, history_mask, features)
+        memory, next_memory = inputs.memories(*inputs.past(samples.history, samples.history_mask), features)
         steps = np.arange(n_steps)
         window = rows[:, None] + steps
         counts = window < self.ends[rows][:, None]
@@ -74,6 +72,7 @@ class DemonstrationReplay:
         next_features = bootstrap_features = self._next_features(rows, inputs)
         if n_steps > 1:
             bootstrap_features = self._next_features(last, inputs)
+            next_memory = inputs.memory(*inputs.past(*self.episodes.past(last, self.history, including=True)))
         return Batch(
             features=features,
             actions=inputs.tensor(samples.actions),

@@ -8,7 +8,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_actpc.actpc.policies import ActPCActor
 from sb3_actpc.common.episodes import map_observations
-from sb3_actpc.common.type_aliases import TensorObservations
+from sb3_actpc.common.type_aliases import Observations, TensorObservations
 
 
 class Batch(NamedTuple):
@@ -20,7 +20,7 @@ class Batch(NamedTuple):
     :param next_features: one step on, which generator and prior predict, (B, n_features)
     :param bootstrap_features: where the critic's target is bootstrapped: one step on, or n, (B, n_features)
     :param memory: m_t, (B, n_memory), or None
-    :param next_memory: m_{t+1}, (B, n_memory), or None
+    :param next_memory: the memory where the target is bootstrapped, m_{t+1} or m_{t+n}, (B, n_memory), or None
     :param rewards: the combined reward r_t, (B, 1)
     :param dones: 1 where the episode truly ended, (B, 1)
     :param discounts: γ, or γ^n with n-step returns, (B, 1)
@@ -76,6 +76,18 @@ class CircuitInputs:
             observations = map_observations(lambda array: array.reshape(*lead, *array.shape[1:]), normalized)
         return map_observations(lambda array: th.as_tensor(array, device=self.actor.normalizer.mean.device), observations)
 
+    def past(
+        self, history: Observations | None, mask: np.ndarray | None
+    ) -> tuple[TensorObservations | None, th.Tensor | None]:
+        """
+        :param history: numpy, (B, H, *obs_shape), as the environment gave them, or a dict of such; or None
+        :param mask: (B, H) or None
+        :return: both as :meth:`memory` takes them
+        """
+        if history is None or mask is None:
+            return None, None
+        return self.observations(history, batch_dims=2), self.tensor(mask)
+
     def features(self, observations: TensorObservations) -> th.Tensor:
         """(B, n_features) of a batch of observations."""
         return self.actor.features(observations)
@@ -90,6 +102,15 @@ class CircuitInputs:
             return None
         flat = map_observations(lambda tensor: tensor.flatten(0, 1), history)
         return self.features(flat).view(*mask.shape, -1) * mask[:, :, None]
+
+    def memory(self, history: TensorObservations | None, mask: th.Tensor | None) -> th.Tensor | None:
+        """
+        :param history: as for :meth:`past_features`
+        :param mask: likewise
+        :return: m_t, (B, n_memory), or None without a working memory
+        """
+        past = self.past_features(history, mask)
+        return None if past is None or self.actor.memory is None else self.actor.memory(past)
 
     def memories(
         self, history: TensorObservations | None, mask: th.Tensor | None, features: th.Tensor

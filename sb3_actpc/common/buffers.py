@@ -49,11 +49,8 @@ class _SignalReplay(ReplayBuffer):
         check_range(given, "n_steps", 1, LARGEST_SIZE)
         check_range(given, "gamma", 0, 1)
         super().__init__(*args, **kwargs)
-        if n_steps > 1 and (history or self.optimize_memory_usage):
-            raise ValueError(
-                f"n_steps={n_steps} works neither with a working memory nor with optimize_memory_usage=True; "
-                "use n_steps=1 or leave those out"
-            )
+        if n_steps > 1 and self.optimize_memory_usage:
+            raise ValueError(f"n_steps={n_steps} does not work with optimize_memory_usage=True; use n_steps=1 or leave it out")
         self.combined, self.history, self.n_steps, self.gamma = combined, history, n_steps, gamma
         self.epistemic = np.zeros((self.buffer_size, self.n_envs), dtype=np.float32)
         self.instrumental = np.zeros((self.buffer_size, self.n_envs), dtype=np.float32)
@@ -152,8 +149,11 @@ class _SignalReplay(ReplayBuffer):
 
     def _gather(self, rows: np.ndarray, envs: np.ndarray, env: VecNormalize | None) -> SignalReplaySamples:
         last, mask = rows, None
+        history, history_mask = self._history_at(rows, envs, env)
+        next_history: tuple[Any, Any] = (None, None)
         if self.n_steps > 1:
             last, mask = self._n_step_window(rows, envs)
+            next_history = self._history_at(last, envs, env, including=True)
         return SignalReplaySamples(
             observations=self._observations_at(rows, envs, env),
             actions=self.to_torch(self.actions[rows, envs]),
@@ -165,8 +165,11 @@ class _SignalReplay(ReplayBuffer):
             discounts=None if mask is None else self.to_torch(self.gamma ** mask.sum(1, keepdims=True)),
             epistemic=self.to_torch(self._summed(self.epistemic, rows, envs, mask)),
             instrumental=self.to_torch(self._summed(self.instrumental, rows, envs, mask)),
-            **self._history_at(rows, envs, env),
+            history=history,
+            history_mask=history_mask,
             following_observations=None if mask is None else self._next_observations_at(rows, envs, env),
+            next_history=next_history[0],
+            next_history_mask=next_history[1],
         )
 
     def _observations_at(self, rows: np.ndarray, envs: np.ndarray, env: VecNormalize | None) -> TensorObservations:
@@ -180,16 +183,22 @@ class _SignalReplay(ReplayBuffer):
     def _to_tensors(self, observations: Observations, env: VecNormalize | None) -> TensorObservations:
         return map_observations(self.to_torch, self._normalize_obs(observations, env))
 
-    def _history_at(self, rows: np.ndarray, envs: np.ndarray, env: VecNormalize | None) -> dict[str, Any]:
-        """The ``history`` observations before each row in its episode, oldest first, and which of them exist."""
+    def _history_at(
+        self, rows: np.ndarray, envs: np.ndarray, env: VecNormalize | None, including: bool = False
+    ) -> tuple[TensorObservations | None, th.Tensor | None]:
+        """
+        The ``history`` observations before each row in its episode, oldest first, and which of them exist.
+
+        :param including: those before the row's *next* observation: its own is the last of them
+        """
         if not self.history:
-            return {"history": None, "history_mask": None}
-        earlier = rows[:, None] - np.arange(self.history, 0, -1)
+            return None, None
+        steps_back = np.arange(self.history, 0, -1) - int(including)
         # row r - 1 precedes r unless it ended its episode or lies before the first row stored
         age = (rows - self.pos) % self.buffer_size if self.full else rows
-        exists = np.arange(self.history, 0, -1)[None] <= age[:, None]
-        earlier %= self.buffer_size
-        unbroken = exists & (self.dones[earlier, envs[:, None]] == 0)
+        exists = steps_back <= age[:, None]
+        earlier = (rows[:, None] - steps_back) % self.buffer_size
+        unbroken = exists & ((steps_back == 0) | (self.dones[earlier, envs[:, None]] == 0))
         mask = np.flip(np.logical_and.accumulate(np.flip(unbroken, axis=1), axis=1), axis=1).astype(np.float32)
         shape = (len(rows) * self.history,)
         flat = map_observations(
@@ -198,7 +207,7 @@ class _SignalReplay(ReplayBuffer):
         past = map_observations(
             lambda array: array.reshape(len(rows), self.history, *array.shape[1:]), self._to_tensors(flat, env)
         )
-        return {"history": past, "history_mask": self.to_torch(mask)}
+        return past, self.to_torch(mask)
 
     def newest_transitions(self, env: VecNormalize | None = None) -> SignalReplaySamples:
         """The transitions added last, one per environment."""

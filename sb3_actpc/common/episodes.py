@@ -78,14 +78,26 @@ class Episodes:
         :param history: H, how many preceding observations of the same episode come with each row
         :return: the rows
         """
-        past, mask = None, None
-        if history:
-            earlier = indices[:, None] + np.arange(-history, 0)
-            mask = (earlier >= self.starts[indices][:, None]).astype(np.float32)
-            past = map_observations(lambda array: array[np.maximum(earlier, 0)], self.observations)
+        past, mask = self.past(indices, history)
         return ImitationSamples(
             map_observations(lambda array: array[indices], self.observations), self.actions[indices], past, mask
         )
+
+    def past(
+        self, indices: np.ndarray, history: int, including: bool = False
+    ) -> tuple[Observations | None, np.ndarray | None]:
+        """
+        :param indices: (B,) rows
+        :param history: H
+        :param including: the past of the step after each row, the row itself its newest part
+        :return: (B, H, *obs_shape), the observations before each row, oldest first, and (B, H), 1 where there is one in the
+            same episode; None and None without a history
+        """
+        if not history:
+            return None, None
+        earlier = indices[:, None] + np.arange(-history, 0) + int(including)
+        mask = (earlier >= self.starts[indices][:, None]).astype(np.float32)
+        return map_observations(lambda array: array[np.maximum(earlier, 0)], self.observations), mask
 
 
 class SelfImitationMemory:

@@ -25,6 +25,9 @@ class SignalReplaySamples(NamedTuple):
         a working memory
     :param history_mask: (B, H), 1 where there was such an observation, or None
     :param following_observations: with n-step returns, those one step on; None where that is ``next_observations``
+    :param next_history: with n-step returns and a working memory, the observations before ``next_observations``, as
+        ``history``; else None
+    :param next_history_mask: likewise
     """
 
     observations: TensorObservations
@@ -38,6 +41,8 @@ class SignalReplaySamples(NamedTuple):
     history: TensorObservations | None
     history_mask: th.Tensor | None
     following_observations: TensorObservations | None = None
+    next_history: TensorObservations | None = None
+    next_history_mask: th.Tensor | None = None
 
 
 class ImitationSamples(NamedTuple):

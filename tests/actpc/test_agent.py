@@ -398,9 +398,12 @@ def test_rebuilt_memory_equals_the_one_at_collection_across_episode_ends_and_rin
     for age in range(30 - 4):  # the oldest rows have lost their predecessors and are never sampled
         row = (buffer.newest - age) % 30
         rows, envs = np.full(n_envs, row), np.arange(n_envs)
-        rebuilt = buffer._history_at(rows, envs, None)
-        past = model.inputs.past_features(rebuilt["history"], rebuilt["history_mask"])
+        past = model.inputs.past_features(*buffer._history_at(rows, envs, None))
         assert np.allclose(past.numpy(), seen[steps - 1 - age], atol=1e-6)
+        if age:  # the next step's, where the episode went on
+            after = model.inputs.past_features(*buffer._history_at(rows, envs, None, including=True)).numpy()
+            goes_on = buffer.dones[row] == 0
+            assert np.allclose(after[goes_on], seen[steps - age][goes_on], atol=1e-6)
     drawn = {int(r) for _ in range(50) for r in buffer._draw(16)[0]}
     lost = {(buffer.pos + k) % 30 for k in range(4)}
     assert drawn == set(range(30)) - lost
@@ -599,13 +602,31 @@ def test_hindsight_relabels_goals_and_rewards_of_drawn_transitions_but_neither_s
     assert th.equal(batch.rewards.squeeze(1), achieved.float() - 1.0)  # BitFlipping: 0 at the goal, else -1
 
 
+def test_the_memory_of_the_bootstrapped_step_is_the_one_that_the_same_step_has_as_a_first():
+    """Returns of three steps: m_{t+3} of row t is m_t of row t + 3, in the replay buffer and in the demonstrations."""
+    model = make(working_memory=True, memory_history=4, n_steps=3, demonstrations=demonstrations(), demonstration_fraction=0.5)
+    model.learn(60)
+    rows = np.arange(40)
+    zeros = np.zeros(len(rows), int)
+    batch = model.replay_buffer._gather(rows, zeros, None)
+    memory = model.inputs.memory(batch.history, batch.history_mask)
+    next_memory = model.inputs.memory(batch.next_history, batch.next_history_mask)
+    goes_on = np.array([not model.replay_buffer.dones[row : row + 3].any() for row in rows[:-3]])
+    assert goes_on.any() and memory.abs().sum() > 0
+    assert th.allclose(next_memory[:-3][goes_on], memory[3:][goes_on], atol=1e-6)
+    rows = np.arange(len(model.expert))
+    shown = model.expert.batch(rows, model.inputs, model.reward_weights, model.gamma, 3)
+    goes_on = rows + 3 < model.expert.ends
+    assert goes_on.any() and th.allclose(shown.next_memory[goes_on], shown.memory[rows[goes_on] + 3], atol=1e-6)
+
+
 def test_a_second_learn_cuts_the_episode_it_interrupts():
     model = make(working_memory=True, memory_history=3, learning_starts=1000)
     model.learn(7)  # stops in the second episode, two steps in
     assert model.replay_buffer.dones[6, 0] == 0
     model.learn(2)  # resets the environment
     assert model.replay_buffer.dones[6, 0] == 1 and model.replay_buffer.timeouts[6, 0] == 1
-    mask = model.replay_buffer._history_at(np.array([7, 8]), np.zeros(2, int), None)["history_mask"]
+    _, mask = model.replay_buffer._history_at(np.array([7, 8]), np.zeros(2, int), None)
     assert mask.tolist() == [[0, 0, 0], [0, 0, 1]]
     assert len(model.replay_buffer._running[0]) == 2
 

@@ -142,3 +142,30 @@ def test_episode_history_stops_at_the_start_of_the_episode():
     rows = episodes.take(np.array([1, 4, 3]), history=2)
     assert np.array_equal(rows.history_mask, [[0, 1], [0, 1], [0, 0]])
     assert np.array_equal(rows.history[0, 1], [0.0]) and np.array_equal(rows.history[1, 1], [3.0])
+    past, mask = episodes.past(np.array([1, 4, 3]), 2, including=True)
+    assert np.array_equal(mask, [[1, 1], [1, 1], [0, 1]])
+    assert np.array_equal(past[..., 0] * mask, [[0, 1], [3, 4], [0, 3]])
+
+
+@pytest.mark.parametrize("n_steps", [1, 3, 9])
+@pytest.mark.parametrize("steps", [5, 75])
+def test_the_past_of_the_bootstrapped_observation_is_what_came_before_it_in_its_episode(steps, n_steps):
+    """The observation of step t holds t, the next one t + 1, so that the past is known from the number alone."""
+    n_envs, history, capacity = 2, 4, 40
+    buffer = CombinedReplayBuffer(capacity * n_envs, *SPACES, n_envs=n_envs, n_steps=n_steps, history=history, device="cpu")
+    fill(buffer, steps, n_envs)
+    rows = np.repeat(np.arange(min(steps, capacity)), n_envs)
+    envs = np.tile(np.arange(n_envs), len(rows) // n_envs)
+    batch = buffer._gather(rows, envs, None)
+    if n_steps == 1:
+        assert batch.next_history is None  # it is the past, and the present observation
+        next_past, next_mask = (part.numpy() for part in buffer._history_at(rows, envs, None, including=True))
+    else:
+        next_past, next_mask = batch.next_history.numpy(), batch.next_history_mask.numpy()
+    for row, env in enumerate(envs):
+        following = round(float(batch.next_observations[row, 0]) - env / 10)
+        oldest = max(steps - capacity, 0)
+        start = max((following - 1 + env) // 7 * 7 - env, oldest)  # of the episode that `following` ended or goes on with
+        expected = list(range(max(start, following - history), following))
+        assert next_mask[row].sum() == len(expected)
+        assert next_past[row, history - len(expected) :, 0] == pytest.approx(np.array(expected) + env / 10)

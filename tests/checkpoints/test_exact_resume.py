@@ -62,6 +62,7 @@ def test_actpc(tmp_path: Path, n_envs: int, normalize: bool, stop_at: int) -> No
         {"buffer_size": 20},
         {"settling": "iterative", "n_critics": 2, "target_policy_noise": 0.2, "circuit_kwargs": {"feedback": "learned"}},
         {"n_steps": 3, "signal_normalizer": "quantile"},
+        {"n_steps": 4, "working_memory": True, "memory_history": 3},
         {"optimize_memory_usage": True, "replay_buffer_kwargs": {"handle_timeout_termination": False}},
         {"demonstration_fraction": 0.25, "actor_warm_start": 3, "observation_normalization": "demonstrations"},
         {"target_update": "hard", "target_update_interval": 7, "train_freq": (3, "step"), "gradient_steps": -1},
