@@ -29,53 +29,58 @@ DIAGNOSTIC_PANELS = {
     "self-imitation memory (transitions)": ("train/self_imitation_size",),
 }
 _STYLES = ("-", "--", ":", "-.")
+_MEASURE_NAMES = {"dense_return": "dense return", "success_rate": "success"}
+_IN_EPISODES = {"dense_return": "dense_return", "success_rate": "success"}  # column of progress.csv -> of episodes.csv
 N_POINTS = 200  # of a curve over time
 
 Curve = tuple[np.ndarray, np.ndarray]  # x (n,), and y of every seed (n_seeds, n)
 
 
-def episode_curve(group: Group) -> Curve:
-    """Dense training returns, smoothed over 100 episodes, of as many episodes as all seeds have."""
-    values = group.column(lambda run: smooth(run.episode_values("dense_return")))
+def episode_curve(group: Group, measure: str = "dense_return") -> Curve:
+    """Dense returns (or successes) in training, smoothed over 100 episodes, of as many episodes as all seeds have."""
+    column = _IN_EPISODES[measure]
+    values = group.column(lambda run: smooth(run.episode_values(column)))
     return np.arange(1, values.shape[1] + 1), values
 
 
-def step_curve(group: Group) -> Curve:
-    """Dense returns of the evaluations over environment steps."""
+def step_curve(group: Group, measure: str = "dense_return") -> Curve:
+    """A measure of the evaluations over environment steps."""
     steps = group.column(lambda run: run.progress["timesteps"])
-    return steps[0], group.column(lambda run: run.progress["dense_return"])
+    return steps[0], group.column(lambda run: run.progress[measure])
 
 
-def time_curve(group: Group) -> Curve:
-    """Dense returns of the evaluations over the seconds of training (evaluations left out), until the first seed ends."""
+def time_curve(group: Group, measure: str = "dense_return") -> Curve:
+    """A measure of the evaluations over the seconds of training (evaluations left out), until the first seed ends."""
     seconds = [run.progress["seconds"] - run.progress["evaluation_seconds"] for run in group.runs]
     grid = np.linspace(0.0, min(one[-1] for one in seconds), N_POINTS)
-    returns = [np.interp(grid, one, run.progress["dense_return"]) for one, run in zip(seconds, group.runs, strict=True)]
-    return grid, np.stack(returns)
+    values = [np.interp(grid, one, run.progress[measure]) for one, run in zip(seconds, group.runs, strict=True)]
+    return grid, np.stack(values)
 
 
 def draw_curves(groups: Sequence[Group], task: str, reference: ReferenceScore | None, path: Path) -> None:
-    """Returns over episodes, over steps and over time.
+    """Returns (or success, by the task's measure) over episodes, over steps and over time.
 
     :param groups: of one task
     :param task: its name
-    :param reference: drawn as lines; None for none
+    :param reference: its measure is drawn, and its scores as lines; None for dense returns without lines
     :param path: PNG file to write
     """
     figure = _figure(15.0, 4.5)
+    measure = "dense_return" if reference is None else reference.measure
+    name = _MEASURE_NAMES[measure]
     panels = (
-        (episode_curve, "episodes", f"dense return in training, mean of {WINDOW} episodes"),
-        (step_curve, "environment steps", "dense return in evaluation"),
-        (time_curve, "seconds of training", "dense return in evaluation"),
+        (episode_curve, "episodes", f"{name} in training, mean of {WINDOW} episodes"),
+        (step_curve, "environment steps", f"{name} in evaluation"),
+        (time_curve, "seconds of training", f"{name} in evaluation"),
     )
     for axes, (curve, x_label, y_label) in zip(figure.subplots(1, 3), panels, strict=True):
         for index, group in enumerate(groups):
-            x, values = curve(group)
+            x, values = curve(group, measure)
             if len(x):
                 _band(axes, x, values, group.variant, index)
         if reference is not None:
-            axes.axhline(reference.demonstrators_return, color="black", linestyle="--", linewidth=1, label="demonstrators")
-            axes.axhline(reference.random_return, color="black", linestyle=":", linewidth=1, label="random")
+            axes.axhline(reference.demonstrators, color="black", linestyle="--", linewidth=1, label="demonstrators")
+            axes.axhline(reference.random, color="black", linestyle=":", linewidth=1, label="random")
         axes.set(xlabel=x_label, ylabel=y_label)
     axes.legend(fontsize="small", loc="upper left", bbox_to_anchor=(1.0, 1.0))
     figure.suptitle(task)

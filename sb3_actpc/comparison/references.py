@@ -28,11 +28,12 @@ SCORES_FILE = Path(__file__).with_name("reference_scores.csv")
 N_EPISODES = 20
 _SCORE_COLUMNS = (
     "env",
-    "random_return",
-    "random_return_std",
+    "measure",
+    "random_score",
+    "random_score_std",
     "random_episodes",
-    "demonstrators_return",
-    "demonstrators_return_std",
+    "demonstrators_score",
+    "demonstrators_score_std",
     "demonstrators_episodes",
 )
 
@@ -68,21 +69,24 @@ class PaperResult:
 
 @dataclass(frozen=True)
 class ReferenceScore:
-    """Mean dense returns with which the returns of a task are normalised.
+    """Means with which a task's evaluations are normalised.
 
-    :param random_return: of uniformly random actions
-    :param demonstrators_return: of the demonstrations that ship with the package
+    :param random: of uniformly random actions
+    :param demonstrators: of the demonstrations that ship with the package
+    :param measure: what is meant, a column of ``progress.csv``: ``"dense_return"``, or ``"success_rate"`` where the paper
+        gives success (an episode that ends with it has the smaller dense return the sooner it succeeds)
     """
 
-    random_return: float
-    demonstrators_return: float
+    random: float
+    demonstrators: float
+    measure: str = "dense_return"
 
-    def normalize(self, returns: Any) -> Any:
+    def normalize(self, values: Any) -> Any:
         """
-        :param returns: dense returns, any shape
+        :param values: of the measure, any shape
         :return: 0 for random actions, 1 for the demonstrators
         """
-        return (returns - self.random_return) / (self.demonstrators_return - self.random_return)
+        return (values - self.random) / (self.demonstrators - self.random)
 
 
 @cache
@@ -121,7 +125,9 @@ def reference_score(env_id: str) -> ReferenceScore | None:
 @cache
 def _reference_scores() -> dict[str, ReferenceScore]:
     return {
-        row["env"]: ReferenceScore(float(row["random_return"]), float(row["demonstrators_return"])) for row in _score_rows()
+        row["env"]: ReferenceScore(float(row["random_score"]), float(row["demonstrators_score"]), row["measure"])
+        for row in _score_rows()
+        if row["demonstrators_score"]
     }
 
 
@@ -164,19 +170,24 @@ def measure_scores(env_id: str, n_episodes: int = N_EPISODES, seed: int = 0) -> 
     """
     envs = make_eval_envs(env_id, {}, n_episodes)
     try:
-        returns = play_episodes(RandomPolicy(envs[0].action_space, seed), envs, n_episodes, seed).dense_returns
+        played = play_episodes(RandomPolicy(envs[0].action_space, seed), envs, n_episodes, seed)
     finally:
         for env in envs:
             env.close()
-    row = {"env": env_id, **_moments("random", returns)}
     path = find_demonstrations(env_id, "shipped")
-    demonstrated = None if path is None else Demonstrations.load(path).dense_returns
+    shown = None if path is None else Demonstrations.load(path)
+    if any(result.is_success for result in paper_results_of(env_id)):
+        row = {"env": env_id, "measure": "success_rate", **_moments("random", played.successes)}
+        demonstrated = None if shown is None else (shown.episode_returns > 0).astype(float)
+    else:
+        row = {"env": env_id, "measure": "dense_return", **_moments("random", played.dense_returns)}
+        demonstrated = None if shown is None else shown.dense_returns
     return {**row, **({} if demonstrated is None else _moments("demonstrators", demonstrated))}
 
 
-def _moments(who: str, returns: np.ndarray) -> dict[str, Any]:
-    spread = round(float(returns.std(ddof=1)), 3)
-    return {f"{who}_return": round(float(returns.mean()), 3), f"{who}_return_std": spread, f"{who}_episodes": len(returns)}
+def _moments(who: str, values: np.ndarray) -> dict[str, Any]:
+    spread = round(float(values.std(ddof=1)), 3)
+    return {f"{who}_score": round(float(values.mean()), 3), f"{who}_score_std": spread, f"{who}_episodes": len(values)}
 
 
 def main(argv: Sequence[str] | None = None) -> int:

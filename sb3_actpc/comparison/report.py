@@ -134,16 +134,17 @@ def _paper_cells(result: PaperResult | None) -> list[str]:
 
 
 def _reference_rows(groups: Sequence[Group], task: str) -> list[list[str]]:
-    """The demonstrators' and the random actions' return, in the column of the evaluation's."""
+    """The demonstrators' and the random actions' scores, in the columns of the evaluation's."""
     demonstrators = np.concatenate([group.values("demonstrators_return") for group in groups])
     known = sorted(set(demonstrators[~np.isnan(demonstrators)].round(1)))
-    rows = [("demonstrators", " or ".join(f"{value:.1f}" for value in known))] if known else []
+    rows = {"demonstrators": {"evaluation_dense": " or ".join(f"{value:.1f}" for value in known)}} if known else {}
     reference = reference_score(task)
-    if reference is not None:
-        rows.append(("random actions", f"{reference.random_return:.1f}"))
-    at = 3 + [key for _, key, _ in _COLUMNS].index("evaluation_dense")
-    width = 3 + len(_COLUMNS) + 2
-    return [[name, *[""] * (at - 1), text, *[""] * (width - at - 1)] for name, text in rows]
+    if reference is not None and reference.measure == "dense_return":
+        rows["random actions"] = {"evaluation_dense": f"{reference.random:.1f}"}
+    elif reference is not None:
+        rows.setdefault("demonstrators", {})["evaluation_success"] = f"{reference.demonstrators:.2f}"
+        rows["random actions"] = {"evaluation_success": f"{reference.random:.2f}"}
+    return [[name, "", "", *(cells.get(key, "") for _, key, _ in _COLUMNS), "", ""] for name, cells in rows.items()]
 
 
 # ------------------------------------------------------------------ across tasks
@@ -170,7 +171,8 @@ def _aggregate_blocks(groups: Sequence[Group], folder: Path) -> list[Block]:
     blocks: list[Block] = [
         Heading("Across tasks"),
         Paragraph(
-            f"The return of the last evaluation, normalised so that random actions are 0 and the demonstrators 1, over "
+            f"The dense return (of robosuite's tasks, the success) of the last evaluation, normalised so that random actions "
+            f"are 0 and the demonstrators 1, over "
             f"{', '.join(tasks)}. Intervals: 95 %, stratified bootstrap, left open for single runs.{missing}"
         ),
         Table(["", "runs", "interquartile mean", "95 % interval"], rows),

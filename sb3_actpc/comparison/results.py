@@ -120,7 +120,7 @@ class RunResult:
         }
         values |= {f"evaluation_{name}": self.last(column) for name, column in _EVALUATION_MEASURES.items()}
         reference = reference_score(self.task)
-        values["normalized"] = math.nan if reference is None else reference.normalize(values["evaluation_dense"])
+        values["normalized"] = math.nan if reference is None else reference.normalize(self.last(reference.measure))
         demonstrators = self.config.get("demonstrators_return")
         values["demonstrators_return"] = math.nan if demonstrators is None else float(demonstrators)
         training_seconds = self.last("seconds") - self.last("evaluation_seconds")

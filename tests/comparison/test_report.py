@@ -143,7 +143,7 @@ def test_demonstrators_random_actions_and_the_papers_other_algorithms_stand_belo
     assert table_row(markdown, "demonstrators", f"## {HOPPER}")["evaluation: return"] == "2000.0"
     score = reference_score(HOPPER)
     assert score is not None
-    assert table_row(markdown, "random actions", f"## {HOPPER}")["evaluation: return"] == f"{score.random_return:.1f}"
+    assert table_row(markdown, "random actions", f"## {HOPPER}")["evaluation: return"] == f"{score.random:.1f}"
     assert table_row(markdown, "LOGO (paper only)", f"## {HOPPER}")["paper: average return"] == "975.368 ± 24.273"
     assert "Refresh alone was not run" in markdown
 
@@ -154,8 +154,8 @@ def test_normalised_scores_across_tasks(tmp_path: Path) -> None:
         score = reference_score(task)
         assert score is not None
         for seed in range(2):
-            write_run(tmp_path, task, "actpc", seed, final=score.demonstrators_return)
-            write_run(tmp_path, task, "td3", seed, final=score.random_return, algo="td3")
+            write_run(tmp_path, task, "actpc", seed, final=score.demonstrators)
+            write_run(tmp_path, task, "td3", seed, final=score.random, algo="td3")
     write_run(tmp_path, HOPPER, "sac_rlpd", final=5.0, algo="sac_rlpd")
     write_report(tmp_path)
     markdown = (tmp_path / "report.md").read_text(encoding="utf-8")
@@ -266,3 +266,16 @@ def test_a_folder_without_runs_is_named(tmp_path: Path, capsys: pytest.CaptureFi
     assert main(["report", str(tmp_path)]) == 2
     errors = capsys.readouterr().err
     assert "no runs in" in errors and "sb3-actpc compare --out" in errors and errors.count("\n") == 1
+
+
+def test_robosuites_tasks_are_scored_by_success(tmp_path: Path) -> None:
+    """The runs end with success 1, like the demonstrators, whatever their dense return is."""
+    for variant, final in (("actpc", 3.0), ("refresh_alone", 200.0)):
+        write_run(tmp_path, "SparseLift-v0", variant, final=final, returns=[5.0] * 120)
+    write_report(tmp_path)
+    markdown = (tmp_path / "report.md").read_text(encoding="utf-8")
+    for variant in ("actpc", "refresh_alone"):
+        assert table_row(markdown, variant, "## Across tasks")["interquartile mean"] == "1.000"
+    group = group_runs(load_runs(tmp_path))[0]
+    assert step_curve(group, "success_rate")[1].tolist() == [[0.0, 0.5, 1.0]]
+    assert episode_curve(group, "success_rate")[1][0, -1] == 0.5

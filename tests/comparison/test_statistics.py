@@ -88,11 +88,11 @@ def test_against_rliable() -> None:
 
 
 def test_random_actions_score_nothing_and_the_demonstrators_one() -> None:
-    score = ReferenceScore(random_return=-10.0, demonstrators_return=30.0)
+    score = ReferenceScore(random=-10.0, demonstrators=30.0)
     assert score.normalize(np.array([-10.0, 30.0, 10.0])).tolist() == [0.0, 1.0, 0.5]
     for task in ("HalfCheetah", "Hopper", "Reacher", "Swimmer", "Walker2d"):
         committed = reference_score(f"Sparse{task}-v5")
-        assert committed is not None and committed.demonstrators_return > committed.random_return
+        assert committed is not None and committed.demonstrators > committed.random
     assert reference_score("Unknown-v0") is None
 
 
