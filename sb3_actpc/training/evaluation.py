@@ -19,6 +19,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from sb3_actpc.baselines.offline import OfflineAlgorithm
 from sb3_actpc.common.files import atomic_write
 
+UNTRAINED_EPISODES = 5
 PROGRESS = "progress.csv"
 PROGRESS_COLUMNS = (
     "timesteps",
@@ -221,7 +222,8 @@ class EvaluationCallback(BaseCallback):
     def begin(self, model: BaseAlgorithm) -> None:
         """Evaluate before ``learn``, which may begin with demonstrations and not with steps.
 
-        An offline method is not: its untrained networks have seen nothing, and fail for as long as an episode may last.
+        An untrained agent fails for as long as an episode may last, which in robosuite's tasks takes minutes: it plays
+        ``UNTRAINED_EPISODES`` at most, and an offline method's, which has seen nothing, none.
 
         :param model: the agent
         """
@@ -230,7 +232,7 @@ class EvaluationCallback(BaseCallback):
         with atomic_write(self.folder / PROGRESS, "w") as file:
             csv.writer(file, lineterminator="\n").writerow(PROGRESS_COLUMNS)
         if not isinstance(model, OfflineAlgorithm):
-            self._evaluate()
+            self._evaluate(min(self.eval_episodes, UNTRAINED_EPISODES))
 
     @property
     def wall_seconds(self) -> float:
@@ -270,9 +272,10 @@ class EvaluationCallback(BaseCallback):
         if self._last_timesteps != self.num_timesteps:
             self._evaluate()
 
-    def _evaluate(self) -> None:
+    def _evaluate(self, n_episodes: int | None = None) -> None:
         started = time.perf_counter()
-        statistics = play_episodes(NormalizedPredictor.wrap(self.model), self.envs, self.eval_episodes, self.seed)
+        n_episodes = self.eval_episodes if n_episodes is None else n_episodes
+        statistics = play_episodes(NormalizedPredictor.wrap(self.model), self.envs, n_episodes, self.seed)
         NormalizedPredictor.save(self.model, self.folder)
         with atomic_write(self.folder / "model.zip") as file:
             self.model.save(cast(BufferedIOBase, file))
