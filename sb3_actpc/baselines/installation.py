@@ -7,12 +7,14 @@ import os
 import shutil
 import subprocess
 import sys
+import time
 import uuid
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 FOLDER_VARIABLE = "SB3_ACTPC_BASELINES"
+ABANDONED_AFTER = 24 * 3600  # seconds
 COMPLETE = "sb3_actpc_complete.json"  # written last, into an environment that is whole
 
 
@@ -79,8 +81,9 @@ def install(name: str, folder: Path | None = None, report: Callable[[str], None]
         report(f"{name} is already installed in {place}")
         return place
     folder.mkdir(parents=True, exist_ok=True)
-    for left in folder.glob(f".{name}.*.tmp"):  # of a command that was killed
-        shutil.rmtree(left, ignore_errors=True)
+    for left in folder.glob(f".{name}.*.tmp"):  # of a command that was killed, not of one that is at work
+        if time.time() - left.stat().st_mtime > ABANDONED_AFTER:
+            shutil.rmtree(left, ignore_errors=True)
     made = folder / f".{name}.{uuid.uuid4().hex[:8]}.tmp"
     try:
         _make(RECIPES[name], made, report)

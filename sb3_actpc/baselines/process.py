@@ -62,7 +62,7 @@ class ServerProcess:
         :raises ValueError: when the answer is that the question was wrong; likewise
         """
         if self._is_closed:
-            raise ServerFailed(f"{self.name} has ended before")
+            raise ServerFailed(f"{self.name} has ended before: close() the agent, which starts it again as it was last saved")
         deadline = time.monotonic() + self.timeout
         try:
             self._write(pack({"ask": what, **values}, arrays or {}), deadline)

@@ -7,6 +7,7 @@ packages pin other versions than this one. Demonstrations go in and actions come
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar
@@ -29,6 +30,8 @@ from sb3_actpc.common.episodes import Episodes
 SERVERS = Path(__file__).resolve().parent / "servers"
 SMALLEST_SPREAD = 1e-3  # an entry that hardly varies in the demonstrations is not blown up
 LARGEST_INPUT = 10.0  # as in SB3's VecNormalize
+D3RLPY_RATES = "actor_learning_rate, critic_learning_rate, ..."
+ROBOMIMIC_RATES = "actor.optim_params.policy.learning_rate.initial, ..."
 
 
 class ServedPolicy(BasePolicy):
@@ -80,7 +83,8 @@ class ServedAlgorithm(OfflineAlgorithm):
     What the four have in common.
 
     Observations are normalised by the demonstrations' mean and standard deviation, actions scaled to [-1, 1], before the other
-    process gets them. It is started when it is first needed, and holds the networks; they are fetched to be saved.
+    process gets them. It is started when it is first needed, computes on the CPU, and holds the networks; they are fetched to
+    be saved. It ends with :meth:`close`, or when the agent is collected.
 
     :param policy: "MlpPolicy"
     :param env: a task with Box observations and actions; for its spaces and for evaluations
@@ -96,6 +100,7 @@ class ServedAlgorithm(OfflineAlgorithm):
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": ServedPolicy}
     package: ClassVar[str]
     method: ClassVar[str]
+    rates: ClassVar[str]  # names of the learning rates in ``method_kwargs``, for a message
     policy: ServedPolicy
 
     def __init__(
@@ -110,7 +115,16 @@ class ServedAlgorithm(OfflineAlgorithm):
     ) -> None:
         check_kinds(locals(), numbers="timeout", mappings="method_kwargs")
         check_range(locals(), "timeout", 1)
+        if "learning_rate" in options:
+            raise ValueError(
+                f"learning_rate={options['learning_rate']!r} has no effect on {type(self).__name__}: each of its networks has "
+                f"a rate of its own, set them in method_kwargs ({self.rates})"
+            )
         self.method_kwargs = _plain(method_kwargs or {})
+        try:
+            json.dumps(self.method_kwargs)
+        except TypeError as error:
+            raise ValueError(f"method_kwargs={method_kwargs!r} must hold plain values alone: {error}") from None
         self.timeout = timeout
         self._process: ServerProcess | None = None
         self._state_names: list[str] = []
@@ -157,7 +171,7 @@ class ServedAlgorithm(OfflineAlgorithm):
         return {**self._shown, **rows}
 
     def _normalized(self, rows: np.ndarray) -> np.ndarray:
-        mean, spread = self.normalization.numpy()
+        mean, spread = self.normalization.cpu().numpy()
         return np.clip((rows - mean) / spread, -LARGEST_INPUT, LARGEST_INPUT).astype(np.float32)
 
     def _command(self) -> list[str]:
@@ -176,11 +190,12 @@ class ServedAlgorithm(OfflineAlgorithm):
                 n_observations=int(np.prod(self.observation_space.shape)),
                 n_actions=int(np.prod(self.action_space.shape)),
                 batch_size=self.batch_size,
-                seed=0 if self.seed is None else self.seed,
+                # as in SB3 no seed is another one each time; an agent that goes on does not draw the same batches again
+                seed=int(np.random.randint(2**31)) if self.seed is None else self.seed + self._n_updates,
                 method_kwargs=self.method_kwargs,
             )
             if len(self.trained):
-                process.ask("load", {"parameters": self.trained.numpy()})
+                process.ask("load", {"parameters": self.trained.cpu().numpy()})
             if self._shown:
                 process.ask("show", self._normalized_demonstrations())
             self._process = process
@@ -260,7 +275,7 @@ class BCQ(ServedAlgorithm):
     :raises ImportError: as there
     """
 
-    package, method = "d3rlpy", "bcq"
+    package, method, rates = "d3rlpy", "bcq", D3RLPY_RATES
 
     def __init__(self, policy: str | type[BasePolicy], env: GymEnv | str | None, **options: Any) -> None:
         super().__init__(policy, env, **options)
@@ -279,7 +294,7 @@ class CQL(ServedAlgorithm):
     :raises ImportError: as there
     """
 
-    package, method = "d3rlpy", "cql"
+    package, method, rates = "d3rlpy", "cql", D3RLPY_RATES
 
     def __init__(self, policy: str | type[BasePolicy], env: GymEnv | str | None, **options: Any) -> None:
         super().__init__(policy, env, **options)
@@ -300,7 +315,7 @@ class HBC(ServedAlgorithm):
     :raises ImportError: as there
     """
 
-    package, method = "robomimic", "hbc"
+    package, method, rates = "robomimic", "hbc", ROBOMIMIC_RATES
 
     def __init__(self, policy: str | type[BasePolicy], env: GymEnv | str | None, **options: Any) -> None:
         super().__init__(policy, env, **options)
@@ -319,7 +334,7 @@ class IRIS(ServedAlgorithm):
     :raises ImportError: as there
     """
 
-    package, method = "robomimic", "iris"
+    package, method, rates = "robomimic", "iris", ROBOMIMIC_RATES
 
     def __init__(self, policy: str | type[BasePolicy], env: GymEnv | str | None, **options: Any) -> None:
         super().__init__(policy, env, **options)

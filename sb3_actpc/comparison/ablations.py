@@ -10,12 +10,12 @@ import numpy as np
 
 from sb3_actpc.comparison import figures
 from sb3_actpc.comparison.document import Block, Heading, Paragraph, Picture, Table
+from sb3_actpc.comparison.references import measure_of
 from sb3_actpc.comparison.results import Group, RunResult
 from sb3_actpc.comparison.statistics import mean_interval
 from sb3_actpc.comparison.tables import interval, mean_and_deviation, number
 from sb3_actpc.comparison.variants import ablation_variants
 
-MEASURE = "evaluation_dense"
 NO_EFFECT = "NO: the part did nothing"
 _LAYER = re.compile(r"train/actor_(cosine|ratio)_(\d+)")
 
@@ -65,13 +65,14 @@ def ablation_blocks(groups: Sequence[Group], task: str, folder: Path) -> list[Bl
     found = ablation_groups(groups)
     if not found:
         return []
-    picture = f"ablations_{task}.png"
+    picture, measure = f"ablations_{task}.png", measure_of(task)
     figures.draw_ablation(
-        [group for group, _ in found], [group.variant for group, _ in found], MEASURE, task, folder / picture
+        [group for group, _ in found], [group.variant for group, _ in found], measure, task, folder / picture
     )
     base = found[0][0]
-    rows = [_row(base, group, about) for group, about in found]
-    header = ["", "", "seeds", "evaluation: return", "95 % interval", "actions changed", "gradient that arrives, by layer"]
+    rows = [_row(base, group, about, measure) for group, about in found]
+    name = f"evaluation: {figures.MEASURE_NAMES[measure]}"
+    header = ["", "", "seeds", name, "95 % interval", "actions changed", "gradient that arrives, by layer"]
     return [
         Heading(f"What each part is worth: {task}"),
         Paragraph(
@@ -97,8 +98,8 @@ def arriving_gradient(run: RunResult) -> list[tuple[float, float]]:
     return [(layers[layer]["cosine"], layers[layer]["ratio"]) for layer in sorted(layers)]
 
 
-def _row(base: Group, group: Group, about: str) -> list[str]:
-    values = group.values(MEASURE)
+def _row(base: Group, group: Group, about: str, measure: str) -> list[str]:
+    values, form = group.last(measure), ".2f" if measure == "success_rate" else ".1f"
     _, low, high = (float(one) for one in mean_interval(values))
     changed = "" if group is base else {True: "yes", False: NO_EFFECT, None: "unknown"}[changed_actions(base, group)]
     arriving = [layers for run in group.runs if (layers := arriving_gradient(run))]
@@ -111,8 +112,8 @@ def _row(base: Group, group: Group, about: str) -> list[str]:
         group.variant,
         about,
         str(len(values)),
-        mean_and_deviation(values, ".1f"),
-        interval((low, high), ".1f"),
+        mean_and_deviation(values, form),
+        interval((low, high), form),
         changed,
         gradient,
     ]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import reduce
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ import numpy as np
 
 from sb3_actpc.common.files import atomic_write
 from sb3_actpc.comparison.r_stability import WINDOW, smooth
-from sb3_actpc.comparison.references import ReferenceScore
+from sb3_actpc.comparison.references import ReferenceScore, measure_of
 from sb3_actpc.comparison.results import Group
 from sb3_actpc.comparison.statistics import (
     Interval,
@@ -29,7 +30,7 @@ DIAGNOSTIC_PANELS = {
     "self-imitation memory (transitions)": ("train/self_imitation_size",),
 }
 _STYLES = ("-", "--", ":", "-.")
-_MEASURE_NAMES = {"dense_return": "dense return", "success_rate": "success"}
+MEASURE_NAMES = {"dense_return": "dense return", "success_rate": "success"}
 _IN_EPISODES = {"dense_return": "dense_return", "success_rate": "success"}  # column of progress.csv -> of episodes.csv
 N_POINTS = 200  # of a curve over time
 
@@ -44,15 +45,18 @@ def episode_curve(group: Group, measure: str = "dense_return") -> Curve:
 
 
 def step_curve(group: Group, measure: str = "dense_return") -> Curve:
-    """A measure of the evaluations over environment steps."""
-    steps = group.column(lambda run: run.progress["timesteps"])
-    return steps[0], group.column(lambda run: run.progress[measure])
+    """A measure of the evaluations over environment steps, where all seeds have one."""
+    steps = reduce(np.intersect1d, [run.progress["timesteps"] for run in group.runs])
+    return steps, np.stack([run.progress[measure][np.isin(run.progress["timesteps"], steps)] for run in group.runs])
 
 
 def time_curve(group: Group, measure: str = "dense_return") -> Curve:
-    """A measure of the evaluations over the seconds of training (evaluations left out), until the first seed ends."""
+    """
+    A measure of the evaluations over the seconds of training (evaluations left out), from the last seed's first evaluation
+    until the first seed ends.
+    """
     seconds = [run.progress["seconds"] - run.progress["evaluation_seconds"] for run in group.runs]
-    grid = np.linspace(0.0, min(one[-1] for one in seconds), N_POINTS)
+    grid = np.linspace(max(one[0] for one in seconds), min(one[-1] for one in seconds), N_POINTS)
     values = [np.interp(grid, one, run.progress[measure]) for one, run in zip(seconds, group.runs, strict=True)]
     return grid, np.stack(values)
 
@@ -66,8 +70,8 @@ def draw_curves(groups: Sequence[Group], task: str, reference: ReferenceScore | 
     :param path: PNG file to write
     """
     figure = _figure(15.0, 4.5)
-    measure = "dense_return" if reference is None else reference.measure
-    name = _MEASURE_NAMES[measure]
+    measure = measure_of(task)
+    name = MEASURE_NAMES[measure]
     panels = (
         (episode_curve, "episodes", f"{name} in training, mean of {WINDOW} episodes"),
         (step_curve, "environment steps", f"{name} in evaluation"),
@@ -115,7 +119,7 @@ def draw_ablation(groups: Sequence[Group], labels: Sequence[str], measure: str, 
 
     :param groups: of one task, the base first
     :param labels: of each
-    :param measure: key of a run's measures
+    :param measure: column of ``progress.csv``
     :param title: of the figure
     :param path: PNG file to write
     """
@@ -123,11 +127,11 @@ def draw_ablation(groups: Sequence[Group], labels: Sequence[str], measure: str, 
     axes = figure.subplots()
     bars = {}
     for group, label in zip(groups, labels, strict=True):
-        mean, low, high = (float(one) for one in mean_interval(group.values(measure)))
+        mean, low, high = (float(one) for one in mean_interval(group.last(measure)))
         bars[label] = (mean, low, high)
     _bars(axes, bars)
     axes.axvline(next(iter(bars.values()))[0], color="black", linestyle="--", linewidth=1)
-    axes.set(title=title, xlabel="dense return of the last evaluation, mean and 95 % interval over seeds")
+    axes.set(title=title, xlabel=f"{MEASURE_NAMES[measure]} of the last evaluation, mean and 95 % interval over seeds")
     _save(figure, path)
 
 
@@ -173,7 +177,7 @@ def _figure(width: float, height: float) -> Any:
 def _band(axes: Any, x: np.ndarray, values: np.ndarray, label: str, index: int) -> None:
     mean, low, high = mean_interval(values)
     color = _COLORS[index % len(_COLORS)]
-    axes.plot(x, mean, color=color, label=label)
+    axes.plot(x, mean, color=color, label=label, marker="o" if len(set(x)) == 1 else None)
     if len(values) > 1:
         axes.fill_between(x, low, high, color=color, alpha=0.15, linewidth=0)
 

@@ -122,6 +122,15 @@ def reference_score(env_id: str) -> ReferenceScore | None:
     return _reference_scores().get(env_id)
 
 
+def measure_of(env_id: str) -> str:
+    """
+    :param env_id: Gymnasium id of a task
+    :return: the column of ``progress.csv`` by which it is compared: ``"success_rate"`` or ``"dense_return"``
+    """
+    reference = reference_score(env_id)
+    return "dense_return" if reference is None else reference.measure
+
+
 @cache
 def _reference_scores() -> dict[str, ReferenceScore]:
     return {

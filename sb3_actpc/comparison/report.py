@@ -16,7 +16,7 @@ from sb3_actpc.comparison.ablations import ablation_blocks
 from sb3_actpc.comparison.document import Block, Heading, Paragraph, Picture, Table, to_html, to_markdown
 from sb3_actpc.comparison.execution import FINISHED
 from sb3_actpc.comparison.r_stability import N_EPISODES, WINDOW
-from sb3_actpc.comparison.references import PaperResult, paper_results_of, reference_score
+from sb3_actpc.comparison.references import PaperResult, measure_of, paper_results_of, reference_score
 from sb3_actpc.comparison.results import Group, RunResult, group_runs, load_runs
 from sb3_actpc.comparison.statistics import (
     Scores,
@@ -42,7 +42,8 @@ _COLUMNS = (
 _NOTE = (
     f"Average return, sparse return and success are means of the last {WINDOW} training episodes, exploration noise and all; "
     f"R-stability (lower is steadier, 0 is perfect) needs the last {N_EPISODES}; with fewer episodes, or where the best of "
-    f"the last {WINDOW} is 0, which the formula divides by, they are undefined. S-Dist is the R-stability of success. The "
+    f"the last {WINDOW} is 0, which the formula divides by, they are undefined; offline methods have no training episodes. "
+    "S-Dist is the R-stability of success. The "
     "evaluation is the last one, of the deterministic policy on episodes of its own. Returns are those of the dense task, "
     "which no agent is trained on. Mean ± standard deviation over seeds. The paper's figures (arXiv 2209.09174) are means of "
     "five runs of its own: tasks, demonstrations and steps differ from these."
@@ -99,7 +100,8 @@ def _task_blocks(groups: Sequence[Group], task: str, folder: Path) -> list[Block
     blocks: list[Block] = [Heading(task), _task_table(groups, task)]
     if any(group.algo == "actpc" for group in groups) and REFRESH_ALONE not in {group.variant for group in groups}:
         blocks.append(Paragraph(f"Refresh alone was not run on this task: --algos {REFRESH_ALONE} does it."))
-    return [*blocks, Picture(picture, f"{task}: returns over episodes, steps and time, mean and 95 % interval over seeds")]
+    name = figures.MEASURE_NAMES[measure_of(task)]
+    return [*blocks, Picture(picture, f"{task}: {name} over episodes, steps and time, mean and 95 % interval over seeds")]
 
 
 def _task_table(groups: Sequence[Group], task: str) -> Table:
@@ -142,7 +144,7 @@ def _reference_rows(groups: Sequence[Group], task: str) -> list[list[str]]:
     if reference is not None and reference.measure == "dense_return":
         rows["random actions"] = {"evaluation_dense": f"{reference.random:.1f}"}
     elif reference is not None:
-        rows.setdefault("demonstrators", {})["evaluation_success"] = f"{reference.demonstrators:.2f}"
+        rows["shipped demonstrators"] = {"evaluation_success": f"{reference.demonstrators:.2f}"}
         rows["random actions"] = {"evaluation_success": f"{reference.random:.2f}"}
     return [[name, "", "", *(cells.get(key, "") for _, key, _ in _COLUMNS), "", ""] for name, cells in rows.items()]
 

@@ -158,6 +158,13 @@ class Group:
         """
         return np.array([run.measures[name] for run in self.runs])
 
+    def last(self, name: str) -> np.ndarray:
+        """
+        :param name: column of ``progress.csv``
+        :return: (n_seeds,), the last evaluation of each; NaN without one
+        """
+        return np.array([run.last(name) for run in self.runs])
+
     def column(self, get: Callable[[RunResult], np.ndarray]) -> np.ndarray:
         """
         :param get: a column of a run

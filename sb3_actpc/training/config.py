@@ -19,6 +19,8 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.utils import LinearSchedule
 
+from sb3_actpc.baselines.installation import environment_python
+from sb3_actpc.baselines.served import ServedAlgorithm
 from sb3_actpc.common.checks import check_device
 from sb3_actpc.common.demonstrations import shipped_demonstrations
 from sb3_actpc.envs import sparse_env_id
@@ -173,6 +175,7 @@ def resolve_run(config: RunConfig) -> RunPlan:
     :return: the plan of the run
     :raises FileNotFoundError: when the preset or the demonstrations file does not exist
     :raises ValueError: when a setting is unknown or has a wrong value, or a sparse task has no demonstrations
+    :raises ImportError: when the algorithm is of another package that is not installed
     """
     algorithm = load_algorithm(config.algo)
     settings = {**load_preset(config.preset or config.algo, config.env), **config.overrides}
@@ -193,6 +196,8 @@ def resolve_run(config: RunConfig) -> RunPlan:
     if isinstance(settings.get("train_freq"), list):
         settings["train_freq"] = tuple(settings["train_freq"])
     check_keywords(algorithm, settings)
+    if issubclass(algorithm, ServedAlgorithm):
+        environment_python(algorithm.package)  # is it installed?
     eval_freq = config.eval_freq or max(1, n_timesteps // 10)
     plan = RunPlan(
         algorithm=algorithm,

@@ -231,7 +231,9 @@ class EvaluationCallback(BaseCallback):
         self._started = time.perf_counter()
         with atomic_write(self.folder / PROGRESS, "w") as file:
             csv.writer(file, lineterminator="\n").writerow(PROGRESS_COLUMNS)
-        if not isinstance(model, OfflineAlgorithm):
+        if isinstance(model, OfflineAlgorithm):
+            self._last_timesteps = 0
+        else:
             self._evaluate(min(self.eval_episodes, UNTRAINED_EPISODES))
 
     @property

@@ -18,6 +18,7 @@ from stable_baselines3.common.noise import ActionNoise, NormalActionNoise, Ornst
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_actpc.baselines.served import ServedAlgorithm
 from sb3_actpc.checkpoints import CheckpointCallback, list_bundles, restore
 from sb3_actpc.common.demonstrations import Demonstrations
 from sb3_actpc.training.config import RunConfig, RunPlan, load_algorithm, parse_schedule, resolve_run
@@ -111,6 +112,7 @@ def evaluate_run(folder: Path, n_episodes: int = 10, seed: int = 0) -> dict[str,
     try:
         statistics = play_episodes(model, envs, n_episodes, seed)
     finally:
+        close_model(model)
         for env in envs:
             env.close()
     return {
@@ -227,11 +229,22 @@ def _train(
         episodes.begin()
         evaluation.begin(model)
     callbacks = [*_checkpoints(folder, plan, report), evaluation, episodes, *more]
-    _learn(model, plan.n_timesteps, callbacks, config.progress, goes_on=has_checkpoint)
+    try:
+        _learn(model, plan.n_timesteps, callbacks, config.progress, goes_on=has_checkpoint)
+    finally:
+        close_model(model)
     plot_learning_curve(folder / PROGRESS, folder / "learning_curve.png", f"{config.env}, {config.algo}", reference)
     result = write_result(folder)
     shutil.rmtree(folder / CHECKPOINTS, ignore_errors=True)  # there is nothing left to resume
     return {**result, "folder": str(folder)}
+
+
+def close_model(model: Any) -> None:
+    """
+    :param model: ends its other process, where it has one
+    """
+    if isinstance(model, ServedAlgorithm):
+        model.close()
 
 
 def _checkpoints(folder: Path, plan: RunPlan, report: Callable[[str], None]) -> list[BaseCallback]:

@@ -1,6 +1,8 @@
 """Behaviour cloning: least squares without hidden layers, a state that is the unrolled sequence's, the same after loading."""
 
+import csv
 from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -15,6 +17,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from sb3_actpc.baselines import BC, BCRNN
 from sb3_actpc.baselines.bc_policies import BCRNNPolicy
 from sb3_actpc.common.demonstrations import Demonstrations
+from sb3_actpc.training import RunConfig, train_run
 from sb3_actpc.training.evaluation import play_episodes
 from tests.recordings import record
 
@@ -206,3 +209,31 @@ def test_what_it_cannot_act_on_is_refused() -> None:
         BCRNNPolicy(spaces.Dict({"a": spaces.Box(0, 1)}), spaces.Box(-1, 1), lambda _: 1e-3)
     with pytest.raises(ValueError, match="leave VecNormalize out"):
         BC("MlpPolicy", VecNormalize(make_vec_env(ENV)), demonstrations=record(ENV), device="cpu")
+
+
+def test_an_offline_method_is_evaluated_at_every_interval_and_not_untrained(tmp_path: Path) -> None:
+    """Steps 10, 20 and 30 of BC; ActPC also at 0, there in five episodes at most."""
+    steps, episodes = {}, {}
+    played = []
+
+    def counted(model: Any, envs: Any, n_episodes: int, seed: int) -> Any:
+        played.append(n_episodes)
+        return play_episodes(model, envs, n_episodes, seed)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("sb3_actpc.training.evaluation.play_episodes", counted)
+        for algo in ("bc", "actpc"):
+            played.clear()
+            overrides = {"batch_size": 4} | ({"actor_warm_start": 0} if algo == "actpc" else {})
+            folder = tmp_path / algo
+            train_run(
+                RunConfig(
+                    "SparseReacher-v5", algo, n_timesteps=30, eval_freq=10, eval_episodes=6, checkpoint_freq=0, progress=False,
+                    output=str(folder), overrides=overrides,
+                )
+            )  # fmt: skip
+            with open(folder / "progress.csv", encoding="utf-8") as file:
+                steps[algo] = [int(row["timesteps"]) for row in csv.DictReader(file)]
+            episodes[algo] = list(played)
+    assert steps == {"bc": [10, 20, 30], "actpc": [0, 10, 20, 30]}
+    assert episodes == {"bc": [6, 6, 6], "actpc": [5, 6, 6, 6]}

@@ -1,9 +1,11 @@
 """Methods of other packages, in processes of their own: what goes through the pipes, and what comes of failures."""
 
+import gc
 import io
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +16,11 @@ from stable_baselines3.common.evaluation import evaluate_policy
 
 from sb3_actpc.baselines import BCQ, CQL, HBC, IRIS, installation
 from sb3_actpc.baselines.installation import environment_python, install
-from sb3_actpc.baselines.process import ServerFailed
+from sb3_actpc.baselines.process import ServerFailed, ServerProcess
 from sb3_actpc.baselines.served import SERVERS, ServedAlgorithm
 from sb3_actpc.baselines.servers.frames import pack, unpack
 from sb3_actpc.cli import main
-from sb3_actpc.training import play_episodes
+from sb3_actpc.training import load_preset, play_episodes
 from tests.recordings import record
 
 # Its action is the number of its gradient steps in hundredths, plus the age of the episode in tenths.
@@ -74,7 +76,7 @@ sys.exit(serve(dict(build=build, show=show, train=train, predict=predict, save=s
 class Fake(ServedAlgorithm):
     """Served by a script that the test has written."""
 
-    package, method = "fake", "count"
+    package, method, rates = "fake", "count", "rate"
     script = ""
 
     def _command(self) -> list[str]:
@@ -140,6 +142,44 @@ def test_every_step_is_one_gradient_step_of_the_other_process(tmp_path: Path) ->
     model.learn(7)
     assert (model.num_timesteps, model._n_updates) == (7, 7)
     assert scaled_action(model) == pytest.approx(0.07, abs=1e-6)
+
+
+def test_the_other_process_ends_with_the_agent() -> None:
+    model = make()
+    model.learn(1)
+    assert model._process is not None
+    process = model._process._process
+    model.close()
+    assert process.poll() is not None
+    model.learn(1)
+    process = model._process._process
+    del model
+    gc.collect()
+    assert process.poll() is not None
+
+
+def test_without_a_seed_every_agent_has_another(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = []
+    ask = ServerProcess.ask
+    monkeypatch.setattr(
+        ServerProcess, "ask", lambda self, what, *args, **values: asked.append(values) or ask(self, what, *args, **values)
+    )
+    for seed in (None, None, 5):
+        Fake("MlpPolicy", "Pendulum-v1", demonstrations=record("Pendulum-v1"), seed=seed).learn(1)
+    first, second, third = (values["seed"] for values in asked if "seed" in values)
+    assert first != second and third == 5
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"learning_rate": 1e-3}, "learning_rate=0.001 has no effect on Fake.*set them in method_kwargs"),
+        ({"method_kwargs": {"rate": np.float32(1)}}, "method_kwargs=.* must hold plain values alone"),
+    ],
+)
+def test_what_cannot_reach_the_other_process_is_refused(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make(**options)
 
 
 def test_a_saved_agent_acts_the_same_and_learns_on(tmp_path: Path) -> None:
@@ -251,12 +291,15 @@ def test_an_environment_is_made_once_and_half_of_one_again(tmp_path: Path, monke
     install("robomimic", tmp_path)
     assert (place / "mine").exists()
     (place / installation.COMPLETE).unlink()  # as if it had been stopped
-    (tmp_path / ".robomimic.1234.tmp").mkdir()
+    abandoned, at_work = tmp_path / ".robomimic.1234.tmp", tmp_path / ".robomimic.5678.tmp"
+    abandoned.mkdir()
+    at_work.mkdir()
+    os.utime(abandoned, (0, 0))
     with pytest.raises(ImportError):
         environment_python("robomimic", tmp_path)
     install("robomimic", tmp_path)
     assert not (place / "mine").exists()
-    assert [path.name for path in tmp_path.iterdir()] == ["robomimic"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [at_work.name, "robomimic"]
 
 
 def test_a_failing_step_is_one_line_and_leaves_nothing(
@@ -278,13 +321,18 @@ def test_a_failing_step_is_one_line_and_leaves_nothing(
 @pytest.mark.slow
 @pytest.mark.parametrize("algorithm", [BCQ, CQL, HBC, IRIS])
 def test_the_packages_learn_and_are_loaded_again(algorithm: type[ServedAlgorithm], tmp_path: Path) -> None:
-    """Where they are installed: the losses of imitation fall on demonstrations of one action."""
+    """Where they are installed, with the shipped settings but for small batches: the losses fall from the first steps on."""
     try:
         environment_python(algorithm.package)
     except ImportError as error:
         pytest.skip(str(error))
-    model = algorithm("MlpPolicy", "Pendulum-v1", demonstrations=record("Pendulum-v1", 4, 40), seed=0)
-    model.learn(20)
+    settings = load_preset(algorithm.method, "default")["method_kwargs"]
+    shown = replace(record("Pendulum-v1", 4, 40), actions=np.ones((160, 1)))  # one action, whatever is observed
+    model = algorithm("MlpPolicy", "Pendulum-v1", demonstrations=shown, seed=0, batch_size=16, method_kwargs=settings)
+    falling = {BCQ: "vae_loss", CQL: "critic_loss", HBC: "actor_loss", IRIS: "actor_loss"}[algorithm]
+    losses = [model._server().ask("train")[0][falling] for _ in range(60)]
+    assert np.mean(losses[-10:]) < 0.8 * np.mean(losses[:10])
+    model.learn(2)
     model.save(tmp_path / "model.zip")
     observations = np.random.default_rng(0).normal(size=(4, 3)).astype(np.float32)
     loaded = algorithm.load(tmp_path / "model.zip")
@@ -300,3 +348,7 @@ def test_the_packages_learn_and_are_loaded_again(algorithm: type[ServedAlgorithm
         algorithm(
             "MlpPolicy", "Pendulum-v1", demonstrations=record("Pendulum-v1"), method_kwargs={"no_such_setting": 1}
         ).learn(1)
+    process = model._process._process
+    del model, one
+    gc.collect()
+    assert process.poll() is not None  # it ended with the agent

@@ -213,6 +213,19 @@ def test_curves_are_those_of_the_files(tmp_path: Path) -> None:
     assert (x[0], x[-1]) == (0.0, 10.0) and np.allclose(values[:, -1], [100.0, 300.0])  # 12 seconds, 2 of evaluation
 
 
+def test_curves_of_runs_without_an_evaluation_at_the_start(tmp_path: Path) -> None:
+    """An offline method's: nothing is drawn before the first evaluation, and only steps that all seeds have."""
+    for seed in range(2):
+        path = write_run(tmp_path, seed=seed, final=100.0) / "progress.csv"
+        lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
+        path.write_text("".join([lines[0], *lines[2 + seed :]]), encoding="utf-8")
+    [group] = group_runs(load_runs(tmp_path))
+    x, values = step_curve(group)
+    assert x.tolist() == [1000] and values.tolist() == [[100.0], [100.0]]
+    x, values = time_curve(group)
+    assert x[0] == x[-1] == 10.0 and (values == 100.0).all()
+
+
 def test_the_page_needs_no_other_file_and_no_network(tmp_path: Path) -> None:
     write_run(tmp_path, returns=[1.0] * 5)
     files = write_report(tmp_path)
@@ -242,7 +255,7 @@ def test_ablations_are_beside_the_base_and_one_without_effect_is_an_error(
     assert main(["report", str(tmp_path)]) == 0
     markdown = (tmp_path / "report.md").read_text(encoding="utf-8")
     row = table_row(markdown, "no_epistemic", f"## What each part is worth: {HOPPER}")
-    assert (row["evaluation: return"], row["actions changed"]) == ("60.0 ± 0.0", "yes")
+    assert (row["evaluation: dense return"], row["actions changed"]) == ("60.0 ± 0.0", "yes")
     assert row["gradient that arrives, by layer"] == "0.50, 0.25; 1.00, 0.8"
     assert (tmp_path / f"ablations_{HOPPER}.png").read_bytes().startswith(b"\x89PNG")
     for seed in range(2):
@@ -276,6 +289,11 @@ def test_robosuites_tasks_are_scored_by_success(tmp_path: Path) -> None:
     markdown = (tmp_path / "report.md").read_text(encoding="utf-8")
     for variant in ("actpc", "refresh_alone"):
         assert table_row(markdown, variant, "## Across tasks")["interquartile mean"] == "1.000"
+    write_run(tmp_path, "SparseLift-v0", "bc_rnn", algo="bc_rnn")
+    write_report(tmp_path)
+    markdown = (tmp_path / "report.md").read_text(encoding="utf-8")
+    assert table_row(markdown, "bc_rnn", "## SparseLift-v0")["paper: success in %"] == "100.0 ± 0.0"
+    assert "BC-RNN (paper only)" not in markdown and "BCQ (paper only)" in markdown
     group = group_runs(load_runs(tmp_path))[0]
     assert step_curve(group, "success_rate")[1].tolist() == [[0.0, 0.5, 1.0]]
     assert episode_curve(group, "success_rate")[1][0, -1] == 0.5

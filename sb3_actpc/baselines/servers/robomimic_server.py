@@ -51,6 +51,8 @@ class Server:
             for part in parts:
                 part.modalities.obs.low_dim = [KEY]
             planner.modalities.subgoal.low_dim = [KEY]
+        if not config.algo.actor.rnn.enabled:
+            raise ValueError("method_kwargs.actor.rnn.enabled must be true: the actor that follows subgoals is recurrent here")
         self.interval, self.horizon = config.algo.subgoal_update_interval, config.algo.actor.rnn.horizon
         of_planner = config.algo.planner if values["method"] == "hbc" else config.algo.value_planner.planner
         self.length = of_planner.subgoal_horizon
@@ -194,6 +196,9 @@ def update(config: Any, values: dict[str, Any], where: str) -> None:
     for key, value in values.items():
         if key not in config:
             raise ValueError(f"{where} has no setting {key!r}: choose one of {', '.join(sorted(config))}")
+        if isinstance(value, dict) != isinstance(config[key], dict):
+            kind = "a mapping" if isinstance(config[key], dict) else "a plain value"
+            raise ValueError(f"{where}.{key}={value!r} must be {kind}")
         if isinstance(value, dict):
             update(config[key], value, f"{where}.{key}")
         else:
