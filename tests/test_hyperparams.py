@@ -63,7 +63,7 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_every_entry_builds_its_agent_which_trains(
     preset: str, key: str, recordings: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # d3rlpy and robomimic are not installed here: tests/baselines/test_served.py (slow) trains with the defaults where they are
+    # d3rlpy and robomimic are not installed here: a slow test of test_served.py trains with the defaults where they are
     monkeypatch.setattr("sb3_actpc.baselines.served.environment_python", lambda package: sys.executable)
     algo = ALGO_OF.get(preset, preset)
     env_id = DEFAULT_ENV.get(algo, "SparseHopper-v5") if key == "default" else key
