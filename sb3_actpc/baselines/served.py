@@ -174,8 +174,13 @@ class ServedAlgorithm(OfflineAlgorithm):
         mean, spread = self.normalization.cpu().numpy()
         return np.clip((rows - mean) / spread, -LARGEST_INPUT, LARGEST_INPUT).astype(np.float32)
 
+    @classmethod
+    def check_installed(cls) -> None:
+        """:raises ImportError: when the package's environment has not been made; the message names the command that does it"""
+        environment_python(cls.package)
+
     def _command(self) -> list[str]:
-        """:raises ImportError: when the environment has not been made"""
+        """:raises ImportError: as :meth:`check_installed`"""
         return [str(environment_python(self.package)), "-s", "-u", str(SERVERS / f"{self.package}_server.py")]
 
     def _server(self) -> ServerProcess:

@@ -19,7 +19,6 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.utils import LinearSchedule
 
-from sb3_actpc.baselines.installation import environment_python
 from sb3_actpc.baselines.served import ServedAlgorithm
 from sb3_actpc.common.checks import check_device
 from sb3_actpc.common.demonstrations import shipped_demonstrations
@@ -197,7 +196,7 @@ def resolve_run(config: RunConfig) -> RunPlan:
         settings["train_freq"] = tuple(settings["train_freq"])
     check_keywords(algorithm, settings)
     if issubclass(algorithm, ServedAlgorithm):
-        environment_python(algorithm.package)  # is it installed?
+        algorithm.check_installed()
     eval_freq = config.eval_freq or max(1, n_timesteps // 10)
     plan = RunPlan(
         algorithm=algorithm,
