@@ -171,10 +171,14 @@ def test_a_second_signal_goes_to_the_old_handler(tmp_path: Path) -> None:
             return True
 
     callback = CheckpointCallback(tmp_path)
-    with pytest.raises(KeyboardInterrupt):
-        make_actpc(CountingEnv).learn(60, [callback, Impatient()])
-    callback.close()
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs begin with none
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            make_actpc(CountingEnv).learn(60, [callback, Impatient()])
+        callback.close()
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def test_outside_the_main_thread_there_are_checkpoints_but_no_handlers(tmp_path: Path) -> None:
