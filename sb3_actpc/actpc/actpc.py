@@ -508,11 +508,11 @@ class ActPC(OffPolicyAlgorithm):
         replayed = self.replay_buffer.sample(batch_size - n_expert, env=self._vec_normalize_env)
         inputs, weights = self.inputs, self.reward_weights
         features = inputs.features(replayed.observations)
-        memory, next_memory = inputs.memories(replayed.history, replayed.history_mask, features)
+        pasts = replayed.history, replayed.history_mask, features, replayed.next_history, replayed.next_history_mask
+        memory, next_memory = inputs.memories(*pasts)
         next_features = bootstrap_features = inputs.features(replayed.next_observations)
-        if replayed.following_observations is not None:  # returns of several steps
+        if replayed.following_observations is not None:
             next_features = inputs.features(replayed.following_observations)
-            next_memory = inputs.memory(replayed.next_history, replayed.next_history_mask)
         internal = weights[1] * replayed.epistemic + weights[2] * replayed.instrumental
         self.diagnostics.follow(internal_reward=internal.mean, task_reward=replayed.rewards.mean)
         batch = Batch(

@@ -1,6 +1,7 @@
 """The demonstrations, as the agent uses them: imitated by the actor, predicted by the prior, mixed into the critic's batch."""
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import torch as th
@@ -63,16 +64,17 @@ class DemonstrationReplay:
         """
         samples = self.episodes.take(rows, self.history)
         features = inputs.features(inputs.observations(samples.observations))
-        memory, next_memory = inputs.memories(*inputs.past(samples.history, samples.history_mask), features)
         steps = np.arange(n_steps)
         window = rows[:, None] + steps
         counts = window < self.ends[rows][:, None]
         last = rows + counts.sum(1) - 1
         rewards = self._rewards(window.clip(max=len(self) - 1), inputs, weights) * counts * gamma**steps
         next_features = bootstrap_features = self._next_features(rows, inputs)
+        next_past: tuple[Any, Any] = (None, None)
         if n_steps > 1:
             bootstrap_features = self._next_features(last, inputs)
-            next_memory = inputs.memory(*inputs.past(*self.episodes.past(last, self.history, including=True)))
+            next_past = inputs.past(*self.episodes.past(last, self.history, including=True))
+        memory, next_memory = inputs.memories(*inputs.past(samples.history, samples.history_mask), features, *next_past)
         return Batch(
             features=features,
             actions=inputs.tensor(samples.actions),

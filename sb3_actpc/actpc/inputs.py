@@ -113,15 +113,25 @@ class CircuitInputs:
         return None if past is None or self.actor.memory is None else self.actor.memory(past)
 
     def memories(
-        self, history: TensorObservations | None, mask: th.Tensor | None, features: th.Tensor
+        self,
+        history: TensorObservations | None,
+        mask: th.Tensor | None,
+        features: th.Tensor,
+        next_history: TensorObservations | None = None,
+        next_mask: th.Tensor | None = None,
     ) -> tuple[th.Tensor | None, th.Tensor | None]:
         """
         :param history: as for :meth:`past_features`
         :param mask: likewise
         :param features: (B, n_features) of the present observations, the newest of the past one step on
-        :return: m_t and m_{t+1}, (B, n_memory) each, or None and None without a working memory
+        :param next_history: with returns of several steps, the past of the observation n steps on
+        :param next_mask: likewise
+        :return: m_t and m_{t+1} (or m_{t+n}), (B, n_memory) each, or None and None without a working memory
         """
         past = self.past_features(history, mask)
         if past is None or self.actor.memory is None:
             return None, None
-        return self.actor.memory(past), self.actor.memory(th.cat([past[:, 1:], features[:, None]], dim=1))
+        following = self.past_features(next_history, next_mask)
+        if following is None:
+            following = th.cat([past[:, 1:], features[:, None]], dim=1)
+        return self.actor.memory(past), self.actor.memory(following)

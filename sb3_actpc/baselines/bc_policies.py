@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from typing import Any
 
 import numpy as np
@@ -59,9 +60,9 @@ class CloningPolicy(BasePolicy):
         self._build()
         self.optimizer = self.optimizer_class(self.parameters(), lr=lr_schedule(1), **self.optimizer_kwargs)  # type: ignore[call-arg]
 
+    @abstractmethod
     def _build(self) -> None:
         """Make the network."""
-        raise NotImplementedError
 
     def fit_normalization(self, rows: th.Tensor) -> None:
         """

@@ -18,6 +18,7 @@ from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
+from sb3_actpc.baselines.bc_policies import LARGEST_INPUT, SMALLEST_SPREAD
 from sb3_actpc.baselines.installation import environment_python
 from sb3_actpc.baselines.keywords import with_keywords_of
 from sb3_actpc.baselines.offline import OfflineAlgorithm
@@ -28,8 +29,6 @@ from sb3_actpc.common.demonstrations import Demonstrations
 from sb3_actpc.common.episodes import Episodes
 
 SERVERS = Path(__file__).resolve().parent / "servers"
-SMALLEST_SPREAD = 1e-3  # an entry that hardly varies in the demonstrations is not blown up
-LARGEST_INPUT = 10.0  # as in SB3's VecNormalize
 D3RLPY_RATES = "actor_learning_rate, critic_learning_rate, ..."
 ROBOMIMIC_RATES = "actor.optim_params.policy.learning_rate.initial, ..."
 
@@ -267,7 +266,6 @@ def _plain(settings: Mapping[str, Any]) -> dict[str, Any]:
     return {key: _plain(value) if isinstance(value, Mapping) else value for key, value in settings.items()}
 
 
-@with_keywords_of(ServedAlgorithm)
 class BCQ(ServedAlgorithm):
     """
     Batch-constrained Q-learning (Fujimoto et al., arXiv 1812.02900) by d3rlpy, as it is there.
@@ -282,11 +280,7 @@ class BCQ(ServedAlgorithm):
 
     package, method, rates = "d3rlpy", "bcq", D3RLPY_RATES
 
-    def __init__(self, policy: str | type[BasePolicy], env: GymEnv | str | None, **options: Any) -> None:
-        super().__init__(policy, env, **options)
 
-
-@with_keywords_of(ServedAlgorithm)
 class CQL(ServedAlgorithm):
     """
     Conservative Q-learning (Kumar et al., arXiv 2006.04779) by d3rlpy, as it is there.
@@ -301,11 +295,7 @@ class CQL(ServedAlgorithm):
 
     package, method, rates = "d3rlpy", "cql", D3RLPY_RATES
 
-    def __init__(self, policy: str | type[BasePolicy], env: GymEnv | str | None, **options: Any) -> None:
-        super().__init__(policy, env, **options)
 
-
-@with_keywords_of(ServedAlgorithm)
 class HBC(ServedAlgorithm):
     """
     Hierarchical behaviour cloning (Mandlekar et al., arXiv 2003.06085) by robomimic: a planner of subgoals, a recurrent actor.
@@ -322,11 +312,7 @@ class HBC(ServedAlgorithm):
 
     package, method, rates = "robomimic", "hbc", ROBOMIMIC_RATES
 
-    def __init__(self, policy: str | type[BasePolicy], env: GymEnv | str | None, **options: Any) -> None:
-        super().__init__(policy, env, **options)
 
-
-@with_keywords_of(ServedAlgorithm)
 class IRIS(ServedAlgorithm):
     """
     Implicit reinforcement without interaction at scale (Mandlekar et al., arXiv 1911.05321) by robomimic: :class:`HBC` with
@@ -340,6 +326,3 @@ class IRIS(ServedAlgorithm):
     """
 
     package, method, rates = "robomimic", "iris", ROBOMIMIC_RATES
-
-    def __init__(self, policy: str | type[BasePolicy], env: GymEnv | str | None, **options: Any) -> None:
-        super().__init__(policy, env, **options)

@@ -209,7 +209,7 @@ def stand_in_for_torchvision() -> None:
     """robomimic imports torchvision for images, which are not used here, and its wheels do not fit every build of torch."""
     try:
         import torchvision  # noqa: F401
-    except Exception:
+    except (ImportError, OSError, RuntimeError):
         names = ("torchvision", "torchvision.transforms", "torchvision.transforms.functional", "torchvision.models")
         modules = {name: types.ModuleType(name) for name in names}
         for name, module in modules.items():
