@@ -77,6 +77,8 @@ class ActPC(OffPolicyAlgorithm):
     :param prior_updates: updates of the prior on the demonstrations before learning starts; then it is frozen
     :param actor_warm_start: updates of the actor on the demonstrations before learning starts
     :param refresh_weight: weight of the actor's refresh from the demonstrations and its own best episodes
+    :param refresh_noise: standard deviation of Gaussian noise on the normalised observations of refresh and warm start; with
+        few demonstrations some 0.1 keeps the imitation from hanging on their last digits. 0 for none (the paper)
     :param self_imitation_size: transitions in the memory of the agent's own best episodes; 0 for none
     :param demonstration_fraction: share of the critic's batch that comes from the demonstrations
     :param alpha_ep: weight of the epistemic signal
@@ -154,6 +156,7 @@ class ActPC(OffPolicyAlgorithm):
         prior_updates: int = 2000,
         actor_warm_start: int = 0,
         refresh_weight: float = 1.0,
+        refresh_noise: float = 0.0,
         self_imitation_size: int = 100_000,
         demonstration_fraction: float = 0.0,
         alpha_ep: float = 1.0,
@@ -223,6 +226,7 @@ class ActPC(OffPolicyAlgorithm):
         self.prior_updates = prior_updates
         self.actor_warm_start = actor_warm_start
         self.refresh_weight = refresh_weight
+        self.refresh_noise = refresh_noise
         self.self_imitation_size = self_imitation_size
         self.demonstration_fraction = demonstration_fraction
         self.alpha_ep = alpha_ep
@@ -621,6 +625,8 @@ class ActPC(OffPolicyAlgorithm):
         inputs, n = self.inputs, self.policy.batch_size_of("actor", self.batch_size)
         samples = sample_union(self._imitated(), n, self.history)
         features = inputs.features(inputs.observations(samples.observations))
+        if self.refresh_noise:
+            features = features + self.refresh_noise * th.randn_like(features)
         memory = inputs.memory(*inputs.past(samples.history, samples.history_mask))
         state = self.actor.circuit.settle(features, inputs.tensor(samples.actions), memory)
         self.diagnostics.settled("actor", state)

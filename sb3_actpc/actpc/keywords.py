@@ -34,7 +34,7 @@ def check_keywords(given: Mapping[str, Any], policies: Mapping[str, type[BasePol
     """
     check_kinds(
         given,
-        numbers="tau gamma learning_starts refresh_weight demonstration_fraction alpha_ep alpha_in actor_pressure "
+        numbers="tau gamma learning_starts refresh_weight refresh_noise demonstration_fraction alpha_ep alpha_in actor_pressure "
         "target_policy_noise target_noise_clip",
         whole="buffer_size batch_size n_steps gradient_steps prior_updates actor_warm_start self_imitation_size "
         "critic_warmup n_critics target_update_interval memory_history stats_window_size verbose",
@@ -55,8 +55,8 @@ def check_keywords(given: Mapping[str, Any], policies: Mapping[str, type[BasePol
     )
     check_range(
         given,
-        "learning_starts prior_updates actor_warm_start refresh_weight actor_pressure critic_warmup target_policy_noise "
-        "target_noise_clip",
+        "learning_starts prior_updates actor_warm_start refresh_weight refresh_noise actor_pressure critic_warmup "
+        "target_policy_noise target_noise_clip",
         0,
     )
     check_range(given, "self_imitation_size", 0, LARGEST_SIZE)

@@ -59,6 +59,9 @@ class NGCCircuit(nn.Module):
     :param synaptic_scaling: "none", "soft_bound" (no synapse passes ±``weight_bound``) or "column_norm" (no column of W or E
         has a norm above ``weight_bound``); acts on the step after the optimiser
     :param weight_bound: the bound of ``synaptic_scaling``
+    :param weight_decay: with every change W, M and E lose this share of themselves, times the learning rate (as AdamW's).
+        Both sides of a synapse get the same changes, so what E was born with is all that parts it from W^T, and the decay
+        forgets it (Kolen & Pollack, 1994): with ``feedback="learned"`` some 0.3 to 1 let the error synapses align. Biases stay
     :param n_memory: size of the working memory fed to every layer; 0 for none
     :param memory_weight: α_m
     :param n_feedback_inputs: error synapses also reach the last this-many inputs (the critic's action columns)
@@ -88,6 +91,7 @@ class NGCCircuit(nn.Module):
         derivative_free: bool = False,
         synaptic_scaling: str = "none",
         weight_bound: float = 1.0,
+        weight_decay: float = 0.0,
         n_memory: int = 0,
         memory_weight: float = 1.0,
         n_feedback_inputs: int = 0,
@@ -110,6 +114,7 @@ class NGCCircuit(nn.Module):
             leak=leak,
             feedback_rate=feedback_rate,
             weight_bound=weight_bound,
+            weight_decay=weight_decay,
             feedback_scale=feedback_scale,
             memory_weight=memory_weight,
         )
@@ -130,7 +135,7 @@ class NGCCircuit(nn.Module):
         self.compensate_arrival = compensate_arrival
         self.settling_rate, self.leak, self.derivative_free = settling_rate, leak, derivative_free
         self.feedback, self.feedback_scale, self.feedback_rate = feedback, feedback_scale, feedback_rate
-        self.synaptic_scaling, self.weight_bound = synaptic_scaling, weight_bound
+        self.synaptic_scaling, self.weight_bound, self.weight_decay = synaptic_scaling, weight_bound, weight_decay
         self.n_memory, self.memory_weight = n_memory, memory_weight
         self.n_feedback_inputs = n_feedback_inputs
         self._create_synapses()
@@ -296,10 +301,16 @@ class NGCCircuit(nn.Module):
         for parameter, weights in zip(self.synapses.feedback, above, strict=self.feedback == "learned"):
             assert weights.grad is not None
             parameter.grad = weights.grad[:, weights.shape[1] - parameter.shape[1] :].contiguous()
+        self._decay_synapses(optimizer)
         optimizer.step()
         self._scale_synapses(old)
         if self._keep_rates:
             self.update_settling_rates()
+
+    def _decay_synapses(self, optimizer: th.optim.Optimizer) -> None:
+        for group in optimizer.param_groups if self.weight_decay else ():
+            matrices = [parameter for parameter in group["params"] if parameter.dim() > 1]
+            th._foreach_mul_(matrices, 1.0 - group["lr"] * self.weight_decay)
 
     def _scaled_synapses(self) -> list[th.Tensor]:
         return [*self.synapses.weights, *self.synapses.feedback]

@@ -277,6 +277,19 @@ def test_actor_warm_start_imitates_before_any_step():
     assert errors[1] < 0.8 * errors[0]
 
 
+def test_noise_on_refreshed_observations_is_ridge_regression():
+    """Of a linear actor on white observations the noise leaves the share 1 / (1 + σ^2) (Bishop, 1995)."""
+    data = demonstrations(n_episodes=20, length=50)
+    data = dataclasses.replace(data, actions=0.2 * data.observations[:, :2])
+    slopes = []
+    for noise in (0.0, 1.0):
+        circuit = {"net_arch": [], "learning_rate": 2e-3}
+        model = make(demonstrations=data, actor_kwargs=circuit, actor_warm_start=600, refresh_noise=noise, batch_size=256)
+        model.pretrain()
+        slopes.append(model.actor.circuit.weights[0][:, :2].diagonal().mean().item())
+    assert slopes == pytest.approx([0.1, 0.05], rel=0.1)
+
+
 def test_demonstrations_fill_their_share_of_the_critic_batch():
     data = demonstrations()
     model = make(demonstrations=data, demonstration_fraction=0.5, alpha_ext=1.0)

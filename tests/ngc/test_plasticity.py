@@ -54,6 +54,32 @@ def test_learned_error_synapses_align_with_the_transposed_weights():
     assert min(end) > 0.5
 
 
+def test_weight_decay_forgets_what_parts_the_error_synapses_from_the_weights():
+    """Kolen & Pollack (1994): with equal changes and rates the gap E^T - W shrinks by 1 - ηλ at every change, exactly."""
+    circuit = NGCCircuit(8, 3, (16, 16), feedback="learned", feedback_rate=1.0, weight_decay=0.5, settling_rate=0.3)
+    optimizer = th.optim.SGD(circuit.parameter_groups(0.1))
+
+    def gaps():
+        return [e - w for e, w in zip(circuit.feedback_weights, list(circuit.weights)[1:], strict=True)]
+
+    start, before = gaps(), [p.clone() for p in circuit.weights]
+    train(circuit, optimizer, 10)
+    assert not any(th.allclose(new, old * 0.95**10, atol=1e-3) for old, new in zip(before, circuit.weights, strict=True))
+    for old, new in zip(start, gaps(), strict=True):
+        assert th.allclose(new, old * 0.95**10, atol=1e-6)
+
+
+def test_weight_decay_spares_the_biases():
+    circuit = NGCCircuit(8, 3, (16,), weight_decay=0.5, n_memory=2, memory_weight=1.0)
+    before = {name: p.clone() for name, p in circuit.named_parameters()}
+    changes = circuit.hebbian_update(circuit.settle(*teacher_batch(), memory=th.zeros(128, 2)))
+    for change in changes.tensors():
+        change.zero_()
+    circuit.apply_changes(changes, th.optim.SGD(circuit.parameter_groups(0.1)))
+    for name, parameter in circuit.named_parameters():
+        assert th.allclose(parameter, before[name] * (1.0 if name.startswith("biases") else 0.95))
+
+
 def test_halving_gamma_e_halves_the_movement_of_the_error_synapses_under_adam():
     moved, n_updates = [], 50
     for feedback_rate in (0.8, 0.4):
