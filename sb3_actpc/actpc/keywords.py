@@ -34,8 +34,8 @@ def check_keywords(given: Mapping[str, Any], policies: Mapping[str, type[BasePol
     """
     check_kinds(
         given,
-        numbers="tau gamma learning_starts refresh_weight refresh_noise demonstration_fraction alpha_ep alpha_in actor_pressure "
-        "target_policy_noise target_noise_clip",
+        numbers="tau gamma learning_starts refresh_weight refresh_noise demonstration_fraction alpha_ep alpha_in "
+        "actor_pressure target_policy_noise target_noise_clip",
         whole="buffer_size batch_size n_steps gradient_steps prior_updates actor_warm_start self_imitation_size "
         "critic_warmup n_critics target_update_interval memory_history stats_window_size verbose",
         optional="alpha_ext nudge",

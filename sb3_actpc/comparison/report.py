@@ -6,6 +6,7 @@ import csv
 import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,7 @@ from sb3_actpc.comparison.ablations import ablation_blocks
 from sb3_actpc.comparison.document import Block, Heading, Paragraph, Picture, Table, to_html, to_markdown
 from sb3_actpc.comparison.execution import FINISHED
 from sb3_actpc.comparison.r_stability import N_EPISODES, WINDOW
-from sb3_actpc.comparison.references import PaperResult, measure_of, paper_results_of, reference_score
+from sb3_actpc.comparison.references import PaperResult, ReferenceScore, measure_of, paper_results_of, reference_score
 from sb3_actpc.comparison.results import Group, RunResult, group_runs, load_runs
 from sb3_actpc.comparison.statistics import (
     Scores,
@@ -96,7 +97,7 @@ def _overview(runs: Sequence[RunResult]) -> str:
 
 def _task_blocks(groups: Sequence[Group], task: str, folder: Path) -> list[Block]:
     picture = f"curves_{task}.png"
-    figures.draw_curves(groups, task, reference_score(task), folder / picture)
+    figures.draw_curves(groups, task, _drawn_reference(groups, task), folder / picture)
     blocks: list[Block] = [Heading(task), _task_table(groups, task)]
     if any(group.algo == "actpc" for group in groups) and REFRESH_ALONE not in {group.variant for group in groups}:
         blocks.append(Paragraph(f"Refresh alone was not run on this task: --algos {REFRESH_ALONE} does it."))
@@ -135,10 +136,23 @@ def _paper_cells(result: PaperResult | None) -> list[str]:
     return [f"{result.score} ± {result.score_std}", stability]
 
 
+def _demonstrators_returns(groups: Sequence[Group]) -> list[float]:
+    """Mean dense returns, rounded, of the demonstrations that the runs were given: one, unless they differ."""
+    returns = np.concatenate([group.values("demonstrators_return") for group in groups])
+    return sorted(set(returns[~np.isnan(returns)].round(1)))
+
+
+def _drawn_reference(groups: Sequence[Group], task: str) -> ReferenceScore | None:
+    """The scores that are drawn as lines: the demonstrators' are those of the runs, which may not be the shipped ones."""
+    reference, known = reference_score(task), _demonstrators_returns(groups)
+    if reference is None or reference.measure != "dense_return" or len(known) != 1:
+        return reference
+    return replace(reference, demonstrators=known[0])
+
+
 def _reference_rows(groups: Sequence[Group], task: str) -> list[list[str]]:
     """The demonstrators' and the random actions' scores, in the columns of the evaluation's."""
-    demonstrators = np.concatenate([group.values("demonstrators_return") for group in groups])
-    known = sorted(set(demonstrators[~np.isnan(demonstrators)].round(1)))
+    known = _demonstrators_returns(groups)
     rows = {"demonstrators": {"evaluation_dense": " or ".join(f"{value:.1f}" for value in known)}} if known else {}
     reference = reference_score(task)
     if reference is not None and reference.measure == "dense_return":
@@ -174,7 +188,7 @@ def _aggregate_blocks(groups: Sequence[Group], folder: Path) -> list[Block]:
         Heading("Across tasks"),
         Paragraph(
             f"The dense return (of robosuite's tasks, the success) of the last evaluation, normalised so that random actions "
-            f"are 0 and the demonstrators 1, over "
+            f"are 0 and the shipped demonstrators 1, over "
             f"{', '.join(tasks)}. Intervals: 95 %, stratified bootstrap, left open for single runs.{missing}"
         ),
         Table(["", "runs", "interquartile mean", "95 % interval"], rows),

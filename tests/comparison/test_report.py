@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.axes import Axes
 
 from sb3_actpc.cli import main
 from sb3_actpc.comparison import ablation_variants
@@ -211,6 +212,17 @@ def test_curves_are_those_of_the_files(tmp_path: Path) -> None:
     assert x.tolist() == [0, 500, 1000] and values.tolist() == [[0, 50, 100], [0, 150, 300]]
     x, values = time_curve(group)
     assert (x[0], x[-1]) == (0.0, 10.0) and np.allclose(values[:, -1], [100.0, 300.0])  # 12 seconds, 2 of evaluation
+
+
+def test_the_line_of_the_demonstrators_is_that_of_the_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They need not be the shipped ones."""
+    drawn: list[float] = []
+    monkeypatch.setattr(Axes, "axhline", lambda axes, y, **keywords: drawn.append(y))
+    write_run(tmp_path)
+    write_report(tmp_path)
+    score = reference_score(HOPPER)
+    assert score is not None and score.demonstrators != 2000.0
+    assert drawn == [2000.0, score.random] * 3
 
 
 def test_curves_of_runs_without_an_evaluation_at_the_start(tmp_path: Path) -> None:
