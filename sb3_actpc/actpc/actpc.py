@@ -77,8 +77,8 @@ class ActPC(OffPolicyAlgorithm):
     :param prior_updates: updates of the prior on the demonstrations before learning starts; then it is frozen
     :param actor_warm_start: updates of the actor on the demonstrations before learning starts
     :param refresh_weight: weight of the actor's refresh from the demonstrations and its own best episodes
-    :param refresh_noise: standard deviation of Gaussian noise on the normalised observations of refresh and warm start; with
-        few demonstrations some 0.1 keeps the imitation from hanging on their last digits. 0 for none (the paper)
+    :param refresh_noise: standard deviation of Gaussian noise on the features (normalised observations) that refresh and warm
+        start imitate on, not on the working memory's; against overfitting to few demonstrations. 0 for none (the paper)
     :param self_imitation_size: transitions in the memory of the agent's own best episodes; 0 for none
     :param demonstration_fraction: share of the critic's batch that comes from the demonstrations
     :param alpha_ep: weight of the epistemic signal

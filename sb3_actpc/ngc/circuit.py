@@ -52,16 +52,16 @@ class NGCCircuit(nn.Module):
         shrink by orders of magnitude as the rates follow the growing synapses, faster than an adaptive optimiser forgets
     :param leak: γ of eq. 1; 0 by default
     :param feedback: "tied" (``feedback_scale`` W^T) or "learned" (own error synapses E, started independently of W: the
-        paper's; they take some thousand updates to align with W^T, so that a fresh circuit learns little at first)
+        paper's; they take some thousand updates to align with W^T, and do so wholly only with a ``weight_decay``)
     :param feedback_scale: λ_e of tied error synapses
     :param feedback_rate: γ_e, learning rate of E over that of W (the paper: below 1)
     :param derivative_free: leave out φ' in the state update (appendix)
     :param synaptic_scaling: "none", "soft_bound" (no synapse passes ±``weight_bound``) or "column_norm" (no column of W or E
         has a norm above ``weight_bound``); acts on the step after the optimiser
     :param weight_bound: the bound of ``synaptic_scaling``
-    :param weight_decay: with every change W, M and E lose this share of themselves, times the learning rate (as AdamW's).
-        Both sides of a synapse get the same changes, so what E was born with is all that parts it from W^T, and the decay
-        forgets it (Kolen & Pollack, 1994): with ``feedback="learned"`` some 0.3 to 1 let the error synapses align. Biases stay
+    :param weight_decay: λ: before every change W, M and E shrink by 1 - ηλ (η the learning rate, as in AdamW); biases do not.
+        E and W^T get changes in the same direction, so that what they were born with is what parts them; the decay forgets
+        it in some 1/(ηλ) updates (Kolen & Pollack, 1994), and learned error synapses align
     :param n_memory: size of the working memory fed to every layer; 0 for none
     :param memory_weight: α_m
     :param n_feedback_inputs: error synapses also reach the last this-many inputs (the critic's action columns)
@@ -292,6 +292,7 @@ class NGCCircuit(nn.Module):
 
         The one place where a change becomes minus a gradient.
         """
+        self._decay_synapses(optimizer)
         old = [parameter.clone() for parameter in self._scaled_synapses()] if self.synaptic_scaling == "soft_bound" else []
         targets = [*self.synapses.weights, *self.synapses.biases, *self.synapses.memory]
         for parameter, gradient in zip(targets, th._foreach_neg(changes.tensors()), strict=True):
@@ -301,7 +302,6 @@ class NGCCircuit(nn.Module):
         for parameter, weights in zip(self.synapses.feedback, above, strict=self.feedback == "learned"):
             assert weights.grad is not None
             parameter.grad = weights.grad[:, weights.shape[1] - parameter.shape[1] :].contiguous()
-        self._decay_synapses(optimizer)
         optimizer.step()
         self._scale_synapses(old)
         if self._keep_rates:
@@ -310,7 +310,8 @@ class NGCCircuit(nn.Module):
     def _decay_synapses(self, optimizer: th.optim.Optimizer) -> None:
         for group in optimizer.param_groups if self.weight_decay else ():
             matrices = [parameter for parameter in group["params"] if parameter.dim() > 1]
-            th._foreach_mul_(matrices, 1.0 - group["lr"] * self.weight_decay)
+            if matrices:
+                th._foreach_mul_(matrices, max(0.0, 1.0 - group["lr"] * self.weight_decay))
 
     def _scaled_synapses(self) -> list[th.Tensor]:
         return [*self.synapses.weights, *self.synapses.feedback]

@@ -69,6 +69,28 @@ def test_weight_decay_forgets_what_parts_the_error_synapses_from_the_weights():
         assert th.allclose(new, old * 0.95**10, atol=1e-6)
 
 
+def test_weight_decay_aligns_the_error_synapses_under_adam():
+    cosines = []
+    for weight_decay in (0.0, 1.0):
+        th.manual_seed(0)
+        circuit = NGCCircuit(8, 3, (32, 32), feedback="learned", weight_decay=weight_decay)
+        optimizer = th.optim.Adam(circuit.parameter_groups(3e-3))
+        train(circuit, optimizer, 1000)
+        pairs = zip(circuit.feedback_weights, list(circuit.weights)[1:], strict=True)
+        cosines.append(min(oracle.cosine(e, w) for e, w in pairs))
+    assert cosines[0] < 0.9 and cosines[1] > 0.95
+
+
+def test_a_synapse_at_its_soft_bound_still_decays():
+    circuit = NGCCircuit(8, 3, (16,), synaptic_scaling="soft_bound", weight_bound=0.4, weight_decay=0.5)
+    circuit.weights[0].fill_(0.4)
+    changes = circuit.hebbian_update(circuit.settle(*teacher_batch()))
+    for change in changes.tensors():
+        change.zero_()
+    circuit.apply_changes(changes, th.optim.SGD(circuit.parameter_groups(0.1)))
+    assert th.allclose(circuit.weights[0], th.full_like(circuit.weights[0], 0.38))
+
+
 def test_weight_decay_spares_the_biases():
     circuit = NGCCircuit(8, 3, (16,), weight_decay=0.5, n_memory=2, memory_weight=1.0)
     before = {name: p.clone() for name, p in circuit.named_parameters()}
