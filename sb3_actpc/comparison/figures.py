@@ -86,6 +86,8 @@ def draw_curves(groups: Sequence[Group], task: str, reference: ReferenceScore | 
             axes.axhline(reference.demonstrators, color="black", linestyle="--", linewidth=1, label="demonstrators")
             axes.axhline(reference.random, color="black", linestyle=":", linewidth=1, label="random")
         axes.set(xlabel=x_label, ylabel=y_label)
+        if measure == "success_rate":
+            axes.set_ylim(-0.05, 1.05)  # the intervals of two or three seeds reach farther than a rate can
     axes.legend(fontsize="small", loc="upper left", bbox_to_anchor=(1.0, 1.0))
     figure.suptitle(task)
     _save(figure, path)
@@ -177,7 +179,8 @@ def _figure(width: float, height: float) -> Any:
 def _band(axes: Any, x: np.ndarray, values: np.ndarray, label: str, index: int) -> None:
     mean, low, high = mean_interval(values)
     color = _COLORS[index % len(_COLORS)]
-    axes.plot(x, mean, color=color, label=label, marker="o" if len(set(x)) == 1 else None)
+    style = _STYLES[index // len(_COLORS) % len(_STYLES)]
+    axes.plot(x, mean, color=color, linestyle=style, label=label, marker="o" if len(set(x)) == 1 else None)
     if len(values) > 1:
         axes.fill_between(x, low, high, color=color, alpha=0.15, linewidth=0)
 
