@@ -17,6 +17,13 @@ def train(circuit, optimizer, n_updates, batch=teacher_batch):
         circuit.apply_changes(circuit.hebbian_update(circuit.settle(*batch())), optimizer)
 
 
+def apply_nothing(circuit, memory=None):
+    """Changes of zero, at a learning rate of 0.1: what is left is what the circuit does on its own."""
+    changes = circuit.hebbian_update(circuit.settle(*teacher_batch(), memory=memory))
+    th._foreach_zero_(changes.tensors())
+    circuit.apply_changes(changes, th.optim.SGD(circuit.parameter_groups(0.1)))
+
+
 def test_plain_sgd_adds_the_change():
     circuit = NGCCircuit(8, 3, (16, 16), feedback="learned")
     optimizer = th.optim.SGD(circuit.parameter_groups(0.1))
@@ -84,20 +91,14 @@ def test_weight_decay_aligns_the_error_synapses_under_adam():
 def test_a_synapse_at_its_soft_bound_still_decays():
     circuit = NGCCircuit(8, 3, (16,), synaptic_scaling="soft_bound", weight_bound=0.4, weight_decay=0.5)
     circuit.weights[0].fill_(0.4)
-    changes = circuit.hebbian_update(circuit.settle(*teacher_batch()))
-    for change in changes.tensors():
-        change.zero_()
-    circuit.apply_changes(changes, th.optim.SGD(circuit.parameter_groups(0.1)))
+    apply_nothing(circuit)
     assert th.allclose(circuit.weights[0], th.full_like(circuit.weights[0], 0.38))
 
 
 def test_weight_decay_spares_the_biases():
-    circuit = NGCCircuit(8, 3, (16,), weight_decay=0.5, n_memory=2, memory_weight=1.0)
+    circuit = NGCCircuit(8, 3, (16,), weight_decay=0.5, n_memory=2)
     before = {name: p.clone() for name, p in circuit.named_parameters()}
-    changes = circuit.hebbian_update(circuit.settle(*teacher_batch(), memory=th.zeros(128, 2)))
-    for change in changes.tensors():
-        change.zero_()
-    circuit.apply_changes(changes, th.optim.SGD(circuit.parameter_groups(0.1)))
+    apply_nothing(circuit, memory=th.zeros(128, 2))
     for name, parameter in circuit.named_parameters():
         assert th.allclose(parameter, before[name] * (1.0 if name.startswith("biases") else 0.95))
 
