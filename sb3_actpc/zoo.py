@@ -134,6 +134,8 @@ def sample_actpc_params(trial: Any, n_actions: int, n_envs: int, additional_args
     trial.suggest_float("refresh_weight", 0.1, 3.0, log=True)
     trial.suggest_float("alpha_ep", 0.01, 1.0, log=True)
     trial.suggest_float("alpha_in", 0.01, 1.0, log=True)
+    trial.suggest_categorical("weight_decay", [0.0, 0.1, 0.3, 1.0])
+    trial.suggest_categorical("refresh_noise", [0.0, 0.05, 0.1, 0.2])
     params = convert_actpc_params(trial.params)
     trial.set_user_attr("gamma", params["gamma"])
     trial.set_user_attr("batch_size", params["batch_size"])
@@ -145,7 +147,7 @@ def convert_actpc_params(sampled: dict[str, Any]) -> dict[str, Any]:
     :param sampled: the parameters of a trial, as :func:`sample_actpc_params` named them
     :return: keywords of ActPC
     """
-    params = {name: sampled[name] for name in ("learning_rate", "tau", "actor_pressure", "refresh_weight")}
+    params = {name: sampled[name] for name in ("learning_rate", "tau", "actor_pressure", "refresh_weight", "refresh_noise")}
     return {
         **params,
         "alpha_ep": sampled["alpha_ep"],
@@ -153,6 +155,7 @@ def convert_actpc_params(sampled: dict[str, Any]) -> dict[str, Any]:
         "gamma": 1.0 - sampled["one_minus_gamma"],
         "batch_size": 2 ** sampled["batch_size_pow"],
         "policy_kwargs": {"net_arch": NET_ARCHS[sampled["net_arch"]]},
+        "circuit_kwargs": {"weight_decay": sampled["weight_decay"]},
     }
 
 

@@ -153,10 +153,13 @@ def test_sampled_parameters_become_keywords() -> None:
         "one_minus_gamma": 0.01,
         "batch_size_pow": 7,
         "net_arch": "small",
+        "weight_decay": 0.3,
+        "refresh_noise": 0.1,
     }
     params = convert_actpc_params(sampled)
     assert (params["gamma"], params["batch_size"]) == (0.99, 128)
     assert params["policy_kwargs"] == {"net_arch": NET_ARCHS["small"]}
+    assert params["circuit_kwargs"] == {"weight_decay": 0.3} and params["refresh_noise"] == 0.1
 
 
 @pytest.mark.parametrize(

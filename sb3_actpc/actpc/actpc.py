@@ -597,9 +597,7 @@ class ActPC(OffPolicyAlgorithm):
 
     def _update_targets(self, tau: float) -> None:
         """Move the target circuits by ``tau`` (1 copies)."""
-        for target, circuit in zip(
-            [self.actor_target, *self.critic_target], [self.actor.circuit, *self.critic], strict=True
-        ):
+        for target, circuit in zip([self.actor_target, *self.critic_target], [self.actor.circuit, *self.critic], strict=True):
             for mine, theirs in zip(target.synapses, circuit.synapses, strict=True):
                 if mine:
                     th._foreach_lerp_(mine, theirs, tau)
@@ -732,4 +730,3 @@ class ActPC(OffPolicyAlgorithm):
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         names = [name if name != "actor" else "actor.circuit" for name, _ in self.policy.named_circuits()]
         return ["policy", *(f"policy.{name}.optimizer" for name in names)], []
-

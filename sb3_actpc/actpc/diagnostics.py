@@ -52,9 +52,7 @@ class Diagnostics:
             self.values[f"{name}_energy"] = float(state.total_discrepancy().mean())
             self.values[f"{name}_residual"] = float(self.circuits[_key(name)].residual(state))
 
-    def coupled(
-        self, state: CoupledState, changes: HebbianChanges, features: th.Tensor, memory: th.Tensor | None
-    ) -> None:
+    def coupled(self, state: CoupledState, changes: HebbianChanges, features: th.Tensor, memory: th.Tensor | None) -> None:
         """
         Action-values, and per layer how the actor's change compares with the deterministic policy gradient: cosine and ratio
         of the norms. (The gradient is for the log alone; it goes through W^T, which learned error synapses never see.)

@@ -149,9 +149,7 @@ def _check_hidden(where: str, sizes: Any) -> None:
     """Sizes of hidden layers, or None for the default."""
     if sizes is None:
         return
-    if not isinstance(sizes, (list, tuple)) or not all(
-        _is_size(size) for size in sizes
-    ):
+    if not isinstance(sizes, (list, tuple)) or not all(_is_size(size) for size in sizes):
         raise ValueError(f"{where}={sizes!r} must be a list of layer sizes, whole numbers from 1 to {LARGEST_LAYER}")
 
 

@@ -246,9 +246,7 @@ class ActPCPolicy(BasePolicy):
         )
         self.net_arch, self.n_critics, self.memory_history = net_arch, n_critics, memory_history
         self.circuit_kwargs = dict(circuit_kwargs or {})
-        self.kwargs_of = dict(
-            zip(CIRCUITS, (actor_kwargs, critic_kwargs, generator_kwargs, prior_kwargs), strict=True)
-        )
+        self.kwargs_of = dict(zip(CIRCUITS, (actor_kwargs, critic_kwargs, generator_kwargs, prior_kwargs), strict=True))
         self.lr_schedule = lr_schedule
         self._build()
 

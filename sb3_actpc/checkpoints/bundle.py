@@ -184,9 +184,7 @@ class Bundle:
             if not file.is_file():
                 raise DamagedCheckpoint(f"{self.path}: {name} is missing")
             if file.stat().st_size != expected["bytes"]:
-                raise DamagedCheckpoint(
-                    f"{self.path}: {name} has {file.stat().st_size} bytes instead of {expected['bytes']}"
-                )
+                raise DamagedCheckpoint(f"{self.path}: {name} has {file.stat().st_size} bytes instead of {expected['bytes']}")
             if _hash_file(file) != expected["sha256"]:
                 raise DamagedCheckpoint(f"{self.path}: {name} does not have the recorded SHA-256")
 
@@ -226,9 +224,7 @@ class Bundle:
 
 
 @contextmanager
-def write_bundle(
-    folder: Path, num_timesteps: int, keep: int, manifest: Mapping[str, Any]
-) -> Iterator[BundleWriter]:
+def write_bundle(folder: Path, num_timesteps: int, keep: int, manifest: Mapping[str, Any]) -> Iterator[BundleWriter]:
     """
     Write a checkpoint; it appears in ``folder`` only when the block and everything after it has worked.
 

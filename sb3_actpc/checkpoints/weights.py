@@ -187,5 +187,3 @@ def _restore_normalizer(env: VecNormalize | None, tensors: dict[str, th.Tensor],
     for name, statistics in present.items():
         values = {part: tensors[f"{_NORMALIZER}{name}/{part}"].numpy() for part in ("mean", "var", "count")}
         statistics.mean, statistics.var, statistics.count = values["mean"], values["var"], float(values["count"])
-
-

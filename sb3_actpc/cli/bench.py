@@ -64,9 +64,7 @@ def _settings() -> dict[str, dict[str, Any]]:
     bare = {"circuit_kwargs": {"feedback": "tied"}, "n_critics": 1}
     presets = {"shipped defaults": "actpc", "paper preset": "actpc_paper"}
     plans = {label: resolve_run(RunConfig(env=TASK, preset=preset)) for label, preset in presets.items()}
-    with_data = {
-        label: {**plan.algorithm_kwargs, "demonstrations": plan.demonstrations} for label, plan in plans.items()
-    }
+    with_data = {label: {**plan.algorithm_kwargs, "demonstrations": plan.demonstrations} for label, plan in plans.items()}
     settings = {}
     for label, keywords in (("bare", bare), *with_data.items()):
         for settling in ("scheduled", "iterative"):

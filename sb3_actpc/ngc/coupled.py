@@ -73,9 +73,7 @@ def settle_coupled(
     return CoupledState(motor.state(), motor.output, value.output)
 
 
-def policy_gradient(
-    actor: NGCCircuit, critic: NGCCircuit, x: th.Tensor, memory: th.Tensor | None = None
-) -> HebbianChanges:
+def policy_gradient(actor: NGCCircuit, critic: NGCCircuit, x: th.Tensor, memory: th.Tensor | None = None) -> HebbianChanges:
     """
     The deterministic policy gradient, by one backward sweep through W^T: what the coupled pair's change is compared with.
 

@@ -93,7 +93,11 @@ def test_guidance_moves_the_policy_towards_the_demonstrated_actions() -> None:
     shown = record("Pendulum-v1", 4, 16)
     shown = Demonstrations(**{**vars(shown), "actions": np.full_like(shown.actions, 2.0)})
     model = make(
-        demonstrations=shown, n_steps=256, target_kl=1e-9, guidance_delta=0.05, discriminator_updates=10,
+        demonstrations=shown,
+        n_steps=256,
+        target_kl=1e-9,
+        guidance_delta=0.05,
+        discriminator_updates=10,
         discriminator_learning_rate=3e-3,
     )
     observations = th.as_tensor(shown.observations)

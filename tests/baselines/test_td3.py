@@ -126,6 +126,4 @@ def test_a_checkpoint_of_other_demonstrations_is_refused() -> None:
 def test_the_number_of_demonstrations_can_be_limited() -> None:
     model = demonstrating(n_demonstration_transitions=7)
     assert model.replay_buffer.demonstrated.buffer_size == 7
-    assert np.array_equal(
-        model.replay_buffer.demonstrated.observations[:, 0], record("Pendulum-v1").observations[:7]
-    )
+    assert np.array_equal(model.replay_buffer.demonstrated.observations[:, 0], record("Pendulum-v1").observations[:7])

@@ -278,9 +278,7 @@ TRAIN_BAD_PRESET = ["train", *SMALL, "--no-progress", "--preset=bad.yml"]
 @example(["evaluate", "."], b"")
 @example(["demos", "info", "bad.npz"], b"PK")
 @generated(100)
-def test_the_command_line_answers_in_one_line(
-    capsys: pytest.CaptureFixture[str], arguments: list[str], preset: bytes
-) -> None:
+def test_the_command_line_answers_in_one_line(capsys: pytest.CaptureFixture[str], arguments: list[str], preset: bytes) -> None:
     Path("bad.yml").write_bytes(preset)
     Path("bad.npz").write_bytes(preset)
     if any(is_long_option(word) for word in arguments):

@@ -37,9 +37,7 @@ def test_plain_sgd_adds_the_change():
         assert th.allclose(new, old + 0.1 * circuit.feedback_rate * change, atol=1e-7)
 
 
-@pytest.mark.parametrize(
-    ("settling", "feedback"), [("iterative", "learned"), ("iterative", "tied"), ("scheduled", "tied")]
-)
+@pytest.mark.parametrize(("settling", "feedback"), [("iterative", "learned"), ("iterative", "tied"), ("scheduled", "tied")])
 def test_a_circuit_learns_a_function(settling, feedback):
     circuit = NGCCircuit(8, 3, (64, 64), settling=settling, feedback=feedback)
     optimizer = th.optim.Adam(circuit.parameter_groups(1e-3))
