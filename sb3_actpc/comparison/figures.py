@@ -78,16 +78,18 @@ def draw_curves(groups: Sequence[Group], task: str, reference: ReferenceScore | 
         (time_curve, "seconds of training", f"{name} in evaluation"),
     )
     for axes, (curve, x_label, y_label) in zip(figure.subplots(1, 3), panels, strict=True):
+        heights = [] if reference is None else [reference.demonstrators, reference.random]
         for index, group in enumerate(groups):
             x, values = curve(group, measure)
             if len(x):
                 _band(axes, x, values, group.variant, index)
+                heights += [float(values.min()), float(values.max())]
         if reference is not None:
             axes.axhline(reference.demonstrators, color="black", linestyle="--", linewidth=1, label="demonstrators")
             axes.axhline(reference.random, color="black", linestyle=":", linewidth=1, label="random")
-        axes.set(xlabel=x_label, ylabel=y_label)
-        if measure == "success_rate":
-            axes.set_ylim(-0.05, 1.05)  # the intervals of two or three seeds reach farther than a rate can
+        low, high = (0.0, 1.0) if measure == "success_rate" else (min(heights, default=0.0), max(heights, default=1.0))
+        margin = 0.05 * (high - low or 1.0)  # every seed is inside; the intervals of two or three seeds reach much farther
+        axes.set(xlabel=x_label, ylabel=y_label, ylim=(low - margin, high + margin))
     axes.legend(fontsize="small", loc="upper left", bbox_to_anchor=(1.0, 1.0))
     figure.suptitle(task)
     _save(figure, path)
