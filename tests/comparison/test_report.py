@@ -14,7 +14,7 @@ from matplotlib.axes import Axes
 from sb3_actpc.cli import main
 from sb3_actpc.comparison import ablation_variants
 from sb3_actpc.comparison.document import Heading, Paragraph, Picture, Table, to_html, to_markdown
-from sb3_actpc.comparison.figures import episode_curve, step_curve, time_curve
+from sb3_actpc.comparison.figures import axis_limits, draw_curves, episode_curve, step_curve, time_curve
 from sb3_actpc.comparison.references import reference_score
 from sb3_actpc.comparison.report import write_report
 from sb3_actpc.comparison.results import group_runs, load_runs, read_columns
@@ -223,6 +223,25 @@ def test_the_line_of_the_demonstrators_is_that_of_the_runs(tmp_path: Path, monke
     score = reference_score(HOPPER)
     assert score is not None and score.demonstrators != 2000.0
     assert drawn == [2000.0, score.random] * 3
+
+
+def test_axes_hold_every_seed_with_a_margin_of_five_percent() -> None:
+    assert axis_limits([-100.0, 40.0, 300.0]) == pytest.approx((-120.0, 320.0))
+    assert axis_limits([7.0]) == pytest.approx((6.95, 7.05))  # one value is still a picture
+    assert axis_limits([]) == pytest.approx((-0.05, 1.05))
+
+
+@pytest.mark.parametrize(("task", "height"), [(HOPPER, 3000.0), ("SparseLift-v0", 1.0)])
+def test_an_axis_is_not_stretched_by_the_interval_of_two_seeds(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, task: str, height: float
+) -> None:
+    """The 95 % interval of two seeds at 0 and 3000 reaches from -17,559 to 20,559; of success, nothing is beyond 0 and 1."""
+    limits: list[tuple[float, float]] = []
+    monkeypatch.setattr(Axes, "set", lambda axes, **keywords: limits.append(keywords["ylim"]))
+    write_run(tmp_path, task, seed=0, final=0.0)
+    write_run(tmp_path, task, seed=1, final=3000.0)
+    draw_curves(group_runs(load_runs(tmp_path)), task, None, tmp_path / "curves.png")
+    assert limits[1:] == [pytest.approx((-0.05 * height, 1.05 * height))] * 2
 
 
 def test_curves_of_runs_without_an_evaluation_at_the_start(tmp_path: Path) -> None:
