@@ -5,7 +5,7 @@ import numpy as np
 from stable_baselines3.common.noise import NormalActionNoise
 
 from sb3_actpc import ActPC, Demonstrations, shipped_demonstrations
-from sb3_actpc.training import play_episodes
+from sb3_actpc.experiments.runs import play_episodes
 
 ENV_ID = "SparseHalfCheetah-v5"
 

@@ -8,7 +8,7 @@ from stable_baselines3 import TD3
 from stable_baselines3.common.noise import NormalActionNoise
 
 import sb3_actpc
-from sb3_actpc.training import play_episodes
+from sb3_actpc.experiments.runs import play_episodes
 
 ENV_ID, STEPS = "SparseHalfCheetah-v5", int(sys.argv[1]) if len(sys.argv) > 1 else 12_000
 

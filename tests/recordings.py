@@ -6,7 +6,7 @@ import gymnasium as gym
 import numpy as np
 
 import sb3_actpc  # noqa: F401  (registers the tasks)
-from sb3_actpc.common.demonstrations import Demonstrations
+from sb3_actpc.demonstrations.dataset import Demonstrations
 
 
 def record(env_id: str, n_episodes: int = 2, n_steps: int = 12, **env_kwargs: object) -> Demonstrations:

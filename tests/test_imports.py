@@ -17,11 +17,9 @@ HEAVY = (
     "matplotlib",
     "mujoco",
     "sb3_actpc.actpc",
-    "sb3_actpc.comparison",
     "sb3_actpc.demonstrations",
-    "sb3_actpc.experts",
+    "sb3_actpc.experiments",
     "sb3_actpc.ngc",
-    "sb3_actpc.training",
 )
 
 
@@ -96,9 +94,9 @@ def test_ngc_imports_torch_the_standard_library_and_itself_only() -> None:
     assert others == []
 
 
-@pytest.mark.parametrize("forbidden", ["sb3_actpc.actpc", "sb3_actpc.training", "sb3_actpc.cli", "sb3_actpc.ActPC"])
+@pytest.mark.parametrize("forbidden", ["sb3_actpc.actpc", "sb3_actpc.experiments.runs", "sb3_actpc.cli", "sb3_actpc.ActPC"])
 def test_common_does_not_import_what_is_built_on_it(forbidden: str) -> None:
-    assert [entry for entry in imports_in("sb3_actpc.common") if is_within(entry.target, forbidden)] == []
+    assert [entry for entry in imports_in("sb3_actpc.utils") if is_within(entry.target, forbidden)] == []
 
 
 @pytest.mark.parametrize("forbidden", ["torch", "stable_baselines3", "sb3_actpc.actpc", "sb3_actpc.ngc", "sb3_actpc.cli"])
@@ -107,7 +105,7 @@ def test_envs_know_neither_torch_nor_the_agent(forbidden: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "forbidden", ["torch", "stable_baselines3", "sb3_actpc.actpc", "sb3_actpc.experts", "sb3_actpc.training"]
+    "forbidden", ["torch", "stable_baselines3", "sb3_actpc.actpc", "sb3_actpc.demonstrations.experts", "sb3_actpc.experiments.runs"]
 )
 def test_demonstrations_know_neither_torch_nor_the_agent(forbidden: str) -> None:
     assert [entry for entry in imports_in("sb3_actpc.demonstrations") if is_within(entry.target, forbidden)] == []
@@ -115,22 +113,22 @@ def test_demonstrations_know_neither_torch_nor_the_agent(forbidden: str) -> None
 
 @pytest.mark.parametrize("package", ["sb3_actpc.actpc", "sb3_actpc.ngc"])
 def test_the_agent_does_not_import_the_training_runs(package: str) -> None:
-    assert [entry for entry in imports_in(package) if is_within(entry.target, "sb3_actpc.training")] == []
+    assert [entry for entry in imports_in(package) if is_within(entry.target, "sb3_actpc.experiments.runs")] == []
 
 
-@pytest.mark.parametrize("package", ["actpc", "checkpoints", "common", "envs", "ngc", "training"])
+@pytest.mark.parametrize("package", ["actpc", "checkpoints", "demonstrations", "envs", "ngc", "utils", "experiments.runs"])
 def test_a_run_knows_nothing_of_comparisons(package: str) -> None:
     imports = imports_in(f"sb3_actpc.{package}")
-    assert imports and [entry for entry in imports if is_within(entry.target, "sb3_actpc.comparison")] == []
+    assert imports and [entry for entry in imports if is_within(entry.target, "sb3_actpc.experiments.comparison")] == []
 
 
 def test_servers_import_nothing_that_only_this_environment_has() -> None:
     """They run in virtual environments where neither this package nor what it needs is installed."""
     allowed = {"numpy", "frames", "d3rlpy", "robomimic", "torch", "torchvision", *sys.stdlib_module_names}
-    others = [entry for entry in imports_in("sb3_actpc.baselines.servers") if entry.target.split(".")[0] not in allowed]
+    others = [entry for entry in imports_in("sb3_actpc.baselines.offline.servers") if entry.target.split(".")[0] not in allowed]
     assert others == []
     heavy = {"d3rlpy", "robomimic", "torch", "torchvision"}
-    at_once = [entry for entry in imports_in("sb3_actpc.baselines.servers") if not entry.is_lazy]
+    at_once = [entry for entry in imports_in("sb3_actpc.baselines.offline.servers") if not entry.is_lazy]
     assert [entry for entry in at_once if entry.target.split(".")[0] in heavy] == []
 
 

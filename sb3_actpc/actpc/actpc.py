@@ -17,19 +17,19 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 
+from sb3_actpc.actpc.arguments import check_keywords
+from sb3_actpc.actpc.buffers import _SignalReplay, combined_buffer_class
 from sb3_actpc.actpc.demonstration_replay import DemonstrationReplay
 from sb3_actpc.actpc.diagnostics import Diagnostics
-from sb3_actpc.actpc.inputs import Batch, CircuitInputs
-from sb3_actpc.actpc.keywords import check_keywords
+from sb3_actpc.actpc.features import Batch, CircuitInputs
 from sb3_actpc.actpc.policies import ActPCActor, ActPCPolicy, CnnPolicy, Critics, MlpPolicy, MultiInputPolicy
-from sb3_actpc.actpc.signals import make_normalizer, summed_squared_errors
+from sb3_actpc.actpc.reward_signals import make_normalizer, summed_squared_errors
+from sb3_actpc.actpc.self_imitation import Episodes, map_observations, sample_union
+from sb3_actpc.baselines.demonstration_buffers import fit_demonstrations
 from sb3_actpc.checkpoints import between_updates, load_checkpoint, load_weights, save_weights
-from sb3_actpc.common.buffers import _SignalReplay, combined_buffer_class
-from sb3_actpc.common.checks import check_finite, named_in_errors
-from sb3_actpc.common.demonstration_buffers import fit_demonstrations
-from sb3_actpc.common.demonstrations import Demonstrations
-from sb3_actpc.common.episodes import Episodes, map_observations, sample_union
+from sb3_actpc.demonstrations.dataset import Demonstrations
 from sb3_actpc.ngc import HebbianChanges, NGCCircuit, settle_coupled
+from sb3_actpc.utils.checks import check_finite, named_in_errors
 
 SelfActPC = TypeVar("SelfActPC", bound="ActPC")
 
@@ -71,7 +71,7 @@ class ActPC(OffPolicyAlgorithm):
     :param critic_kwargs: the same for the critic
     :param generator_kwargs: the same for the generator
     :param prior_kwargs: the same for the prior
-    :param demonstrations: a path, or a :class:`~sb3_actpc.common.demonstrations.Demonstrations`
+    :param demonstrations: a path, or a :class:`~sb3_actpc.demonstrations.dataset.Demonstrations`
     :param n_demonstrations: use only the first so many episodes of them
     :param n_demonstration_transitions: use only the first so many transitions (the paper's "300 samples")
     :param prior_updates: updates of the prior on the demonstrations before learning starts; then it is frozen

@@ -7,10 +7,10 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 
-from sb3_actpc.actpc.inputs import Batch, CircuitInputs
-from sb3_actpc.actpc.signals import Normalizer
-from sb3_actpc.common.demonstrations import Demonstrations
-from sb3_actpc.common.episodes import Episodes, split_observations
+from sb3_actpc.actpc.features import Batch, CircuitInputs
+from sb3_actpc.actpc.reward_signals import Normalizer
+from sb3_actpc.actpc.self_imitation import Episodes, split_observations
+from sb3_actpc.demonstrations.dataset import Demonstrations
 
 RawSignals = Callable[[th.Tensor, th.Tensor, th.Tensor, th.Tensor | None], tuple[np.ndarray, np.ndarray]]
 

@@ -15,9 +15,9 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, Combine
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
-from sb3_actpc.actpc.keywords import CIRCUITS, check_policy_keywords
-from sb3_actpc.common.checks import named_in_errors
+from sb3_actpc.actpc.arguments import CIRCUITS, check_policy_keywords
 from sb3_actpc.ngc import NGCCircuit, WorkingMemory
+from sb3_actpc.utils.checks import named_in_errors
 
 # what circuit_kwargs, actor_kwargs and so on may set; sizes follow from the task
 _SIZES = {"self", "n_inputs", "n_outputs", "hidden", "output_activation", "n_memory", "n_feedback_inputs"}

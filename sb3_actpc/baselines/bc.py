@@ -11,12 +11,12 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv
 from torch import nn
 
+from sb3_actpc.actpc.self_imitation import Episodes
 from sb3_actpc.baselines.bc_policies import BCPolicy, BCRNNPolicy, CloningPolicy
-from sb3_actpc.baselines.keywords import with_keywords_of
-from sb3_actpc.baselines.offline import OfflineAlgorithm
-from sb3_actpc.common.checks import check_kinds, check_range
-from sb3_actpc.common.demonstrations import Demonstrations
-from sb3_actpc.common.episodes import Episodes
+from sb3_actpc.baselines.offline.base import OfflineAlgorithm
+from sb3_actpc.baselines.signatures import with_keywords_of
+from sb3_actpc.demonstrations.dataset import Demonstrations
+from sb3_actpc.utils.checks import check_kinds, check_range
 
 
 @with_keywords_of(OfflineAlgorithm)
@@ -24,14 +24,14 @@ class BC(OfflineAlgorithm):
     """
     Behaviour cloning: the mean squared error between the demonstrated actions (scaled to [-1, 1]) and the network's.
 
-    A step of ``learn`` is one gradient step (see :class:`~sb3_actpc.baselines.offline.OfflineAlgorithm`). Observations are
+    A step of ``learn`` is one gradient step (see :class:`~sb3_actpc.baselines.offline.base.OfflineAlgorithm`). Observations are
     normalised by the demonstrations' mean and standard deviation.
 
     :param policy: "MlpPolicy"
     :param env: a task with Box observations and actions; for its spaces and for evaluations
     :param weight_decay: decoupled from the gradient (AdamW)
     :param input_noise: standard deviation of Gaussian noise on the normalised observations of each batch
-    :param options: keywords of :class:`~sb3_actpc.baselines.offline.OfflineAlgorithm`; ``policy_kwargs`` takes ``net_arch``
+    :param options: keywords of :class:`~sb3_actpc.baselines.offline.base.OfflineAlgorithm`; ``policy_kwargs`` takes ``net_arch``
     :raises ValueError: as there
     """
 

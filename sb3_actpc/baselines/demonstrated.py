@@ -10,18 +10,18 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
-from sb3_actpc.common.demonstration_buffers import (
+from sb3_actpc.baselines.demonstration_buffers import (
     DemonstrationDictReplayBuffer,
     _DemonstrationReplay,
     demonstration_buffer_class,
     fit_demonstrations,
 )
-from sb3_actpc.common.demonstrations import Demonstrations
+from sb3_actpc.demonstrations.dataset import Demonstrations
 
 
 class DemonstratedAlgorithm(OffPolicyAlgorithm):
     """
-    An off-policy algorithm whose replay buffer is one of :mod:`sb3_actpc.common.demonstration_buffers`.
+    An off-policy algorithm whose replay buffer is one of :mod:`sb3_actpc.baselines.demonstration_buffers`.
 
     An agent that is loaded without an environment, to be played, gets a buffer of one transition and does not look for its
     demonstrations; :meth:`set_env` makes the whole buffer.

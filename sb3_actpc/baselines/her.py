@@ -11,11 +11,11 @@ from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 from stable_baselines3.td3.policies import TD3Policy
 
-from sb3_actpc.baselines.keywords import with_keywords_of
+from sb3_actpc.baselines.demonstration_buffers import DemonstrationHerReplayBuffer, _DemonstrationReplay
 from sb3_actpc.baselines.prioritized import DemonstrationPrioritizedHerReplayBuffer, PrioritizedHerReplayBuffer
+from sb3_actpc.baselines.signatures import with_keywords_of
 from sb3_actpc.baselines.td3 import DDPGDemo
-from sb3_actpc.common.checks import check_range
-from sb3_actpc.common.demonstration_buffers import DemonstrationHerReplayBuffer, _DemonstrationReplay
+from sb3_actpc.utils.checks import check_range
 
 
 @with_keywords_of(DDPGDemo)

@@ -19,10 +19,10 @@ from stable_baselines3.common.torch_layers import create_mlp
 from stable_baselines3.common.type_aliases import GymEnv
 from torch import nn
 
-from sb3_actpc.baselines.keywords import with_keywords_of
-from sb3_actpc.common.checks import check_kinds, check_range
-from sb3_actpc.common.demonstration_buffers import fit_demonstrations
-from sb3_actpc.common.demonstrations import Demonstrations
+from sb3_actpc.baselines.demonstration_buffers import fit_demonstrations
+from sb3_actpc.baselines.signatures import with_keywords_of
+from sb3_actpc.demonstrations.dataset import Demonstrations
+from sb3_actpc.utils.checks import check_kinds, check_range
 
 ZERO_DELTA = 6e-7  # at or below this the guidance step is left out (the authors' code)
 
@@ -67,7 +67,7 @@ class LOGO(TRPO):
 
     :param policy: "MlpPolicy"
     :param env: a task with Box observations and actions
-    :param demonstrations: a path, or a :class:`~sb3_actpc.common.demonstrations.Demonstrations`; None for TRPO
+    :param demonstrations: a path, or a :class:`~sb3_actpc.demonstrations.dataset.Demonstrations`; None for TRPO
     :param n_demonstrations: use only the first so many episodes of them
     :param n_demonstration_transitions: use only the first so many transitions
     :param guidance_delta: δ at the start, mean Kullback-Leibler divergence of the guidance step

@@ -10,8 +10,8 @@ from stable_baselines3.common.type_aliases import DictReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
-from sb3_actpc.common.checks import check_range
-from sb3_actpc.common.demonstration_buffers import _DemonstrationReplay, _joined
+from sb3_actpc.baselines.demonstration_buffers import _DemonstrationReplay, _joined
+from sb3_actpc.utils.checks import check_range
 
 
 class SumTree:

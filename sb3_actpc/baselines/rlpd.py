@@ -14,9 +14,9 @@ from stable_baselines3.sac.policies import SACPolicy
 from torch import nn
 
 from sb3_actpc.baselines.demonstrated import DemonstratedAlgorithm
-from sb3_actpc.baselines.keywords import with_keywords_of
-from sb3_actpc.common.checks import check_range
-from sb3_actpc.common.demonstrations import Demonstrations
+from sb3_actpc.baselines.signatures import with_keywords_of
+from sb3_actpc.demonstrations.dataset import Demonstrations
+from sb3_actpc.utils.checks import check_range
 
 
 class LayerNormCritic(ContinuousCritic):
@@ -104,7 +104,7 @@ class RLPD(DemonstratedAlgorithm, SAC):
 
     :param policy: "MlpPolicy" or "MultiInputPolicy"; ``policy_kwargs`` takes ``n_critics`` and ``n_target_critics``
     :param env: as SB3's
-    :param demonstrations: a path, or a :class:`~sb3_actpc.common.demonstrations.Demonstrations`; None learns without
+    :param demonstrations: a path, or a :class:`~sb3_actpc.demonstrations.dataset.Demonstrations`; None learns without
     :param n_demonstrations: use only the first so many episodes of them
     :param n_demonstration_transitions: use only the first so many transitions
     :param demonstration_fraction: share of each batch that comes from them; without demonstrations it has no effect

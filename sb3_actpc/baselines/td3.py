@@ -15,11 +15,11 @@ from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.utils import polyak_update
 from stable_baselines3.td3.policies import TD3Policy
 
+from sb3_actpc.actpc.self_imitation import map_observations
 from sb3_actpc.baselines.demonstrated import DemonstratedAlgorithm
-from sb3_actpc.baselines.keywords import with_keywords_of
-from sb3_actpc.common.checks import check_kinds, check_range
-from sb3_actpc.common.demonstrations import Demonstrations
-from sb3_actpc.common.episodes import map_observations
+from sb3_actpc.baselines.signatures import with_keywords_of
+from sb3_actpc.demonstrations.dataset import Demonstrations
+from sb3_actpc.utils.checks import check_kinds, check_range
 
 OPTIMIZERS: dict[str, type[th.optim.Optimizer]] = {"adam": th.optim.Adam, "adamw": th.optim.AdamW}
 NETWORK_KEYWORDS = ("learning_rate", "optimizer", "optimizer_kwargs", "tau")
@@ -34,7 +34,7 @@ class TD3Demo(DemonstratedAlgorithm, TD3):
 
     :param policy: as SB3's
     :param env: as SB3's
-    :param demonstrations: a path, or a :class:`~sb3_actpc.common.demonstrations.Demonstrations`; None learns without
+    :param demonstrations: a path, or a :class:`~sb3_actpc.demonstrations.dataset.Demonstrations`; None learns without
     :param n_demonstrations: use only the first so many episodes of them
     :param n_demonstration_transitions: use only the first so many transitions
     :param demonstration_fraction: share of each batch that comes from them; without demonstrations it has no effect

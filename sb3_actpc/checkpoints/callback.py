@@ -15,13 +15,13 @@ from stable_baselines3.common.callbacks import BaseCallback, CallbackList, Event
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import MaybeCallback
 
+from sb3_actpc.actpc.self_imitation import map_observations
 from sb3_actpc.checkpoints.bundle import Report, find_bundle, list_bundles, write_bundle
+from sb3_actpc.checkpoints.interrupts import StopSignals, TrainingStopped
 from sb3_actpc.checkpoints.settings import constructor_settings
-from sb3_actpc.checkpoints.signals import StopSignals, TrainingStopped
 from sb3_actpc.checkpoints.simulators import env_name
 from sb3_actpc.checkpoints.state import capture_model, describe_model, restore_learning, restore_model, take_resumed
-from sb3_actpc.common.checks import check_finite
-from sb3_actpc.common.episodes import map_observations
+from sb3_actpc.utils.checks import check_finite
 
 SelfAlgorithm = TypeVar("SelfAlgorithm", bound=OffPolicyAlgorithm)
 

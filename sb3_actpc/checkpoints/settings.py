@@ -23,7 +23,7 @@ from stable_baselines3.common.type_aliases import TrainFreq
 from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
-from sb3_actpc.common import buffers
+from sb3_actpc.actpc import buffers
 
 _ACTIVATIONS = ("ReLU", "LeakyReLU", "Tanh", "ELU", "GELU", "SiLU", "Mish", "Sigmoid", "Softplus", "Identity", "ReLU6")
 _OPTIMIZERS = ("Adam", "AdamW", "SGD", "RMSprop", "Adamax", "NAdam", "RAdam", "Adagrad")

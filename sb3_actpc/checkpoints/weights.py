@@ -19,7 +19,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from sb3_actpc.checkpoints.bundle import Report, _warn, find_bundle
 from sb3_actpc.checkpoints.settings import constructor_settings, read_settings
 from sb3_actpc.checkpoints.state import check_weights, restore_model
-from sb3_actpc.common.files import atomic_write
+from sb3_actpc.utils.files import atomic_write
 
 SelfAlgorithm = TypeVar("SelfAlgorithm", bound=OffPolicyAlgorithm)
 

@@ -32,7 +32,7 @@ def run(args: argparse.Namespace) -> int:
     :raises ValueError: when there is no such package
     :raises OSError: when a step of the installation fails
     """
-    from sb3_actpc.baselines.installation import FOLDER_VARIABLE, environments_folder, install
+    from sb3_actpc.baselines.offline.installation import FOLDER_VARIABLE, environments_folder, install
 
     folder = None if args.dir is None else Path(args.dir).absolute()
     install(args.package, folder, report=lambda line: print(line, flush=True))

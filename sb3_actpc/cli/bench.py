@@ -59,7 +59,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _settings() -> dict[str, dict[str, Any]]:
     """The agents measured: the bare one, the shipped defaults and the paper's preset, with both schedules."""
-    from sb3_actpc.training.config import RunConfig, resolve_run
+    from sb3_actpc.experiments.runs.config import RunConfig, resolve_run
 
     bare = {"circuit_kwargs": {"feedback": "tied"}, "n_critics": 1}
     presets = {"shipped defaults": "actpc", "paper preset": "actpc_paper"}
@@ -85,7 +85,7 @@ def _td3(device: str) -> OffPolicyAlgorithm:
 
 def _actpc(keywords: dict[str, Any], device: str) -> OffPolicyAlgorithm:
     from sb3_actpc import ActPC
-    from sb3_actpc.training.config import parse_schedule
+    from sb3_actpc.experiments.runs.config import parse_schedule
 
     if "learning_rate" in keywords:
         keywords = {**keywords, "learning_rate": parse_schedule(keywords["learning_rate"])}
@@ -189,7 +189,7 @@ def _memory_ratio() -> float:
     from gymnasium import spaces
     from stable_baselines3.common.buffers import ReplayBuffer
 
-    from sb3_actpc.common.buffers import CombinedReplayBuffer
+    from sb3_actpc.actpc.buffers import CombinedReplayBuffer
 
     pair = spaces.Box(-np.inf, np.inf, (17,), np.float64), spaces.Box(-1.0, 1.0, (6,), np.float32)
     sizes = [

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from sb3_actpc.comparison import PlannedRun
-    from sb3_actpc.comparison.schedule import Summary
+    from sb3_actpc.experiments.comparison import PlannedRun
+    from sb3_actpc.experiments.comparison.schedule import Summary
 
 # options that say which runs are compared; a file may say the same
 _COMPARISON = (
@@ -75,10 +75,10 @@ def run(args: argparse.Namespace) -> int:
     :raises ValueError: when a name, a number or a setting is wrong, or another command works in the folder
     :raises FileNotFoundError: when a file is missing
     """
-    from sb3_actpc.comparison import plan_runs, read_comparison
-    from sb3_actpc.comparison.display import make_display
-    from sb3_actpc.comparison.engines import make_engine
-    from sb3_actpc.comparison.schedule import run_comparison
+    from sb3_actpc.experiments.comparison import plan_runs, read_comparison
+    from sb3_actpc.experiments.comparison.display import make_display
+    from sb3_actpc.experiments.comparison.engines import make_engine
+    from sb3_actpc.experiments.comparison.schedule import run_comparison
 
     given = _given(args)
     folder = Path(args.out or given.pop("out", None) or "runs/comparison")
@@ -100,7 +100,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _given(args: argparse.Namespace) -> dict[str, Any]:
-    from sb3_actpc.comparison.table import read_yaml
+    from sb3_actpc.experiments.comparison.run_table import read_yaml
 
     given = {} if args.file is None else read_yaml(Path(args.file))
     options = {name: getattr(args, name) for name in _COMPARISON}
@@ -108,8 +108,8 @@ def _given(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def _print_table(runs: Sequence[PlannedRun], args: argparse.Namespace, threads: int) -> None:
-    from sb3_actpc.comparison.engines.local import usable_cores
-    from sb3_actpc.comparison.estimate import describe_table
+    from sb3_actpc.experiments.comparison.engines.local import usable_cores
+    from sb3_actpc.experiments.comparison.estimate import describe_table
 
     print(describe_table(runs, args.workers or max(1, usable_cores() // threads), args.retry_failed))
 

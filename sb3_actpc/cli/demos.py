@@ -10,7 +10,7 @@ import numpy as np
 from sb3_actpc.envs import ROBOSUITE_IDS, SPARSE_IDS
 
 if TYPE_CHECKING:
-    from sb3_actpc.common.demonstrations import Demonstrations
+    from sb3_actpc.demonstrations.dataset import Demonstrations
 
 Subparsers = Any  # argparse's own type is private
 
@@ -152,7 +152,7 @@ def _proficiency(text: str | None) -> float | str:
 
 def _collect_trained(args: argparse.Namespace) -> "Demonstrations":
     """Train and roll out."""
-    from sb3_actpc.experts import ExpertTraining, collect_demonstrations, default_expert_steps, train_expert
+    from sb3_actpc.demonstrations.experts import ExpertTraining, collect_demonstrations, default_expert_steps, train_expert
 
     n_episodes = 20 if args.episodes is None else args.episodes
     training = ExpertTraining(args.env, args.algo, args.seed, args.n_envs)
@@ -181,8 +181,8 @@ def _command(options: dict[str, Any]) -> str:
 
 def _convert(args: argparse.Namespace) -> int:
     """Between .npz and HDF5."""
-    from sb3_actpc.common.demonstrations import Demonstrations
     from sb3_actpc.demonstrations import write_robomimic
+    from sb3_actpc.demonstrations.dataset import Demonstrations
 
     if args.file.suffix == ".npz":
         output = args.output or args.file.with_suffix(".hdf5")
@@ -232,7 +232,7 @@ def _download(args: argparse.Namespace) -> int:
 
 def _info(args: argparse.Namespace) -> int:
     """Print what a file holds."""
-    from sb3_actpc.common.demonstrations import Demonstrations
+    from sb3_actpc.demonstrations.dataset import Demonstrations
 
     if not args.file.is_file():
         raise FileNotFoundError(f"no demonstration file {args.file}: make one with `sb3-actpc demos collect`")

@@ -38,7 +38,7 @@ def run(args: argparse.Namespace) -> int:
     :raises ValueError: when an argument is wrong or a file of the run is damaged
     :raises FileNotFoundError: when the folder is not that of a run
     """
-    from sb3_actpc.training.video import check_video_path, choose_gl_backend
+    from sb3_actpc.experiments.runs.video import check_video_path, choose_gl_backend
 
     folder = Path(args.folder)
     video = None if args.no_video else Path(args.video or folder / "video.mp4")
@@ -47,8 +47,8 @@ def run(args: argparse.Namespace) -> int:
         check_video_path(video)
         choose_gl_backend()  # before MuJoCo is imported
 
-    from sb3_actpc.training import evaluate_run
-    from sb3_actpc.training.report import result_table
+    from sb3_actpc.experiments.runs import evaluate_run
+    from sb3_actpc.experiments.runs.summary import result_table
 
     print(result_table(evaluate_run(folder, args.episodes, args.seed)), flush=True)
     if video is not None:
@@ -64,10 +64,10 @@ def _check_video_options(args: argparse.Namespace) -> None:
 
 
 def _record(folder: Path, video: Path, args: argparse.Namespace) -> None:
-    from sb3_actpc.common.demonstrations import Demonstrations
-    from sb3_actpc.training.config import find_demonstrations
-    from sb3_actpc.training.run import load_run
-    from sb3_actpc.training.video import RenderingUnavailable, record_video
+    from sb3_actpc.demonstrations.dataset import Demonstrations
+    from sb3_actpc.experiments.runs.config import find_demonstrations
+    from sb3_actpc.experiments.runs.run import load_run
+    from sb3_actpc.experiments.runs.video import RenderingUnavailable, record_video
 
     record, model = load_run(folder)
     size = {} if args.size is None else {"width": args.size, "height": args.size}

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from sb3_actpc.training import RunConfig
+    from sb3_actpc.experiments.runs import RunConfig
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -59,8 +59,8 @@ def run(args: argparse.Namespace) -> int:
     :raises FileNotFoundError: when the preset, the demonstrations or the run to resume do not exist
     """
     from sb3_actpc.checkpoints import EXIT_STOPPED, TrainingStopped
-    from sb3_actpc.training import resume_run, train_run
-    from sb3_actpc.training.report import result_table
+    from sb3_actpc.experiments.runs import resume_run, train_run
+    from sb3_actpc.experiments.runs.summary import result_table
 
     try:
         if args.resume is None:
@@ -91,8 +91,8 @@ def _check_only_resume(args: argparse.Namespace) -> None:
 
 
 def _config(args: argparse.Namespace) -> RunConfig:
-    from sb3_actpc.training import RunConfig
-    from sb3_actpc.training.config import parse_assignments
+    from sb3_actpc.experiments.runs import RunConfig
+    from sb3_actpc.experiments.runs.config import parse_assignments
 
     return RunConfig(
         env=args.env,

@@ -29,6 +29,6 @@ def run(args: argparse.Namespace) -> int:
     :raises ImportError: when rl-zoo3 is not installed
     :raises FileNotFoundError: when the preset, the demonstrations or the runs do not exist
     """
-    from sb3_actpc.zoo import main
+    from sb3_actpc.experiments.zoo import main
 
     return main(args.arguments)

@@ -1,6 +1,6 @@
 """Where demonstrations come from: recordings of experts and scripted operators, and the files of robomimic and robosuite.
 
-All of it ends in the one form of :class:`sb3_actpc.common.demonstrations.Demonstrations`.
+All of it ends in the one form of :class:`sb3_actpc.demonstrations.dataset.Demonstrations`.
 """
 
 from sb3_actpc.demonstrations.operators import MIXED_OPERATORS, ScriptedOperator, collect_scripted

@@ -9,11 +9,11 @@ import urllib.request
 from collections.abc import Callable
 from pathlib import Path
 
-from sb3_actpc.common.demonstrations import Demonstrations
-from sb3_actpc.common.files import atomic_write
+from sb3_actpc.demonstrations.dataset import Demonstrations
 from sb3_actpc.demonstrations.hdf5 import import_h5py
 from sb3_actpc.demonstrations.robomimic import read_robomimic
 from sb3_actpc.envs.robosuite_layouts import robosuite_task
+from sb3_actpc.utils.files import atomic_write
 
 REPOSITORY = "https://huggingface.co/datasets/robomimic/robomimic_datasets/resolve/main"
 KINDS = {"mh": "300 by six humans of three levels", "ph": "200 by one proficient human"}

@@ -13,7 +13,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from sb3_actpc.common.demonstrations import Demonstrations
+from sb3_actpc.demonstrations.dataset import Demonstrations
 from sb3_actpc.demonstrations.recording import Report, join_episodes, record_successes, silent
 from sb3_actpc.envs.robosuite_layouts import (
     ACTION_DIM,

@@ -14,8 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from sb3_actpc.common.demonstrations import ACTION_TOLERANCE, Demonstrations
-from sb3_actpc.common.files import atomic_write
+from sb3_actpc.demonstrations.dataset import ACTION_TOLERANCE, Demonstrations
 from sb3_actpc.demonstrations.hdf5 import (
     check_recorded_task,
     demo_names,
@@ -26,6 +25,7 @@ from sb3_actpc.demonstrations.hdf5 import (
 )
 from sb3_actpc.demonstrations.recording import Columns, join_episodes
 from sb3_actpc.envs.robosuite_layouts import ACTION_DIM, OBSERVATIONS, PROPRIOCEPTION, RobosuiteTask, robosuite_task
+from sb3_actpc.utils.files import atomic_write
 
 ROBOSUITE_TYPE = 1  # robomimic's EnvType
 # metres: the median over an episode of how much an object's two recorded distances from the gripper differ

@@ -8,7 +8,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from sb3_actpc.common.demonstrations import Demonstrations
+from sb3_actpc.demonstrations.dataset import Demonstrations
 from sb3_actpc.demonstrations.hdf5 import check_recorded_task, demo_names, open_hdf5, read_array, read_json_attribute
 from sb3_actpc.demonstrations.recording import Columns, join_episodes
 from sb3_actpc.envs.robosuite_layouts import ACTION_DIM, RobosuiteTask, robosuite_task

@@ -18,7 +18,7 @@ from gymnasium import spaces
 from sb3_actpc.envs import sparse_mujoco
 
 if TYPE_CHECKING:
-    from sb3_actpc.common.demonstrations import Demonstrations
+    from sb3_actpc.demonstrations.dataset import Demonstrations
 
 Observation = dict[str, np.ndarray]
 _REACHER_OWN = [0, 1, 2, 3, 6, 7]  # joint angles and velocities

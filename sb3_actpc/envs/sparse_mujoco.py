@@ -34,7 +34,7 @@ from gymnasium.envs.mujoco import (
 )
 
 if TYPE_CHECKING:
-    from sb3_actpc.common.demonstrations import Demonstrations
+    from sb3_actpc.demonstrations.dataset import Demonstrations
 
 LOCOMOTION_CONDITIONS: tuple[str, ...] = ("displacement", "forward")
 

@@ -5,8 +5,8 @@ import pytest
 from gymnasium import spaces
 from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 
-from sb3_actpc.common.buffers import CombinedReplayBuffer, combined_buffer_class
-from sb3_actpc.common.episodes import Episodes, SelfImitationMemory, sample_union
+from sb3_actpc.actpc.buffers import CombinedReplayBuffer, combined_buffer_class
+from sb3_actpc.actpc.self_imitation import Episodes, SelfImitationMemory, sample_union
 
 SPACES = (spaces.Box(-1, 1, (2,), np.float64), spaces.Box(-1, 1, (1,), np.float32))
 

@@ -16,9 +16,9 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_actpc.baselines import BC, BCRNN
 from sb3_actpc.baselines.bc_policies import BCRNNPolicy
-from sb3_actpc.common.demonstrations import Demonstrations
-from sb3_actpc.training import RunConfig, train_run
-from sb3_actpc.training.evaluation import play_episodes
+from sb3_actpc.demonstrations.dataset import Demonstrations
+from sb3_actpc.experiments.runs import RunConfig, train_run
+from sb3_actpc.experiments.runs.evaluation import play_episodes
 from tests.recordings import record
 
 ENV = "Pendulum-v1"
@@ -221,7 +221,7 @@ def test_an_offline_method_is_evaluated_at_every_interval_and_not_untrained(tmp_
         return play_episodes(model, envs, n_episodes, seed)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("sb3_actpc.training.evaluation.play_episodes", counted)
+        patch.setattr("sb3_actpc.experiments.runs.evaluation.play_episodes", counted)
         for algo in ("bc", "actpc"):
             played.clear()
             overrides = {"batch_size": 4} | ({"actor_warm_start": 0} if algo == "actpc" else {})

@@ -8,14 +8,14 @@ from stable_baselines3 import DDPG, SAC, TD3
 from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_actpc.baselines import TD3Demo
-from sb3_actpc.common.demonstration_buffers import (
+from sb3_actpc.baselines.demonstration_buffers import (
     DemonstrationHerReplayBuffer,
     DemonstrationNStepReplayBuffer,
     DemonstrationReplayBuffer,
     demonstration_buffer_class,
     fit_demonstrations,
 )
-from sb3_actpc.common.demonstrations import Demonstrations
+from sb3_actpc.demonstrations.dataset import Demonstrations
 from tests.recordings import record
 
 BOX = spaces.Box(-1.0, 1.0, (2,), np.float32)

@@ -12,7 +12,7 @@ from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_actpc.baselines import LOGO
 from sb3_actpc.baselines.logo import Guidance, generalized_advantages
-from sb3_actpc.common.demonstrations import Demonstrations
+from sb3_actpc.demonstrations.dataset import Demonstrations
 from tests.recordings import record
 
 SMALL = {"n_steps": 64, "batch_size": 32, "n_critic_updates": 2, "seed": 1}

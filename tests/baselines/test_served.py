@@ -15,12 +15,12 @@ import pytest
 from stable_baselines3.common.evaluation import evaluate_policy
 
 from sb3_actpc.baselines import BCQ, CQL, HBC, IRIS, installation
-from sb3_actpc.baselines.installation import environment_python, install
-from sb3_actpc.baselines.process import ServerFailed, ServerProcess
-from sb3_actpc.baselines.served import SERVERS, ServedAlgorithm
-from sb3_actpc.baselines.servers.frames import pack, unpack
+from sb3_actpc.baselines.offline.installation import environment_python, install
+from sb3_actpc.baselines.offline.process import ServerFailed, ServerProcess
+from sb3_actpc.baselines.offline.served import SERVERS, ServedAlgorithm
+from sb3_actpc.baselines.offline.servers.frames import pack, unpack
 from sb3_actpc.cli import main
-from sb3_actpc.training import load_preset, play_episodes
+from sb3_actpc.experiments.runs import load_preset, play_episodes
 from tests.recordings import record
 
 # Its action is the number of its gradient steps in hundredths, plus the age of the episode in tenths.
@@ -243,7 +243,7 @@ def test_a_failing_process_is_one_clear_error_and_is_ended(kwargs: dict, error: 
 
 def test_the_other_process_ends_with_this_one(tmp_path: Path) -> None:
     code = (
-        "import os; from sb3_actpc.baselines.process import ServerProcess; import sys;"
+        "import os; from sb3_actpc.baselines.offline.process import ServerProcess; import sys;"
         f"server = ServerProcess([sys.executable, {Fake.script!r}], 'fake', 20); server.ask('build', method_kwargs={{}});"
         "print(server._process.pid, flush=True); os._exit(9)"
     )

@@ -24,7 +24,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from sb3_actpc import ActPC
 from sb3_actpc.actpc.policies import CIRCUIT_KEYWORDS, ActPCPolicy
 from sb3_actpc.cli import main
-from sb3_actpc.common.demonstrations import Demonstrations
+from sb3_actpc.demonstrations.dataset import Demonstrations
 from tests.actpc.envs import CountingEnv
 from tests.actpc.test_agent import demonstrations
 from tests.checkpoints.test_exact_resume import ACTPC

@@ -19,7 +19,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from sb3_actpc import ActPC
 from sb3_actpc.checkpoints import EXIT_STOPPED, CheckpointCallback, TrainingStopped, continue_learning, list_bundles, restore
 from sb3_actpc.cli import main
-from sb3_actpc.common.demonstrations import Demonstrations
+from sb3_actpc.demonstrations.dataset import Demonstrations
 from tests.actpc.envs import CountingEnv
 from tests.checkpoints.runs import assert_equal, log_rows
 from tests.checkpoints.test_exact_resume import make_actpc
@@ -214,7 +214,7 @@ class Terminate(BaseCallback):
 
 def test_a_run_killed_at_random_moments_and_resumed_is_the_run_never_killed() -> None:
     """The short form; ``python tests/kill_and_resume.py`` kills 30 times."""
-    script = Path(__file__).resolve().parents[1] / "kill_and_resume.py"
+    script = Path(__file__).resolve().parents[2] / "benchmarks" / "kill_and_resume.py"
     command = [sys.executable, str(script), "--kills", "2", "--steps", "200"]
     result = subprocess.run(command, capture_output=True, text=True, check=False)
     assert result.returncode == 0, result.stdout + result.stderr

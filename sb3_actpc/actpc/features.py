@@ -1,0 +1,137 @@
+"""What the circuits see: normalised features of observations, and the working memory rebuilt from their past."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.vec_env import VecNormalize
+
+from sb3_actpc.actpc.policies import ActPCActor
+from sb3_actpc.actpc.self_imitation import map_observations
+from sb3_actpc.actpc.type_aliases import Observations, TensorObservations
+
+
+class Batch(NamedTuple):
+    """
+    Transitions as the circuits see them, B rows, the newest first, demonstrations (if mixed in) last.
+
+    :param features: normalised observations, (B, n_features)
+    :param actions: (B, A), in [-1, 1]
+    :param next_features: one step on, which generator and prior predict, (B, n_features)
+    :param bootstrap_features: where the critic's target is bootstrapped: one step on, or n, (B, n_features)
+    :param memory: m_t, (B, n_memory), or None
+    :param next_memory: the memory where the target is bootstrapped, m_{t+1} or m_{t+n}, (B, n_memory), or None
+    :param rewards: the combined reward r_t, (B, 1)
+    :param dones: 1 where the episode truly ended, (B, 1)
+    :param discounts: γ, or γ^n with n-step returns, (B, 1)
+    """
+
+    features: th.Tensor
+    actions: th.Tensor
+    next_features: th.Tensor
+    bootstrap_features: th.Tensor
+    memory: th.Tensor | None
+    next_memory: th.Tensor | None
+    rewards: th.Tensor
+    dones: th.Tensor
+    discounts: th.Tensor
+
+    def join(self, other: "Batch") -> "Batch":
+        """These rows, then those of ``other``."""
+        pairs: Any = zip(self, other, strict=True)
+        columns: list[Any] = [None if mine is None else th.cat([mine, theirs]) for mine, theirs in pairs]
+        return Batch(*columns)
+
+    def shuffled(self, keep: int) -> "Batch":
+        """The first ``keep`` rows as they are, the others in random order."""
+        order = th.arange(len(self.features), device=self.features.device)
+        order[keep:] = keep + th.randperm(max(len(order) - keep, 0), device=order.device)
+        columns: list[Any] = [None if column is None else column[order] for column in self]
+        return Batch(*columns)
+
+
+class CircuitInputs:
+    """
+    :param actor: its extractor, normaliser and working memory are every circuit's
+    :param vec_normalize: the VecNormalize wrapper of the training environment, or None
+    """
+
+    def __init__(self, actor: ActPCActor, vec_normalize: VecNormalize | None) -> None:
+        self.actor, self.vec_normalize = actor, vec_normalize
+
+    def tensor(self, array: np.ndarray) -> th.Tensor:
+        """The array as float32 on the agent's device."""
+        return th.as_tensor(array, dtype=th.float32, device=self.actor.normalizer.mean.device)
+
+    def observations(self, observations: Any, batch_dims: int = 1) -> TensorObservations:
+        """
+        :param observations: numpy, as the environment gave them, with ``batch_dims`` leading dimensions; or a dict of such
+        :return: tensors, normalised as the replay buffer's are
+        """
+        if self.vec_normalize is not None:
+            shape = next(iter(observations.values())).shape if isinstance(observations, dict) else observations.shape
+            lead = shape[:batch_dims]
+            flat = map_observations(lambda array: array.reshape(-1, *array.shape[batch_dims:]), observations)
+            normalized = self.vec_normalize.normalize_obs(flat)
+            observations = map_observations(lambda array: array.reshape(*lead, *array.shape[1:]), normalized)
+        return map_observations(lambda array: th.as_tensor(array, device=self.actor.normalizer.mean.device), observations)
+
+    def past(
+        self, history: Observations | None, mask: np.ndarray | None
+    ) -> tuple[TensorObservations | None, th.Tensor | None]:
+        """
+        :param history: numpy, (B, H, *obs_shape), as the environment gave them, or a dict of such; or None
+        :param mask: (B, H) or None
+        :return: both as :meth:`memory` takes them
+        """
+        if history is None or mask is None:
+            return None, None
+        return self.observations(history, batch_dims=2), self.tensor(mask)
+
+    def features(self, observations: TensorObservations) -> th.Tensor:
+        """(B, n_features) of a batch of observations."""
+        return self.actor.features(observations)
+
+    def past_features(self, history: TensorObservations | None, mask: th.Tensor | None) -> th.Tensor | None:
+        """
+        :param history: (B, H, *obs_shape), the observations before each row, oldest first; or None
+        :param mask: (B, H), 1 where there was one in the same episode; or None
+        :return: (B, H, n_features), zero before the episode's start; None without a history
+        """
+        if history is None or mask is None:
+            return None
+        flat = map_observations(lambda tensor: tensor.flatten(0, 1), history)
+        return self.features(flat).view(*mask.shape, -1) * mask[:, :, None]
+
+    def memory(self, history: TensorObservations | None, mask: th.Tensor | None) -> th.Tensor | None:
+        """
+        :param history: as for :meth:`past_features`
+        :param mask: likewise
+        :return: m_t, (B, n_memory), or None without a working memory
+        """
+        past = self.past_features(history, mask)
+        return None if past is None or self.actor.memory is None else self.actor.memory(past)
+
+    def memories(
+        self,
+        history: TensorObservations | None,
+        mask: th.Tensor | None,
+        features: th.Tensor,
+        next_history: TensorObservations | None = None,
+        next_mask: th.Tensor | None = None,
+    ) -> tuple[th.Tensor | None, th.Tensor | None]:
+        """
+        :param history: as for :meth:`past_features`
+        :param mask: likewise
+        :param features: (B, n_features) of the present observations, the newest of the past one step on
+        :param next_history: with returns of several steps, the past of the observation n steps on
+        :param next_mask: likewise
+        :return: m_t and m_{t+1} (or m_{t+n}), (B, n_memory) each, or None and None without a working memory
+        """
+        past = self.past_features(history, mask)
+        if past is None or self.actor.memory is None:
+            return None, None
+        following = self.past_features(next_history, next_mask)
+        if following is None:
+            following = th.cat([past[:, 1:], features[:, None]], dim=1)
+        return self.actor.memory(past), self.actor.memory(following)

@@ -1,0 +1,187 @@
+"""Whole episodes worth imitating: the demonstrations, and the agent's own best (self-imitation)."""
+
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+
+from sb3_actpc.actpc.type_aliases import ImitationSamples, Observations
+from sb3_actpc.demonstrations.dataset import Demonstrations
+
+
+def map_observations(function: Callable[[Any], Any], observations: Any) -> Any:
+    """Apply ``function`` to an array or tensor, or to every one of a dict."""
+    if isinstance(observations, dict):
+        return {key: function(value) for key, value in observations.items()}
+    return function(observations)
+
+
+def split_observations(space: spaces.Space, rows: np.ndarray) -> Observations:
+    """
+    Undo ``gymnasium.spaces.utils.flatten`` for many rows at once.
+
+    :param space: a Box, or a Dict of Boxes
+    :param rows: (N, flat size)
+    :return: (N, *shape), or a dict of such
+    :raises ValueError: for other spaces
+    """
+    parts_of = space.spaces.values() if isinstance(space, spaces.Dict) else [space]
+    if not all(isinstance(part, spaces.Box) for part in parts_of):
+        raise ValueError(f"demonstrations need Box observations or a Dict of Boxes, found {space}")
+    if not isinstance(space, spaces.Dict):
+        return rows.reshape(len(rows), *(space.shape or ()))
+    parts, start = {}, 0
+    for key, part in space.spaces.items():
+        size = int(np.prod(part.shape or ()))
+        parts[key] = rows[:, start : start + size].reshape(len(rows), *(part.shape or ()))
+        start += size
+    return parts
+
+
+@dataclass
+class Episodes:
+    """
+    Episodes laid end to end.
+
+    :param observations: (N, *obs_shape), or a dict of such
+    :param actions: (N, A), scaled to [-1, 1]
+    :param starts: (N,) index of the first transition of each row's episode
+    """
+
+    observations: Observations
+    actions: np.ndarray
+    starts: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.actions)
+
+    @classmethod
+    def from_demonstrations(
+        cls, demonstrations: Demonstrations, observation_space: spaces.Space, action_space: spaces.Box
+    ) -> "Episodes":
+        """The demonstrations with actions scaled to [-1, 1]."""
+        low, high = action_space.low, action_space.high
+        actions = np.clip(2.0 * (demonstrations.actions - low.ravel()) / (high - low).ravel() - 1.0, -1.0, 1.0)
+        bounds = demonstrations.episode_bounds
+        return cls(
+            observations=split_observations(observation_space, demonstrations.observations),
+            actions=actions.astype(np.float32),
+            starts=np.repeat(bounds[:, 0], bounds[:, 1] - bounds[:, 0]),
+        )
+
+    def take(self, indices: np.ndarray, history: int = 0) -> ImitationSamples:
+        """
+        :param indices: (B,) rows
+        :param history: H, how many preceding observations of the same episode come with each row
+        :return: the rows
+        """
+        past, mask = self.past(indices, history)
+        return ImitationSamples(
+            map_observations(lambda array: array[indices], self.observations), self.actions[indices], past, mask
+        )
+
+    def past(
+        self, indices: np.ndarray, history: int, including: bool = False
+    ) -> tuple[Observations | None, np.ndarray | None]:
+        """
+        :param indices: (B,) rows
+        :param history: H
+        :param including: the past of the step after each row, the row itself its newest part
+        :return: (B, H, *obs_shape), the observations before each row, oldest first, and (B, H), 1 where there is one in the
+            same episode; None and None without a history
+        """
+        if not history:
+            return None, None
+        earlier = indices[:, None] + np.arange(-history, 0) + int(including)
+        mask = (earlier >= self.starts[indices][:, None]).astype(np.float32)
+        return map_observations(lambda array: array[np.maximum(earlier, 0)], self.observations), mask
+
+
+class SelfImitationMemory:
+    """
+    The actor's memory of its own goal-reaching episodes (paper: M^actor, Algorithm 1 lines 25 to 27).
+
+    An episode enters when its sparse return is positive and at least the best return now stored; the oldest leave when the
+    capacity is passed.
+
+    :param capacity: most transitions kept (an episode longer than that is not stored)
+    """
+
+    def __init__(self, capacity: int = 100_000) -> None:
+        self.capacity = capacity
+        self.returns: deque[float] = deque()
+        self._episodes: deque[Episodes] = deque()
+        self._joined: Episodes | None = None
+
+    def __len__(self) -> int:
+        return sum(map(len, self._episodes))
+
+    @property
+    def best_return(self) -> float:
+        """The best sparse return stored; 0 while empty."""
+        return max(self.returns, default=0.0)
+
+    def offer(self, observations: Observations, actions: np.ndarray, episode_return: float) -> bool:
+        """
+        :param observations: (T, *obs_shape) of one whole episode, or a dict of such
+        :param actions: (T, A)
+        :param episode_return: the episode's sparse return
+        :return: whether it was stored
+        """
+        if episode_return <= 0.0 or episode_return < self.best_return or len(actions) > self.capacity:
+            return False
+        self._episodes.append(Episodes(observations, actions, np.zeros(len(actions), dtype=np.int64)))
+        self.returns.append(episode_return)
+        while len(self) > self.capacity:
+            self._episodes.popleft()
+            self.returns.popleft()
+        self._joined = None
+        return True
+
+    def checkpoint_state(self) -> dict[str, Any]:
+        """The stored episodes and their returns, for a checkpoint."""
+        parts = [{"observations": episode.observations, "actions": episode.actions} for episode in self._episodes]
+        return {"returns": list(self.returns), "episodes": parts}
+
+    def restore_checkpoint_state(self, state: dict[str, Any]) -> None:
+        """:param state: what :meth:`checkpoint_state` returned"""
+        self.returns = deque(state["returns"])
+        self._episodes = deque(
+            Episodes(part["observations"], part["actions"], np.zeros(len(part["actions"]), dtype=np.int64))
+            for part in state["episodes"]
+        )
+        self._joined = None
+
+    @property
+    def episodes(self) -> Episodes:
+        """All stored episodes laid end to end."""
+        if self._joined is None:
+            lengths = [len(episode) for episode in self._episodes]
+            starts = np.repeat(np.cumsum([0, *lengths[:-1]]), lengths)
+            observations = _concatenate([episode.observations for episode in self._episodes])
+            self._joined = Episodes(observations, np.concatenate([e.actions for e in self._episodes]), starts)
+        return self._joined
+
+
+def sample_union(parts: list[Episodes], n: int, history: int = 0) -> ImitationSamples:
+    """``n`` rows drawn uniformly from the union of ``parts`` (global NumPy generator, as SB3's buffers)."""
+    parts = [part for part in parts if len(part)]
+    offsets = np.cumsum([len(part) for part in parts])
+    drawn = np.sort(np.random.randint(0, offsets[-1], size=n))
+    taken, start = [], 0
+    for part, end in zip(parts, offsets, strict=True):
+        taken.append(part.take(drawn[(drawn >= start) & (drawn < end)] - start, history))
+        start = int(end)
+    if len(taken) == 1:
+        return taken[0]
+    columns: list[Any] = [None if column[0] is None else _concatenate(column) for column in zip(*taken, strict=True)]
+    return ImitationSamples(*columns)
+
+
+def _concatenate(arrays: Sequence[Any]) -> Any:
+    if isinstance(arrays[0], dict):
+        return {key: np.concatenate([array[key] for array in arrays]) for key in arrays[0]}
+    return np.concatenate(arrays)

@@ -1,0 +1,214 @@
+"""SB3's replay buffers with a share of demonstrations in every batch, for any SB3 off-policy algorithm."""
+
+from __future__ import annotations
+
+from operator import itemgetter
+from os import PathLike
+from typing import Any, ClassVar
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
+
+from sb3_actpc.actpc.self_imitation import Episodes, map_observations, split_observations
+from sb3_actpc.demonstrations.dataset import Demonstrations, resolve
+from sb3_actpc.utils.checks import check_range
+
+
+def fit_demonstrations(
+    source: str | PathLike[str] | Demonstrations,
+    env: VecEnv | None,
+    observation_space: spaces.Space,
+    action_space: spaces.Space,
+    n_episodes: int | None = None,
+    n_transitions: int | None = None,
+) -> Demonstrations:
+    """
+    The demonstrations as an environment would have shown them: of its task, in its spaces, paid as it pays.
+
+    :param source: a file, or the demonstrations
+    :param env: the environment, whose goal version and rewards count; None where there is none yet
+    :param observation_space: the environment's
+    :param action_space: the environment's
+    :param n_episodes: use only the first so many episodes, None for all
+    :param n_transitions: use only the first so many transitions, None for all
+    :return: demonstrations that fit
+    :raises FileNotFoundError: when there is no such file
+    :raises ValueError: when they are damaged, fewer than asked for, or of another task
+    """
+    demonstrations = resolve(source).select(n_episodes, n_transitions)
+    env_id = None
+    if env is not None:
+        if env.has_attr("goal_demonstrations"):
+            demonstrations = env.env_method("goal_demonstrations", demonstrations, indices=[0])[0]
+        spec = env.get_attr("spec", indices=0)[0] if env.has_attr("spec") else None
+        env_id = None if spec is None else spec.id
+    demonstrations.check(observation_space, action_space, env_id)
+    return demonstrations if env is None else demonstrations.rewarded_by(env)
+
+
+def fill_with_demonstrations(
+    buffer: ReplayBuffer, demonstrations: Demonstrations, observation_space: spaces.Space, action_space: spaces.Box
+) -> None:
+    """
+    Add every demonstrated transition; an episode that did not terminate ends as by a time limit.
+
+    :param buffer: a buffer for one environment, with room for all
+    :param demonstrations: N transitions that fit the spaces
+    :param observation_space: a Box, or a Dict of Boxes
+    :param action_space: whose actions are scaled to [-1, 1]
+    :raises ValueError: for other observation spaces
+    """
+    episodes = Episodes.from_demonstrations(demonstrations, observation_space, action_space)
+    next_observations = split_observations(observation_space, demonstrations.next_observations)
+    ends = np.zeros(len(episodes), dtype=bool)
+    ends[demonstrations.episode_bounds[:, 1] - 1] = True
+    for row in range(len(episodes)):
+        one = itemgetter(slice(row, row + 1))
+        buffer.add(
+            map_observations(one, episodes.observations),
+            map_observations(one, next_observations),
+            one(episodes.actions),
+            one(demonstrations.rewards),
+            one(ends),
+            [{"TimeLimit.truncated": bool(ends[row] and not demonstrations.terminations[row])}],
+        )
+
+
+class _DemonstrationReplay(ReplayBuffer):
+    """
+    What the buffers of this module add to SB3's; combine it with one of them.
+
+    The demonstrations stay in a buffer of their own, of the SB3 class, so that whatever that class does to its transitions
+    (n-step returns, hindsight relabelling, normalisation) is done to them too. They come last in the batch.
+
+    ActPC does not use these classes: its demonstrations carry two internal signals and a working memory (see
+    :class:`sb3_actpc.actpc.demonstration_replay.DemonstrationReplay`). What both share is :func:`fit_demonstrations` and
+    :class:`~sb3_actpc.actpc.self_imitation.Episodes`.
+
+    :param demonstrations: transitions that fit the environment (see :func:`fit_demonstrations`), or None for none
+    :param demonstration_fraction: share of each batch, between 0 and 1
+    :raises ValueError: for a share out of range
+    """
+
+    _own_keywords: ClassVar[tuple[str, ...]] = ()  # of a subclass, not for the demonstrations' buffer
+
+    def __init__(
+        self,
+        *args: Any,
+        demonstrations: Demonstrations | None = None,
+        demonstration_fraction: float = 0.5,
+        **kwargs: Any,
+    ) -> None:
+        check_range({"demonstration_fraction": demonstration_fraction}, "demonstration_fraction", 0, 1)
+        super().__init__(*args, **kwargs)
+        self.demonstration_fraction = demonstration_fraction
+        self.demonstrated: ReplayBuffer | None = None
+        if demonstrations is not None:
+            skipped = {"n_envs", "optimize_memory_usage", *self._own_keywords}
+            kwargs = {key: value for key, value in kwargs.items() if key not in skipped}
+            kind: Any = self._demonstrated_class
+            self.demonstrated = kind(len(demonstrations), *args[1:], n_envs=1, **kwargs)
+            assert isinstance(self.action_space, spaces.Box)
+            fill_with_demonstrations(self.demonstrated, demonstrations, self.observation_space, self.action_space)
+
+    @property
+    def _demonstrated_class(self) -> type[ReplayBuffer]:
+        raise NotImplementedError
+
+    def n_demonstrated(self, batch_size: int) -> int:
+        """
+        :param batch_size: B
+        :return: how many of the B transitions are demonstrated ones; they are the last rows
+        """
+        return 0 if self.demonstrated is None else round(self.demonstration_fraction * batch_size)
+
+    def sample(self, batch_size: int, env: VecNormalize | None = None) -> Any:
+        """
+        :param batch_size: B
+        :param env: VecNormalize whose statistics normalise observations and rewards
+        :return: B transitions: those of the agent, then those of the demonstrations
+        """
+        n_demonstrated = self.n_demonstrated(batch_size)
+        if self.demonstrated is None or not n_demonstrated:
+            return super().sample(batch_size, env)
+        self.demonstrated.device = self.device
+        shown = self.demonstrated.sample(n_demonstrated, env)
+        if n_demonstrated == batch_size:
+            return shown
+        return _joined(super().sample(batch_size - n_demonstrated, env), shown)
+
+
+class DemonstrationReplayBuffer(_DemonstrationReplay):
+    """SB3's replay buffer with demonstrations; see :class:`_DemonstrationReplay`."""
+
+    _demonstrated_class = ReplayBuffer
+
+
+class DemonstrationNStepReplayBuffer(_DemonstrationReplay, NStepReplayBuffer):
+    """SB3's n-step replay buffer with demonstrations, whose returns are n-step too."""
+
+    _demonstrated_class = NStepReplayBuffer
+
+
+class DemonstrationDictReplayBuffer(_DemonstrationReplay, DictReplayBuffer):
+    """SB3's replay buffer for Dict observations with demonstrations."""
+
+    _demonstrated_class = DictReplayBuffer
+
+
+class DemonstrationHerReplayBuffer(_DemonstrationReplay, HerReplayBuffer):
+    """SB3's hindsight replay buffer with demonstrations, which are relabelled as the agent's own transitions are."""
+
+    _demonstrated_class = HerReplayBuffer
+
+    def set_env(self, env: VecEnv) -> None:
+        """:param env: the environment whose ``compute_reward`` relabels"""
+        super().set_env(env)
+        if isinstance(self.demonstrated, HerReplayBuffer) and self.demonstrated.env is None:
+            self.demonstrated.set_env(env)
+
+
+def demonstration_buffer_class(
+    given: type[ReplayBuffer] | str | None, observation_space: spaces.Space, n_steps: int = 1
+) -> type[_DemonstrationReplay]:
+    """
+    :param given: a class of SB3's or of this module, its name, or None
+    :param observation_space: Dict or not
+    :param n_steps: length of n-step returns
+    :return: the class of this module that does what ``given`` does
+    :raises ValueError: for another class, or n-step returns with Dict observations
+    """
+    is_dict = isinstance(observation_space, spaces.Dict)
+    if n_steps > 1 and (is_dict or given is not None):
+        raise ValueError(f"n_steps={n_steps} works with vector observations and replay_buffer_class=None alone; use n_steps=1")
+    if given is None:
+        if is_dict:
+            return DemonstrationDictReplayBuffer
+        return DemonstrationNStepReplayBuffer if n_steps > 1 else DemonstrationReplayBuffer
+    if isinstance(given, type) and issubclass(given, _DemonstrationReplay):
+        return given
+    same = {
+        "ReplayBuffer": DemonstrationReplayBuffer,
+        "DictReplayBuffer": DemonstrationDictReplayBuffer,
+        "HerReplayBuffer": DemonstrationHerReplayBuffer,
+    }
+    name = given if isinstance(given, str) else given.__name__
+    if name not in same:
+        raise ValueError(f"replay_buffer_class={name!r} cannot hold demonstrations: choose None or one of {sorted(same)}")
+    return same[name]
+
+
+def _joined(own: Any, shown: Any) -> Any:
+    """Two batches of one kind as one, field by field; fields that SB3 leaves at None stay None."""
+    columns: dict[str, Any] = {}
+    for name, mine in own._asdict().items():
+        theirs = getattr(shown, name)
+        if isinstance(mine, dict):
+            columns[name] = {key: th.cat([part, theirs[key]]) for key, part in mine.items()}
+        else:
+            columns[name] = None if mine is None else th.cat([mine, theirs])
+    return own._replace(**columns)

@@ -1,0 +1,1 @@
+"""Offline methods of other packages, trained in virtual environments of their own."""

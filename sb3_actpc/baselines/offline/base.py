@@ -1,0 +1,156 @@
+"""What the offline baselines share: they learn from demonstrations alone, by steps that do nothing in the environment."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+
+from sb3_actpc.baselines.demonstration_buffers import fit_demonstrations
+from sb3_actpc.demonstrations.dataset import Demonstrations
+from sb3_actpc.utils.checks import check_kinds, check_range
+
+SelfOffline = TypeVar("SelfOffline", bound="OfflineAlgorithm")
+
+
+class OfflineAlgorithm(BaseAlgorithm):
+    """
+    An algorithm that learns from demonstrations alone.
+
+    A step of ``learn`` is one gradient step on a batch of demonstrations: nothing is done in the environment, which gives the
+    spaces and the demonstrations' task. Callbacks are called after each, so that evaluations at intervals work as for any
+    other algorithm. Nothing is kept to resume from: a training is short enough to be run again.
+
+    :param policy: "MlpPolicy"
+    :param env: a task with Box observations and actions; for its spaces and for evaluations
+    :param demonstrations: a path, or a :class:`~sb3_actpc.demonstrations.dataset.Demonstrations`
+    :param n_demonstrations: use only the first so many episodes of them
+    :param n_demonstration_transitions: use only the first so many transitions
+    :param learning_rate: of the optimiser, or a schedule
+    :param batch_size: B
+    :param policy_kwargs: keywords of the policy
+    :param stats_window_size: as SB3's
+    :param tensorboard_log: as SB3's
+    :param verbose: as SB3's
+    :param seed: as SB3's
+    :param device: as SB3's
+    :raises ValueError: for a keyword with a value that is not allowed, without demonstrations, for demonstrations that do not
+        fit the environment, for other spaces, and for an environment that normalises observations
+    """
+
+    def __init__(
+        self,
+        policy: str | type[BasePolicy],
+        env: GymEnv | str | None,
+        *,
+        demonstrations: Demonstrations | str | Path | None = None,
+        n_demonstrations: int | None = None,
+        n_demonstration_transitions: int | None = None,
+        learning_rate: float | Schedule = 1e-3,
+        batch_size: int = 256,
+        policy_kwargs: dict[str, Any] | None = None,
+        stats_window_size: int = 100,
+        tensorboard_log: str | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: th.device | str = "auto",
+        _init_setup_model: bool = True,
+    ) -> None:
+        check_kinds(locals(), whole="batch_size")
+        check_range(locals(), "batch_size", 1)
+        super().__init__(
+            policy,
+            env,
+            learning_rate,
+            policy_kwargs=policy_kwargs,
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            verbose=verbose,
+            device=device,
+            seed=seed,
+            support_multi_env=True,
+            supported_action_spaces=(spaces.Box,),
+        )
+        # a path is kept absolute, so that the saved agent finds its demonstrations from any folder
+        self.demonstrations = Path(demonstrations).absolute() if isinstance(demonstrations, (str, Path)) else demonstrations
+        self.n_demonstrations, self.n_demonstration_transitions = n_demonstrations, n_demonstration_transitions
+        self.batch_size = batch_size
+        if _init_setup_model:
+            self._setup_model()
+
+    @abstractmethod
+    def train(self) -> None:
+        """One gradient step; counts it in ``_n_updates``."""
+
+    @abstractmethod
+    def _take(self, shown: Demonstrations) -> None:
+        """
+        :param shown: demonstrations that fit the environment, to learn from
+        """
+
+    def _load_demonstrations(self) -> None:
+        if self.demonstrations is None:
+            raise ValueError(f"demonstrations=None: {type(self).__name__} learns from nothing else, pass a file")
+        if self.get_vec_normalize_env() is not None:
+            raise ValueError(f"{type(self).__name__} normalises observations itself: leave VecNormalize out")
+        limits = self.n_demonstrations, self.n_demonstration_transitions
+        self._take(fit_demonstrations(self.demonstrations, self.env, self.observation_space, self.action_space, *limits))
+        self._is_shown = True
+
+    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
+        """
+        :param env: as SB3's; an agent that was loaded without one gets its demonstrations now
+        :param force_reset: as SB3's
+        """
+        super().set_env(env, force_reset)
+        self._load_demonstrations()
+
+    def learn(
+        self: SelfOffline,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 1000,
+        tb_log_name: str | None = None,
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> SelfOffline:
+        """
+        :param total_timesteps: gradient steps
+        :param callback: called after each of them
+        :param log_interval: gradient steps between two lines of the log
+        :param tb_log_name: as SB3's, by default the name of the class
+        :param reset_num_timesteps: as SB3's
+        :param progress_bar: as SB3's
+        :return: the agent
+        """
+        if not getattr(self, "_is_shown", False):
+            raise ValueError(f"{type(self).__name__} was loaded without an environment: set_env() first")
+        name = tb_log_name or type(self).__name__
+        total, callback = self._setup_learn(total_timesteps, callback, reset_num_timesteps, name, progress_bar)
+        callback.on_training_start(locals(), globals())
+        while self.num_timesteps < total:
+            self._update_current_progress_remaining(self.num_timesteps, total)
+            self.train()
+            self.num_timesteps += 1
+            if self._n_updates % log_interval == 0:
+                self.logger.dump(self.num_timesteps)
+            if not self._step_callback(callback):
+                break
+        callback.on_training_end()
+        return self
+
+    def _step_callback(self, callback: BaseCallback) -> bool:
+        # what callbacks look for after a step of the environment: there was none
+        callback.update_locals({"actions": np.empty(0, dtype=np.float32), "infos": [], "dones": np.empty(0, dtype=bool)})
+        return callback.on_step()
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_is_shown"]

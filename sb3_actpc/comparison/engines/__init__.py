@@ -1,5 +1,0 @@
-"""Where runs are executed: processes of this machine, or a Ray cluster."""
-
-from sb3_actpc.comparison.engines.base import ENGINES, Engine, Event, make_engine
-
-__all__ = ["ENGINES", "Engine", "Event", "make_engine"]

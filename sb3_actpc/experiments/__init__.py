@@ -1,0 +1,1 @@
+"""Whole training runs, comparisons of many, and reports about them."""

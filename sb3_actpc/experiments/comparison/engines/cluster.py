@@ -1,0 +1,226 @@
+"""Runs as tasks of a Ray cluster (extra ``ray``); their folders end up on this machine, shared or not."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import os
+import socket
+import tempfile
+import threading
+import uuid
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from sb3_actpc.experiments.comparison.engines.base import Event
+from sb3_actpc.experiments.comparison.execution import LOG, LOST, STOPPED, Outcome, execute_run
+from sb3_actpc.experiments.comparison.lock import LOCK
+from sb3_actpc.experiments.comparison.run_table import PlannedRun
+
+CONNECTION_TIME = 10.0  # seconds
+_PROBE = ".shared-"  # a file by which a node sees whether it shares the folders
+
+
+class RayEngine:
+    """
+    A Ray task for each run. A run whose node dies ends as lost, and is begun again, or gone on with, elsewhere.
+
+    A node that sees this machine's folders (a network file system, or the same machine) works in them, checkpoints and all.
+    To another the run's folder is sent, and what it made of it comes back when the run has ended.
+
+    :param n_workers: runs at a time; by default as many as the cluster has cores for
+    :param threads: of each run, the cores that it reserves
+    :param address: of a cluster, such as ``"auto"`` or ``"10.0.0.1:6379"``; by default one is started on this machine, or the
+        one that this process has joined already is used
+    :raises ImportError: when Ray is not installed
+    :raises ConnectionError: when there is no cluster at the address
+    """
+
+    def __init__(self, n_workers: int | None = None, threads: int = 1, address: str | None = None) -> None:
+        self.ray = _import_ray()
+        self.n_workers, self.threads = n_workers, threads
+        self._is_mine = not self.ray.is_initialized()
+        if self._is_mine:
+            _check_address(address)
+            options = {"include_dashboard": False} if address is None else {}
+            self.ray.init(address=address, log_to_driver=False, **options)
+        self._task = self.ray.remote(num_cpus=threads, max_retries=0)(_execute)
+        self._board = self._start_board()
+        self._tasks: dict[Any, PlannedRun] = {}  # by Ray's reference to the answer
+        self._steps: dict[str, int] = {}
+        self._is_stopping = False
+
+    def capacity(self) -> int:
+        """As many as the nodes that live now have cores for."""
+        fitting = int(self.ray.cluster_resources().get("CPU", 0)) // self.threads
+        return max(1, fitting if self.n_workers is None else min(fitting, self.n_workers))
+
+    def start(self, run: PlannedRun) -> None:
+        """:param run: one that is not under way
+        :raises OSError: when its folder cannot be written"""
+        run.folder.mkdir(parents=True, exist_ok=True)
+        folder = run.folder.absolute()
+        run = dataclasses.replace(run, config=dataclasses.replace(run.config, output=str(folder)))
+        probe = folder / f"{_PROBE}{uuid.uuid4().hex}"
+        probe.touch()
+        packed = self.ray.put(pack_folder(folder))
+        self._tasks[self._task.remote(run.to_json(), str(probe), packed, self._board)] = run
+
+    def poll(self, timeout: float) -> list[Event]:
+        """:param timeout: seconds
+        :return: news"""
+        if not self._tasks:
+            threading.Event().wait(timeout)
+            return []
+        ended, _ = self.ray.wait(list(self._tasks), num_returns=1, timeout=timeout)
+        return [*self._progress(), *(self._end(reference) for reference in ended)]
+
+    def stop(self) -> None:
+        """Interrupt the tasks, upon which they save and end."""
+        self._is_stopping = True
+        for reference in self._tasks:
+            self.ray.cancel(reference)
+
+    def close(self) -> None:
+        """Leave the cluster, and end it if this engine started it."""
+        for reference in self._tasks:
+            self.ray.cancel(reference, force=True)
+        if self._is_mine:
+            self.ray.shutdown()
+
+    def _start_board(self) -> Any:
+        """The actor to which runs tell their steps; on this node, so that no other's death takes it along."""
+        from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
+
+        here = NodeAffinitySchedulingStrategy(self.ray.get_runtime_context().get_node_id(), soft=True)
+        return self.ray.remote(num_cpus=0, scheduling_strategy=here)(StepBoard).remote()
+
+    def _progress(self) -> list[Event]:
+        try:
+            steps = self.ray.get(self._board.read.remote(), timeout=5.0)
+        except self.ray.exceptions.RayError:  # the steps are for display only
+            return []
+        news = [Event(run_id, steps=count) for run_id, count in steps.items() if self._steps.get(run_id) != count]
+        self._steps = steps
+        return news
+
+    def _end(self, reference: Any) -> Event:
+        run = self._tasks.pop(reference)
+        for probe in run.folder.glob(f"{_PROBE}*"):
+            probe.unlink(missing_ok=True)
+        try:
+            status, message, packed = self.ray.get(reference)
+        except self.ray.exceptions.RayError as error:  # the node, or the process on it, died
+            first_line = (str(error).strip() or type(error).__name__).splitlines()[0]
+            return Event(run.id, outcome=Outcome(STOPPED if self._is_stopping else LOST, first_line))
+        if packed is not None:
+            unpack_folder(packed, run.folder)
+        return Event(run.id, outcome=Outcome(status, message))
+
+
+class StepBoard:
+    """The steps that each run has done."""
+
+    def __init__(self) -> None:
+        self.steps: dict[str, int] = {}
+
+    def write(self, run_id: str, steps: int) -> None:
+        """:param run_id: which
+        :param steps: so far"""
+        self.steps[run_id] = steps
+
+    def read(self) -> dict[str, int]:
+        """:return: by the run's id"""
+        return self.steps
+
+
+def _execute(job: str, probe: str, packed: bytes, board: Any) -> tuple[str, str, bytes | None]:
+    """On a node: bring a run to its end, in its folder or in a copy of it.
+
+    :param job: the run as JSON
+    :param probe: a file that is there where the node shares the folders
+    :param packed: the run's folder as it is now
+    :param board: is told the steps; None for nobody
+    :return: status and message of the outcome, and the folder where it has to be sent back
+    """
+    run = PlannedRun.from_json(job)
+
+    def on_steps(steps: int) -> None:
+        if board is not None:
+            board.write.remote(run.id, steps)
+
+    if Path(probe).is_file():
+        outcome = _execute_with_log(run, on_steps)
+        return outcome.status, outcome.message, None
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary)
+        unpack_folder(packed, folder)
+        local = dataclasses.replace(run, config=dataclasses.replace(run.config, output=str(folder)))
+        outcome = _execute_with_log(local, on_steps)
+        return outcome.status, outcome.message, pack_folder(folder)
+
+
+def _execute_with_log(run: PlannedRun, on_steps: Callable[[int], None]) -> Outcome:
+    """With what it reports in the run's folder, as the local engine has it."""
+    with open(run.folder / LOG, "a", encoding="utf-8") as log:
+        return execute_run(run, lambda line: print(line, file=log, flush=True), on_steps)
+
+
+def pack_folder(folder: Path) -> bytes:
+    """
+    :param folder: any
+    :return: its files as a ZIP archive, locks and probes left out
+    :raises OSError: when a file cannot be read
+    """
+    archive = io.BytesIO()
+    with zipfile.ZipFile(archive, "w", zipfile.ZIP_STORED) as target:
+        for path in sorted(folder.rglob("*")):
+            if path.is_file() and path.name != LOCK and not path.name.startswith(_PROBE):
+                target.write(path, path.relative_to(folder))
+    return archive.getvalue()
+
+
+def unpack_folder(archive: bytes, folder: Path) -> None:
+    """Make a folder what another was; files that the archive does not hold are removed, ``result.json`` comes last.
+
+    :param archive: what :func:`pack_folder` returned
+    :param folder: made when it does not exist
+    :raises OSError: when it cannot be written
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    with zipfile.ZipFile(io.BytesIO(archive)) as source:
+        names = source.namelist()
+        for name in sorted(names, key=lambda name: name == "result.json"):
+            source.extract(name, folder)  # which keeps within the folder
+    kept = {(folder / name).resolve() for name in names}
+    for path in folder.rglob("*"):
+        if path.is_file() and path.resolve() not in kept and path.name != LOCK:
+            path.unlink()
+
+
+def _check_address(address: str | None) -> None:
+    """Ray itself would try for minutes.
+
+    :raises ConnectionError: when nobody answers at ``host:port``
+    """
+    host, separator, port = (address or "").rpartition(":")
+    if not separator or "/" in host or not port.isdigit():  # "auto", or a URL of Ray's
+        return
+    try:
+        socket.create_connection((host, int(port)), timeout=CONNECTION_TIME).close()
+    except OSError as error:
+        raise ConnectionError(
+            f"no Ray cluster answers at address={address!r} ({error.strerror or error}): give that of `ray start --head`, or "
+            "leave it out to start one on this machine"
+        ) from error
+
+
+def _import_ray() -> Any:
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # nothing is reported to anybody unless the user asks for it
+    try:
+        import ray
+    except ImportError as error:
+        raise ImportError("the engine 'ray' needs Ray: pip install 'sb3-actpc[ray]', or leave --engine out") from error
+    return ray

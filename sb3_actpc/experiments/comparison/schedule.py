@@ -1,0 +1,186 @@
+"""From the table to finished runs: which are begun, gone on with, tried again or left alone."""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Protocol
+
+from sb3_actpc.checkpoints import StopSignals
+from sb3_actpc.experiments.comparison.engines import Engine, Event
+from sb3_actpc.experiments.comparison.execution import (
+    DISK_FULL,
+    ERROR,
+    FAILED,
+    FINISHED,
+    LOST,
+    STOPPED,
+    Outcome,
+    is_disk_full,
+    read_error,
+    repair_result,
+    run_status,
+    write_error,
+)
+from sb3_actpc.experiments.comparison.lock import folder_lock
+from sb3_actpc.experiments.comparison.run_table import PlannedRun
+
+MAX_LOSSES = 3  # times that the process of one run may die before the run counts as failed
+LOCK_WAIT = 5.0  # seconds for another command in the same folder to end
+POLL = 0.5  # seconds
+
+
+class Display(Protocol):
+    """Shows how a comparison goes on."""
+
+    def begin(self, runs: Sequence[PlannedRun], n_finished: int) -> None:
+        """:param runs: those still to do
+        :param n_finished: those done before"""
+
+    def started(self, run: PlannedRun) -> None:
+        """:param run: now under way"""
+
+    def stepped(self, run: PlannedRun, steps: int) -> None:
+        """:param run: under way
+        :param steps: done so far"""
+
+    def ended(self, run: PlannedRun, outcome: Outcome) -> None:
+        """:param run: no longer under way
+        :param outcome: what came of it"""
+
+    def line(self, text: str) -> None:
+        """:param text: one line"""
+
+
+@dataclass
+class Summary:
+    """What a command has come to.
+
+    :param finished: runs that are done, the ones done before among them
+    :param failed: runs that failed, now or before, with their errors
+    :param unfinished: runs that were not begun or not brought to their end
+    :param stopped_by: name of the signal that ended the command, or ``"disk full"``; None when it came to its end
+    :param message: of the full disk
+    """
+
+    finished: list[PlannedRun] = field(default_factory=list)
+    failed: list[tuple[PlannedRun, str]] = field(default_factory=list)
+    unfinished: list[PlannedRun] = field(default_factory=list)
+    stopped_by: str | None = None
+    message: str = ""
+
+
+def run_comparison(
+    runs: Sequence[PlannedRun],
+    folder: Path,
+    make_engine: Callable[[], Engine],
+    display: Display,
+    retry_failed: bool = False,
+) -> Summary:
+    """Bring every run of a table to its end that is not there yet.
+
+    Stopped at any moment and called again, it loses no finished run, repeats none, and goes on with the others from their last
+    checkpoint.
+
+    :param runs: the table
+    :param folder: of the comparison; one process at a time works in it
+    :param make_engine: makes what executes the runs; not called when there is nothing to do
+    :param display: shows how it goes on
+    :param retry_failed: also try those again that failed before
+    :return: what became of the runs
+    :raises FolderBusy: when another process works in the folder
+    :raises OSError: when the folder cannot be written
+    """
+    with folder_lock(folder, LOCK_WAIT, display.line):
+        for run in runs:
+            repair_result(run.folder, display.line)
+        to_do = [run for run in runs if is_to_do(run_status(run.folder), retry_failed)]
+        display.begin(to_do, sum(run_status(run.folder) == FINISHED for run in runs))
+        summary = Summary()
+        if to_do:
+            _Scheduler(make_engine(), display, to_do, summary).run()
+        for run in runs:
+            status = run_status(run.folder)
+            if status == FINISHED:
+                summary.finished.append(run)
+            elif status == FAILED:
+                summary.failed.append((run, read_error(run.folder)))
+            else:
+                summary.unfinished.append(run)
+        return summary
+
+
+def is_to_do(status: str, retry_failed: bool) -> bool:
+    """
+    :param status: of a run
+    :param retry_failed: whether failed ones are tried again
+    :return: whether the command will execute it
+    """
+    return status != FINISHED and (retry_failed or status != FAILED)
+
+
+class _Scheduler:
+    """Keeps an engine busy."""
+
+    def __init__(self, engine: Engine, display: Display, runs: Sequence[PlannedRun], summary: Summary) -> None:
+        self.engine, self.display, self.summary = engine, display, summary
+        self.waiting = deque(runs)
+        self.under_way: dict[str, PlannedRun] = {}
+        self.losses: Counter[str] = Counter()
+
+    def run(self) -> None:
+        """Until all have ended, or a signal or a full disk says stop."""
+        try:
+            with StopSignals() as signals:
+                while self.under_way or (self.waiting and self.summary.stopped_by is None):
+                    if signals.received and self.summary.stopped_by is None:
+                        self.display.line(f"{signals.received}: the runs under way save their state and end")
+                        self._stop(signals.received)
+                    self._start_some()
+                    for event in self.engine.poll(POLL):
+                        self._take(event)
+        finally:
+            self.engine.close()
+
+    def _start_some(self) -> None:
+        while self.summary.stopped_by is None and self.waiting and len(self.under_way) < self.engine.capacity():
+            run = self.waiting.popleft()
+            (run.folder / ERROR).unlink(missing_ok=True)
+            try:
+                self.engine.start(run)
+            except OSError as error:
+                if not is_disk_full(error):
+                    raise
+                self._stop(DISK_FULL, str(error))
+                return
+            self.under_way[run.id] = run
+            self.display.started(run)
+
+    def _take(self, event: Event) -> None:
+        run = self.under_way.get(event.run_id)
+        if run is None:
+            return
+        if event.outcome is None:
+            self.display.stepped(run, event.steps or 0)
+            return
+        del self.under_way[run.id]
+        self.display.ended(run, event.outcome)
+        if event.outcome.status == DISK_FULL:
+            self._stop(DISK_FULL, event.outcome.message)
+        elif event.outcome.status in (LOST, STOPPED) and self.summary.stopped_by is None:
+            self._try_again(run, event.outcome)
+
+    def _try_again(self, run: PlannedRun, outcome: Outcome) -> None:
+        """Somebody ended the run's process, not the run."""
+        self.losses[run.id] += 1
+        if self.losses[run.id] < MAX_LOSSES:
+            self.waiting.appendleft(run)
+        else:
+            write_error(run.folder, f"given up after {MAX_LOSSES} times: {outcome.message}")
+
+    def _stop(self, reason: str, message: str = "") -> None:
+        if self.summary.stopped_by is None:
+            self.summary.stopped_by, self.summary.message = reason, message
+            self.engine.stop()

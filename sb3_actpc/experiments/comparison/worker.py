@@ -1,0 +1,48 @@
+"""A process that brings one run to its end: ``python -m sb3_actpc.experiments.comparison.worker``, started by the local engine.
+
+It reads the run as a line of JSON from its standard input and answers with lines of JSON on its standard output. When its
+standard input closes (the command wants it to stop, or was killed) it saves a checkpoint and ends.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sys
+import threading
+from typing import Any
+
+
+def main() -> int:
+    """Run it.
+
+    :return: exit code, 0: what came of the run has been said
+    """
+    channel = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    os.dup2(2, 1)  # whatever libraries print goes to the log
+    text = sys.stdin.readline()
+    threading.Thread(target=_stop_when_input_closes, daemon=True).start()
+
+    from sb3_actpc.experiments.comparison.execution import execute_run
+    from sb3_actpc.experiments.comparison.run_table import PlannedRun
+
+    def send(**message: Any) -> None:
+        try:
+            print(json.dumps(message), file=channel, flush=True)
+        except BrokenPipeError:  # the command was killed: nobody listens
+            pass
+
+    outcome = execute_run(PlannedRun.from_json(text), lambda line: print(line, flush=True), lambda steps: send(steps=steps))
+    send(status=outcome.status, message=outcome.message)
+    return 0
+
+
+def _stop_when_input_closes() -> None:
+    while os.read(0, 1024):
+        pass
+    os.kill(os.getpid(), signal.SIGTERM)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

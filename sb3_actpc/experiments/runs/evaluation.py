@@ -1,0 +1,314 @@
+"""Playing whole episodes with a trained policy, and doing so every so often while it is trained."""
+
+from __future__ import annotations
+
+import csv
+import time
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from io import BufferedIOBase
+from pathlib import Path
+from typing import Any, Protocol, cast
+
+import gymnasium as gym
+import numpy as np
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
+
+from sb3_actpc.baselines.offline.base import OfflineAlgorithm
+from sb3_actpc.utils.files import atomic_write
+
+UNTRAINED_EPISODES = 5
+PROGRESS = "progress.csv"
+PROGRESS_COLUMNS = (
+    "timesteps",
+    "updates",
+    "seconds",
+    "evaluation_seconds",
+    "dense_return",
+    "dense_return_std",
+    "sparse_return",
+    "sparse_return_std",
+    "success_rate",
+    "episode_length",
+)
+
+
+class Predictor(Protocol):
+    """Anything that acts like an SB3 algorithm or policy."""
+
+    def predict(
+        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = False
+    ) -> tuple[Any, Any]:
+        """Actions, (n, action_dim), and the next recurrent state, for n observations."""
+
+
+class NormalizedPredictor:
+    """A policy that learned from the observations of SB3's ``VecNormalize``, for those of the bare environment.
+
+    :param model: the policy
+    :param normalize: normalises n observations, (n, obs_dim)
+    """
+
+    FILE = "normalization.npz"  # in a run's folder
+
+    def __init__(self, model: Predictor, normalize: Callable[[np.ndarray], np.ndarray]) -> None:
+        self.model, self.normalize = model, normalize
+
+    def predict(
+        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = False
+    ) -> tuple[Any, Any]:
+        """See :class:`Predictor`."""
+        return self.model.predict(self.normalize(observation), state, episode_start, deterministic)
+
+    @classmethod
+    def wrap(cls, model: BaseAlgorithm) -> Predictor:
+        """The agent itself, or with the present statistics of its environment where that normalises observations."""
+        wrapper = model.get_vec_normalize_env()
+        return model if wrapper is None or not wrapper.norm_obs else cls(model, wrapper.normalize_obs)  # type: ignore[arg-type]
+
+    @classmethod
+    def save(cls, model: BaseAlgorithm, folder: Path) -> None:
+        """Write the statistics, where there are any, into the run's folder."""
+        wrapper = model.get_vec_normalize_env()
+        if wrapper is None or not wrapper.norm_obs:
+            return
+        statistics: Any = wrapper.obs_rms
+        spread = np.sqrt(statistics.var + wrapper.epsilon)
+        with atomic_write(folder / cls.FILE) as file:
+            np.savez(file, mean=statistics.mean, spread=spread, limit=np.array(wrapper.clip_obs))
+
+    @classmethod
+    def wrap_saved(cls, model: Predictor, folder: Path) -> Predictor:
+        """The agent itself, or with the statistics that :meth:`save` wrote into the run's folder.
+
+        :raises ValueError: when the file is damaged
+        """
+        if not (folder / cls.FILE).is_file():
+            return model
+        with np.load(folder / cls.FILE, allow_pickle=False) as stored:
+            mean, spread, limit = stored["mean"], stored["spread"], float(stored["limit"])
+        return cls(model, lambda rows: np.clip((rows - mean) / spread, -limit, limit).astype(np.float32))
+
+
+@dataclass(frozen=True)
+class EpisodeStatistics:
+    """What happened in n episodes; each array is (n,) float64.
+
+    :param dense_returns: sums of ``info["dense_reward"]`` (of the reward, where the environment does not report it)
+    :param sparse_returns: sums of the reward
+    :param successes: 1 where ``info["is_success"]`` was true at the end, NaN where the environment does not report it
+    :param lengths: steps
+    :param stages: ``info["stage"]`` at the end of each, "" where the environment does not report it
+    """
+
+    dense_returns: np.ndarray
+    sparse_returns: np.ndarray
+    successes: np.ndarray
+    lengths: np.ndarray
+    stages: tuple[str, ...]
+
+    def summary(self) -> dict[str, float | None]:
+        """Means and standard deviations over the episodes; ``success_rate`` is None where it is not reported."""
+        success_rate = float(self.successes.mean())
+        return {
+            "dense_return": float(self.dense_returns.mean()),
+            "dense_return_std": float(self.dense_returns.std()),
+            "sparse_return": float(self.sparse_returns.mean()),
+            "sparse_return_std": float(self.sparse_returns.std()),
+            "success_rate": None if np.isnan(success_rate) else success_rate,
+            "episode_length": float(self.lengths.mean()),
+        }
+
+    def failed_after(self) -> dict[str, int]:
+        """Farthest stage of the episodes without success -> how many; empty where stages are not reported."""
+        stages = (stage for stage, success in zip(self.stages, self.successes, strict=True) if not success)
+        return dict(Counter(filter(None, stages)))
+
+
+def play_episodes(model: Predictor, envs: Sequence[gym.Env[Any, Any]], n_episodes: int, seed: int) -> EpisodeStatistics:
+    """Play whole episodes with the deterministic policy, carrying its recurrent state.
+
+    Episode i starts from ``reset(seed=seed + i)``, so that two calls with one seed start from the same states. The
+    environments are stepped side by side, each playing at most one episode at a time, so that the policy is asked once
+    for all of them and short episodes are not counted more often than long ones.
+
+    :param model: the policy
+    :param envs: at least one environment; as many episodes are played at a time
+    :param n_episodes: how many episodes
+    :param seed: seed of the first episode
+    :return: returns, successes and lengths, in the order of the seeds
+    :raises ValueError: when ``n_episodes`` is less than 1 or there is no environment
+    """
+    if n_episodes < 1 or not envs:
+        raise ValueError(f"expected at least one episode and one environment, found {n_episodes} and {len(envs)}")
+    rows: list[list[float]] = []
+    stages: list[str] = []
+    for first in range(0, n_episodes, len(envs)):
+        n_playing = min(len(envs), n_episodes - first)
+        more_rows, more_stages = _play_side_by_side(model, envs[:n_playing], seed + first)
+        rows += more_rows
+        stages += more_stages
+    dense_returns, sparse_returns, successes, lengths = np.array(rows, dtype=np.float64).T
+    return EpisodeStatistics(dense_returns, sparse_returns, successes, lengths, tuple(stages))
+
+
+def _play_side_by_side(model: Predictor, envs: Sequence[gym.Env[Any, Any]], seed: int) -> tuple[list[list[float]], list[str]]:
+    """One episode in each environment: [dense return, sparse return, success, length] and the last stage of each."""
+    observations = [env.reset(seed=seed + i)[0] for i, env in enumerate(envs)]
+    rows = [[0.0, 0.0, float("nan"), 0.0] for _ in envs]
+    stages = ["" for _ in envs]
+    playing = np.ones(len(envs), dtype=bool)
+    episode_start = np.ones(len(envs), dtype=bool)
+    state = None
+    while playing.any():
+        actions, state = model.predict(_stack(observations), state=state, episode_start=episode_start, deterministic=True)
+        episode_start = np.zeros(len(envs), dtype=bool)
+        for i in np.flatnonzero(playing):
+            observations[i], reward, terminated, truncated, info = envs[i].step(actions[i])
+            rows[i][0] += float(info.get("dense_reward", reward))
+            rows[i][1] += float(reward)
+            rows[i][2] = float(info.get("is_success", np.nan))
+            rows[i][3] += 1
+            stages[i] = info.get("stage", "")
+            playing[i] = not (terminated or truncated)
+    return rows, stages
+
+
+def _stack(observations: list[Any]) -> Any:
+    """n observations as one batch: (n, ...), or a dictionary of such."""
+    if isinstance(observations[0], dict):
+        return {key: np.stack([observation[key] for observation in observations]) for key in observations[0]}
+    return np.stack(observations)
+
+
+class EvaluationCallback(BaseCallback):
+    """Evaluates the untrained agent (:meth:`begin`; offline methods excepted), then every ``eval_freq`` steps, and at the end.
+
+    Each evaluation starts its episodes from the same seeds, appends a row to ``progress.csv`` and saves
+    ``model.zip`` (written under another name and renamed, so that a stopped run leaves a whole one). ``seconds`` are those
+    since :meth:`begin`, the evaluations' own (``evaluation_seconds``) among them; ``updates`` are the agent's.
+
+    :param envs: environments that only this callback uses, closed by whoever made them
+    :param folder: run folder
+    :param eval_freq: environment steps between two evaluations
+    :param eval_episodes: episodes in each evaluation
+    :param seed: seed of the first episode of each evaluation
+    :param report: given one line of text after each evaluation
+    """
+
+    def __init__(
+        self,
+        envs: Sequence[gym.Env[Any, Any]],
+        folder: Path,
+        eval_freq: int,
+        eval_episodes: int,
+        seed: int,
+        report: Callable[[str], None],
+    ) -> None:
+        super().__init__()
+        self.envs = envs
+        self.folder = folder
+        self.eval_freq = eval_freq
+        self.eval_episodes = eval_episodes
+        self.seed = seed
+        self.report = report
+        self.evaluation_seconds = 0.0
+        self.last_summary: dict[str, float | None] = {}
+        self._last_timesteps = -1
+        self._started = time.perf_counter()
+
+    def begin(self, model: BaseAlgorithm) -> None:
+        """Evaluate before ``learn``, which may begin with demonstrations and not with steps.
+
+        An untrained agent fails for as long as an episode may last, which in robosuite's tasks takes minutes: it plays
+        ``UNTRAINED_EPISODES`` at most, and an offline method's, which has seen nothing, none.
+
+        :param model: the agent
+        """
+        self.model = model
+        self._started = time.perf_counter()
+        with atomic_write(self.folder / PROGRESS, "w") as file:
+            csv.writer(file, lineterminator="\n").writerow(PROGRESS_COLUMNS)
+        if isinstance(model, OfflineAlgorithm):
+            self._last_timesteps = 0
+        else:
+            self._evaluate(min(self.eval_episodes, UNTRAINED_EPISODES))
+
+    @property
+    def wall_seconds(self) -> float:
+        """Seconds since :meth:`begin`, the time while the run was stopped left out."""
+        return time.perf_counter() - self._started
+
+    def checkpoint_state(self) -> dict[str, Any]:
+        """What a checkpoint keeps: timers, the last evaluation and the rows written so far."""
+        return {
+            "wall_seconds": self.wall_seconds,
+            "evaluation_seconds": self.evaluation_seconds,
+            "last_summary": self.last_summary,
+            "last_timesteps": self._last_timesteps,
+            "rows": (self.folder / PROGRESS).read_text(encoding="utf-8"),
+        }
+
+    def restore_checkpoint_state(self, state: dict[str, Any]) -> None:
+        """Go on where the checkpoint was taken; rows written after it are dropped, they will be written again.
+
+        :param state: what :meth:`checkpoint_state` returned
+        """
+        self._started = time.perf_counter() - state["wall_seconds"]
+        self.evaluation_seconds = state["evaluation_seconds"]
+        self.last_summary = state["last_summary"]
+        self._last_timesteps = state["last_timesteps"]
+        with atomic_write(self.folder / PROGRESS, "w") as file:
+            file.write(state["rows"])
+
+    def _on_step(self) -> bool:
+        # at the last step, the update that belongs to it is still to come
+        is_last = self.num_timesteps >= self.model._total_timesteps
+        if not is_last and self.num_timesteps - self._last_timesteps >= self.eval_freq:
+            self._evaluate()
+        return True
+
+    def _on_training_end(self) -> None:
+        if self._last_timesteps != self.num_timesteps:
+            self._evaluate()
+
+    def _evaluate(self, n_episodes: int | None = None) -> None:
+        started = time.perf_counter()
+        n_episodes = self.eval_episodes if n_episodes is None else n_episodes
+        statistics = play_episodes(NormalizedPredictor.wrap(self.model), self.envs, n_episodes, self.seed)
+        NormalizedPredictor.save(self.model, self.folder)
+        with atomic_write(self.folder / "model.zip") as file:
+            self.model.save(cast(BufferedIOBase, file))
+        now = time.perf_counter()
+        self.evaluation_seconds += now - started
+        self._last_timesteps = self.num_timesteps
+        self.last_summary = statistics.summary()
+        self._append_row(
+            {
+                **self.last_summary,
+                "timesteps": self.num_timesteps,
+                "updates": getattr(self.model, "_n_updates", 0),
+                "seconds": round(self.wall_seconds, 2),
+                "evaluation_seconds": round(self.evaluation_seconds, 2),
+            }
+        )
+        for name in ("dense_return", "sparse_return", "success_rate"):
+            if self.last_summary[name] is not None:
+                self.logger.record(f"eval/{name}", self.last_summary[name])
+        self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
+        self.logger.dump(self.num_timesteps)  # a row of the agent's own figures beside each evaluation
+        self.report(_evaluation_line(self.num_timesteps, self.last_summary))
+
+    def _append_row(self, values: dict[str, Any]) -> None:
+        with open(self.folder / PROGRESS, "a", newline="", encoding="utf-8") as file:
+            csv.writer(file, lineterminator="\n").writerow([values[name] for name in PROGRESS_COLUMNS])
+
+
+def _evaluation_line(timesteps: int, summary: dict[str, float | None]) -> str:
+    success = summary["success_rate"]
+    return (
+        f"step {timesteps:>8}  dense return {summary['dense_return']:9.1f} ± {summary['dense_return_std']:<7.1f} "
+        f"sparse return {summary['sparse_return']:7.1f}  success {'n/a' if success is None else f'{success:.2f}'}"
+    )

@@ -1,0 +1,54 @@
+"""Where the numbers of a run come from: versions of the packages, and the commit of a source checkout."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.metadata
+import platform
+import subprocess
+from pathlib import Path
+
+_PACKAGES = ("sb3-actpc", "stable-baselines3", "torch", "gymnasium", "mujoco", "robosuite", "numpy")
+CHECKOUT = Path(__file__).resolve().parents[3]
+
+
+def package_versions() -> dict[str, str]:
+    """Versions of Python and of the packages that a result depends on; ``"unknown"`` for one that is not installed."""
+    versions = {"python": platform.python_version()}
+    for name in _PACKAGES:
+        try:
+            versions[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:  # a source checkout that is not installed
+            versions[name] = "unknown"
+    return versions
+
+
+def git_commit(checkout: Path = CHECKOUT) -> str | None:
+    """The commit that a source checkout stands on.
+
+    :param checkout: folder that holds ``.git``
+    :return: 40 hex digits, followed by ``+changes`` where files differ from it; None for an installed package or where git
+        cannot be asked
+    """
+    if not (checkout / ".git").exists():
+        return None
+    try:
+        commit = _git(checkout, "rev-parse", "HEAD")
+        changes = _git(checkout, "status", "--porcelain", "--untracked-files=no")
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return f"{commit}+changes" if changes else commit
+
+
+def file_hash(path: Path | None) -> str | None:
+    """
+    :param path: a file, or None
+    :return: SHA-256 of its content in hex digits, None for None
+    :raises OSError: when it cannot be read
+    """
+    return None if path is None else hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def _git(checkout: Path, *arguments: str) -> str:
+    command = ["git", "-C", str(checkout), *arguments]
+    return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()

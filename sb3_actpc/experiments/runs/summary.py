@@ -1,0 +1,70 @@
+"""What a run shows at its end: a table and a plot."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from sb3_actpc.utils.files import atomic_write
+
+
+def result_table(result: Mapping[str, Any]) -> str:
+    """The result of a run, or of its replay, as aligned text.
+
+    :param result: what ``train_run`` or ``evaluate_run`` returned
+    :return: a line per quantity
+    """
+    rows = [
+        ("dense return", f"{result['dense_return']:.1f} ± {result['dense_return_std']:.1f}"),
+        ("demonstrators' dense return", _number(result.get("demonstrators_return"), ".1f")),
+        ("sparse return", f"{result['sparse_return']:.1f} ± {result['sparse_return_std']:.1f}"),
+        ("success rate", _number(result["success_rate"], ".2f")),
+        ("episode length", f"{result['episode_length']:.1f}"),
+    ]
+    if result.get("failed_after"):
+        rows.append(("failed, farthest stage", ", ".join(f"{stage} {n}" for stage, n in result["failed_after"].items())))
+    if "steps_per_second" in result:
+        rows.append(("training steps per second", f"{result['steps_per_second']:.0f}"))
+    title = f"{result['env']}, {result['algo']}, seed {result['seed']}: mean ± std of {result['eval_episodes']} episodes"
+    width = max(len(name) for name, _ in rows)
+    return "\n".join([title, "-" * len(title), *(f"{name:<{width}}  {value}" for name, value in rows)])
+
+
+def plot_learning_curve(progress: Path, output: Path, title: str, demonstrators_return: float | None) -> None:
+    """Draw the dense and the sparse return against the environment steps.
+
+    :param progress: a ``progress.csv``
+    :param output: PNG file to write
+    :param title: title of the figure
+    :param demonstrators_return: mean dense return of the demonstrations, drawn as a dashed line; None for none
+    :raises FileNotFoundError: when there is no such CSV file
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    with open(progress, newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    steps, dense, spread, sparse = (
+        [float(row[name]) for row in rows] for name in ("timesteps", "dense_return", "dense_return_std", "sparse_return")
+    )
+    figure = Figure(figsize=(6.4, 6.4), layout="constrained")
+    FigureCanvasAgg(figure)
+    dense_axes, sparse_axes = figure.subplots(2, 1, sharex=True)
+    dense_axes.plot(steps, dense, marker="o", label="policy")
+    lower = [value - width for value, width in zip(dense, spread, strict=True)]
+    upper = [value + width for value, width in zip(dense, spread, strict=True)]
+    dense_axes.fill_between(steps, lower, upper, alpha=0.2)
+    if demonstrators_return is not None:
+        dense_axes.axhline(demonstrators_return, color="black", linestyle="--", label="demonstrators")
+    dense_axes.legend()
+    dense_axes.set(title=title, ylabel="dense return (mean ± std)")
+    sparse_axes.plot(steps, sparse, marker="o", color="tab:orange")
+    sparse_axes.set(xlabel="environment steps", ylabel="sparse return (mean)")
+    with atomic_write(output) as image:
+        figure.savefig(image, format="png", dpi=120)
+
+
+def _number(value: float | None, form: str) -> str:
+    return "n/a" if value is None else format(value, form)

@@ -1,0 +1,182 @@
+"""A video of one episode, or a strip of pictures, where the machine can render."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sb3_actpc.demonstrations.dataset import Demonstrations
+from sb3_actpc.utils.files import atomic_write
+
+GL_BACKENDS = ("egl", "osmesa")
+VIDEO_SUFFIXES = (".mp4", ".gif", ".png")
+STRIP_LENGTH = 6
+# of one episode; software rendering takes a twentieth of a second for each
+MAX_FRAMES = 300
+# in a process of its own: a broken graphics driver may end the process
+_PROBE = "import mujoco; context = mujoco.GLContext(64, 64); context.make_current(); context.free()"
+
+
+class RenderingUnavailable(RuntimeError):
+    """This machine, or this environment, cannot render; the message says why."""
+
+
+def choose_gl_backend() -> str | None:
+    """Find a way for MuJoCo to render without a window and select it for this process (environment variables).
+
+    Call it before MuJoCo is imported. What ``MUJOCO_GL`` names is tried first; it is unset when nothing works, since
+    MuJoCo cannot be imported with a name that does not work.
+
+    :return: the name, or None when nothing works
+    """
+    chosen = os.environ.get("MUJOCO_GL", "")
+    for backend in dict.fromkeys(filter(None, (chosen, *GL_BACKENDS))):
+        variables = {"MUJOCO_GL": backend}
+        if backend in GL_BACKENDS:
+            variables["PYOPENGL_PLATFORM"] = backend
+        if _probe(variables):
+            os.environ.update(variables)
+            return backend
+    os.environ.pop("MUJOCO_GL", None)
+    return None
+
+
+def check_video_path(path: Path) -> None:
+    """Check that a video can have this name.
+
+    :param path: file to write
+    :raises ValueError: when the suffix is none of ``VIDEO_SUFFIXES``
+    """
+    if path.suffix.lower() not in VIDEO_SUFFIXES:
+        raise ValueError(f"the video must end in .mp4, .gif or .png, found {str(path)!r}")
+
+
+def record_video(
+    model: Any,
+    env_id: str,
+    env_kwargs: dict[str, Any],
+    path: Path,
+    seed: int,
+    n_frames: int = MAX_FRAMES,
+    demonstrations: Demonstrations | None = None,
+) -> int:
+    """Write a video of the first steps of an episode with the deterministic policy.
+
+    :param model: SB3 algorithm or policy
+    :param env_id: Gymnasium id
+    :param env_kwargs: keywords of the environment; ``width`` and ``height`` in pixels where it takes them
+    :param path: file to write: ``.mp4``, ``.gif``, or ``.png`` for ``STRIP_LENGTH`` pictures side by side, at half the size
+    :param seed: seed of the episode
+    :param n_frames: most frames to render
+    :param demonstrations: draw their first episode on the right of the agent, or None
+    :return: number of frames, each (height, width, 3) uint8
+    :raises RenderingUnavailable: when rendering does not work here
+    :raises ValueError: when the path has another suffix, or the environment cannot draw demonstrations
+    """
+    check_video_path(path)
+    with _rendering(env_id, env_kwargs) as env:
+        frames: list[Any] = _play(model, env, seed, n_frames)
+        if demonstrations is not None:
+            right = _replay(demonstrations, env, n_frames)
+            frames = [np.hstack(pair) for pair in zip(frames, right, strict=False)]
+        frames_per_second = float(env.metadata.get("render_fps", 30))
+    import imageio.v2 as imageio
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if path.suffix.lower() == ".png":
+        with atomic_write(path) as file:
+            file.write(imageio.imwrite("<bytes>", picture_strip(frames), format="png"))
+        return len(frames)
+    temporary = path.with_name(f".{path.name}{path.suffix}")  # the suffix tells imageio the format
+    if path.suffix.lower() == ".gif":
+        # viewers slow down a GIF with delays below 20 ms
+        stride = max(1, round(frames_per_second / 25))
+        imageio.mimsave(temporary, frames[::stride], duration=1000 * stride / frames_per_second, loop=0)
+    else:
+        imageio.mimsave(temporary, frames, fps=frames_per_second, macro_block_size=2)
+    temporary.replace(path)
+    return len(frames)
+
+
+def picture_strip(frames: list[np.ndarray]) -> np.ndarray:
+    """
+    :param frames: (height, width, 3) uint8 each
+    :return: ``STRIP_LENGTH`` of them from the first to the last, side by side, (height / 2, STRIP_LENGTH * width / 2, 3)
+    """
+    chosen = np.linspace(0, len(frames) - 1, STRIP_LENGTH).round().astype(int)
+    return np.concatenate([frames[index][::2, ::2] for index in chosen], axis=1)
+
+
+@contextlib.contextmanager
+def _rendering(env_id: str, env_kwargs: dict[str, Any]) -> Iterator[Any]:
+    """The environment, made to render, and closed in the end; what goes wrong in a renderer as ``RenderingUnavailable``."""
+    import gymnasium as gym
+    from mujoco import FatalError
+
+    from sb3_actpc.experiments.runs.environments import make_env
+
+    env = None
+    try:
+        env = make_env(env_id, env_kwargs, render_mode="rgb_array")
+        yield env
+    except (FatalError, gym.error.Error, ImportError, OSError, RuntimeError, AttributeError, NotImplementedError) as error:
+        raise RenderingUnavailable(f"{type(error).__name__}: {error}") from error
+    finally:
+        if env is not None:
+            env.close()
+
+
+def _replay(demonstrations: Demonstrations, env: Any, n_frames: int) -> list[Any]:
+    """Frames of the first demonstrated episode."""
+    simulator = env.unwrapped
+    if not hasattr(simulator, "demonstrated_positions"):
+        raise ValueError(f"{env.spec.id} cannot draw demonstrations: leave --beside-demonstrator out")
+    end = min(n_frames, int(demonstrations.episode_bounds[0, 1]))
+    frames = []
+    for position in simulator.demonstrated_positions(demonstrations)[:end]:
+        simulator.set_state(position, np.zeros(simulator.model.nv))
+        frames.append(_frame(env))
+    return frames
+
+
+def _play(model: Any, env: Any, seed: int, n_frames: int) -> list[Any]:
+    observation, _ = env.reset(seed=seed)
+    frames = [_frame(env)]
+    state, episode_start, finished = None, np.ones(1, dtype=bool), False
+    while not finished and len(frames) < n_frames:
+        action, state = model.predict(_batch(observation), state=state, episode_start=episode_start, deterministic=True)
+        observation, _, terminated, truncated, _ = env.step(action[0])
+        episode_start = np.zeros(1, dtype=bool)
+        finished = terminated or truncated
+        frames.append(_frame(env))
+    return frames
+
+
+def _frame(env: Any) -> np.ndarray:
+    frame = env.render()
+    if not isinstance(frame, np.ndarray):
+        raise NotImplementedError(f"the environment renders {type(frame).__name__}, not an image")
+    return frame
+
+
+def _batch(observation: Any) -> Any:
+    """One observation as a batch of one: (1, ...), or a dictionary of such."""
+    if isinstance(observation, dict):
+        return {key: np.asarray(value)[None] for key, value in observation.items()}
+    return np.asarray(observation)[None]
+
+
+def _probe(variables: dict[str, str]) -> bool:
+    command = [sys.executable, "-c", _PROBE]
+    try:
+        process = subprocess.run(command, env={**os.environ, **variables}, capture_output=True, timeout=60, check=False)
+    except subprocess.TimeoutExpired:
+        return False
+    return process.returncode == 0

@@ -1,0 +1,306 @@
+"""ActPC and the baselines in rl-zoo3: its own command line, with our algorithms, settings and tasks.
+
+``sb3-actpc zoo train | enjoy | optimize | plot ...`` and ``python -m sb3_actpc.experiments.zoo ...`` put the algorithms of
+``sb3_actpc.experiments.runs.ALGORITHMS`` into ``rl_zoo3.ALGOS`` and hand over to rl_zoo3, so that every option of its scripts works.
+Ours are ``--preset`` and ``--demonstrations`` (as of ``sb3-actpc train``) before training, and ``--output`` of the plots.
+
+What rl_zoo3 gets is a settings file with one entry, made from the preset, because rl_zoo3
+
+* takes its own settings file unless it is given one, and evaluates texts in it as Python: ours hold plain values only;
+* knows nothing of demonstrations: the file's path is a setting like any other;
+* logs the success rate only where it is told to (``monitor_kwargs``), and its plots need it;
+* begins a continued run (``-i model.zip``) with the random warm-up again: ``learning_starts`` is then 0.
+
+rl_zoo3 gives its training and its evaluation environments one seed, so that an agent is evaluated on the starts that it
+trained on; here the evaluation has another, as in ``sb3-actpc train``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import os
+import sys
+import tempfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from sb3_actpc.experiments.runs.config import (
+    ALGORITHMS,
+    check_keywords,
+    constructor_parameters,
+    find_demonstrations,
+    load_algorithm,
+    load_preset,
+)
+from sb3_actpc.experiments.runs.environments import check_env_id, make_env, register_tasks
+from sb3_actpc.experiments.runs.run import EVALUATION_SEED_OFFSET
+
+SCRIPTS = {
+    "train": "rl_zoo3.train:train",
+    "optimize": "rl_zoo3.train:train",
+    "enjoy": "rl_zoo3.enjoy:enjoy",
+    "plot": "rl_zoo3.plots:plot_train",
+    "plot_train": "rl_zoo3.plots:plot_train",
+    "all_plots": "rl_zoo3.plots:all_plots",
+    "plot_from_file": "rl_zoo3.plots:plot_from_file",
+}
+LOG_FOLDER = "logs"  # rl_zoo3's own default when it trains
+# keys of a settings file that are not the algorithm's
+_RUN_KEYS = {"n_timesteps", "n_envs", "policy", "env_kwargs", "noise_type", "noise_std", "normalize"}
+NET_ARCHS = {"small": [64, 64], "medium": [256, 256], "big": [400, 300]}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """
+    Run one of rl_zoo3's scripts.
+
+    :param argv: a key of ``SCRIPTS``, then the script's own arguments; by default those of the process
+    :return: exit code 0
+    :raises ValueError: when there is no such script, or a setting is unknown or has a wrong value
+    :raises ImportError: when rl_zoo3 is not installed
+    :raises FileNotFoundError: when the preset or the demonstrations do not exist
+    """
+    given = list(sys.argv[1:] if argv is None else argv)
+    command, arguments = (given[0], given[1:]) if given else ("", [])
+    if command not in SCRIPTS:
+        raise ValueError(f"zoo has no command {command!r}: choose one of {', '.join(SCRIPTS)}")
+    if command.startswith(("plot", "all")):
+        return _plot(SCRIPTS[command], arguments)
+    register_algorithms()
+    if {"-h", "--help"} & set(arguments):
+        return _run(SCRIPTS[command], ["--help"])
+    if command == "enjoy":
+        return _run(SCRIPTS[command], _playing_arguments(arguments))
+    with tempfile.TemporaryDirectory(prefix="sb3_actpc_zoo_") as folder:
+        return _run(SCRIPTS[command], _training_arguments(arguments, Path(folder), optimize=command == "optimize"))
+
+
+def register_algorithms() -> None:
+    """
+    Put our algorithms, and what samples their settings, into rl_zoo3's tables; ``td3`` and ``ddpg`` are then ours.
+
+    :raises ImportError: when rl_zoo3 is not installed
+    """
+    zoo, hyperparams = _import("rl_zoo3"), _import("rl_zoo3.hyperparams_opt")
+    if "actpc" in zoo.ALGOS:
+        return
+    for name in ALGORITHMS:
+        zoo.ALGOS[name] = load_algorithm(name)
+    samplers, converters = hyperparams.HYPERPARAMS_SAMPLER, hyperparams.HYPERPARAMS_CONVERTER
+    samplers["actpc"], converters["actpc"] = sample_actpc_params, convert_actpc_params
+    for name, like in (("her", "td3"), ("sac_rlpd", "sac"), ("logo", "trpo")):
+        samplers.setdefault(name, samplers[like])
+        converters.setdefault(name, converters[like])
+    for name in ("td3", "ddpg", "her"):
+        samplers[name] = _with_one_learning_rate(samplers[name])
+    _evaluate_on_other_seeds(_import("rl_zoo3.exp_manager").ExperimentManager)
+
+
+def _evaluate_on_other_seeds(manager: Any) -> None:
+    """:param manager: rl_zoo3's class, whose method that makes environments is replaced"""
+    create_envs = manager.create_envs
+
+    def create_envs_with_other_seeds(self: Any, n_envs: int, eval_env: bool = False, no_log: bool = False) -> Any:
+        seed = self.seed
+        self.seed = (seed + EVALUATION_SEED_OFFSET) % 2**32 if eval_env else seed
+        try:
+            return create_envs(self, n_envs, eval_env=eval_env, no_log=no_log)
+        finally:
+            self.seed = seed
+
+    manager.create_envs = create_envs_with_other_seeds
+
+
+def sample_actpc_params(trial: Any, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> dict[str, Any]:
+    """
+    Settings of ActPC for one trial of a search: those that matter under either settling.
+
+    :param trial: Optuna's trial
+    :param n_actions: not used
+    :param n_envs: not used
+    :param additional_args: not used
+    :return: keywords of ActPC
+    """
+    trial.suggest_float("learning_rate", 1e-5, 2e-3, log=True)
+    trial.suggest_float("one_minus_gamma", 1e-4, 0.03, log=True)
+    trial.suggest_float("tau", 1e-3, 0.15, log=True)
+    trial.suggest_int("batch_size_pow", 6, 9)
+    trial.suggest_categorical("net_arch", list(NET_ARCHS))
+    trial.suggest_float("actor_pressure", 0.01, 3.0, log=True)
+    trial.suggest_float("refresh_weight", 0.1, 3.0, log=True)
+    trial.suggest_float("alpha_ep", 0.01, 1.0, log=True)
+    trial.suggest_float("alpha_in", 0.01, 1.0, log=True)
+    trial.suggest_categorical("weight_decay", [0.0, 0.1, 0.3, 1.0])
+    trial.suggest_categorical("refresh_noise", [0.0, 0.05, 0.1, 0.2])
+    params = convert_actpc_params(trial.params)
+    trial.set_user_attr("gamma", params["gamma"])
+    trial.set_user_attr("batch_size", params["batch_size"])
+    return params
+
+
+def convert_actpc_params(sampled: dict[str, Any]) -> dict[str, Any]:
+    """
+    :param sampled: the parameters of a trial, as :func:`sample_actpc_params` named them
+    :return: keywords of ActPC
+    """
+    params = {name: sampled[name] for name in ("learning_rate", "tau", "actor_pressure", "refresh_weight", "refresh_noise")}
+    return {
+        **params,
+        "alpha_ep": sampled["alpha_ep"],
+        "alpha_in": sampled["alpha_in"],
+        "gamma": 1.0 - sampled["one_minus_gamma"],
+        "batch_size": 2 ** sampled["batch_size_pow"],
+        "policy_kwargs": {"net_arch": NET_ARCHS[sampled["net_arch"]]},
+        "circuit_kwargs": {"weight_decay": sampled["weight_decay"]},
+    }
+
+
+def _with_one_learning_rate(sample: Callable[..., dict[str, Any]]) -> Callable[..., dict[str, Any]]:
+    """The sampled learning rate and tau are those of both networks, whatever the settings file gives each."""
+
+    def sample_params(*arguments: Any) -> dict[str, Any]:
+        return {**sample(*arguments), "actor_kwargs": None, "critic_kwargs": None}
+
+    return sample_params
+
+
+# ---------------------------------------------------------------------- arguments
+
+
+def _training_arguments(arguments: Sequence[str], folder: Path, optimize: bool) -> list[str]:
+    parser = _parser()
+    parser.add_argument("--preset")
+    parser.add_argument("--demonstrations", default="shipped")
+    parser.add_argument("-conf", "--conf-file", dest="conf_file")
+    parser.add_argument("-i", "--trained-agent", default="")
+    parser.add_argument("-f", "--log-folder", default=LOG_FOLDER)
+    parser.add_argument("--storage")
+    parser.add_argument("--study-name")
+    ours, rest = parser.parse_known_args(list(arguments))
+    if ours.env is None:
+        raise ValueError("--env is missing: give a Gymnasium id, such as --env SparseHalfCheetah-v5")
+    check_env_id(ours.env)
+    if ours.conf_file is None:
+        conf_file = folder / f"{ours.algo}.yml"
+        conf_file.write_text(yaml.safe_dump({ours.env: _zoo_settings(ours)}, sort_keys=False), encoding="utf-8")
+        ours.conf_file = str(conf_file)
+    passed = ["--algo", ours.algo, "--env", ours.env, "--conf-file", ours.conf_file, "--log-folder", ours.log_folder]
+    if ours.trained_agent:
+        passed += ["--trained-agent", ours.trained_agent]
+    if optimize:
+        samplers = _import("rl_zoo3.hyperparams_opt").HYPERPARAMS_SAMPLER
+        if ours.algo not in samplers:
+            known = ", ".join(sorted(set(samplers) & set(ALGORITHMS)))
+            raise ValueError(f"zoo optimize does not know what to vary for {ours.algo!r}: choose one of {known}")
+        passed.append("--optimize-hyperparameters")
+        ours.study_name = ours.study_name or f"{ours.algo}_{ours.env}"
+        # a journal: several processes can work on it, and a stopped search goes on
+        ours.storage = ours.storage or os.path.join(ours.log_folder, ours.algo, f"{ours.study_name}.log")
+    for option, value in (("--storage", ours.storage), ("--study-name", ours.study_name)):
+        passed += [option, value] if value else []
+    return [*passed, *rest]
+
+
+def _playing_arguments(arguments: Sequence[str]) -> list[str]:
+    """rl_zoo3 looks for runs in a folder of its own, and downloads what is not there; ours are in ``logs``."""
+    parser = _parser()
+    parser.add_argument("-f", "--folder", default=LOG_FOLDER)
+    ours, rest = parser.parse_known_args(list(arguments))
+    if ours.env is None:
+        raise ValueError("--env is missing: give the Gymnasium id of the trained agent's task")
+    register_tasks(ours.env)
+    if not Path(ours.folder, ours.algo).is_dir():
+        raise FileNotFoundError(f"no runs of {ours.algo} in {ours.folder}: sb3-actpc zoo train makes one; or give --folder")
+    return ["--algo", ours.algo, "--env", ours.env, "--folder", ours.folder, *rest]
+
+
+def _parser() -> argparse.ArgumentParser:
+    """What every script takes; the rest is left to rl_zoo3."""
+    parser = argparse.ArgumentParser(prog="sb3-actpc zoo", add_help=False, allow_abbrev=False)
+    parser.add_argument("--algo", default="actpc")
+    parser.add_argument("--env")
+    return parser
+
+
+def _zoo_settings(ours: argparse.Namespace) -> dict[str, Any]:
+    """The entry of rl_zoo3's settings file: the preset's, and what rl_zoo3 would not know."""
+    algorithm = load_algorithm(ours.algo)
+    settings = load_preset(ours.preset or ours.algo, ours.env)
+    check_keywords(algorithm, {name: value for name, value in settings.items() if name not in _RUN_KEYS})
+    settings.setdefault("policy", "MlpPolicy")
+    if "demonstrations" in constructor_parameters(algorithm):
+        demonstrations = find_demonstrations(ours.env, ours.demonstrations)
+        settings["demonstrations"] = None if demonstrations is None else str(demonstrations.absolute())
+    if _reports_success(ours.env, settings.get("env_kwargs") or {}):
+        # the Monitor wants a tuple, which a settings file cannot hold but as the Python that rl_zoo3 evaluates
+        settings["monitor_kwargs"] = "dict(info_keywords=('is_success',))"
+    # hindsight cannot sample before its first whole episode
+    if ours.trained_agent and "learning_starts" in constructor_parameters(algorithm) and not _uses_hindsight(ours, settings):
+        settings["learning_starts"] = 0
+    return settings
+
+
+def _uses_hindsight(ours: argparse.Namespace, settings: dict[str, Any]) -> bool:
+    return ours.algo == "her" or "Her" in str(settings.get("replay_buffer_class", ""))
+
+
+def _reports_success(env_id: str, env_kwargs: dict[str, Any]) -> bool:
+    env = make_env(env_id, env_kwargs)
+    try:
+        env.reset(seed=0)
+        return "is_success" in env.step(env.action_space.sample())[4]
+    finally:
+        env.close()
+
+
+# ---------------------------------------------------------------------- handing over
+
+
+def _plot(script: str, arguments: Sequence[str]) -> int:
+    parser = argparse.ArgumentParser(prog="sb3-actpc zoo plot", add_help=False, allow_abbrev=False)
+    parser.add_argument("--output", type=Path)
+    ours, rest = parser.parse_known_args(list(arguments))
+    if ours.output is None:
+        return _run(script, rest)
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    shown, pyplot.show = pyplot.show, lambda *_, **__: None
+    try:
+        _run(script, rest)
+    finally:
+        pyplot.show = shown
+    ours.output.parent.mkdir(parents=True, exist_ok=True)
+    pyplot.savefig(ours.output)
+    print(f"written to {ours.output}")
+    return 0
+
+
+def _run(script: str, arguments: Sequence[str]) -> int:
+    """Call one of rl_zoo3's functions, which read their arguments from the process."""
+    module, _, name = script.partition(":")
+    function = getattr(_import(module), name)
+    given = sys.argv
+    sys.argv = [script.replace(":", " "), *arguments]
+    try:
+        function()
+    finally:
+        sys.argv = given
+    return 0
+
+
+def _import(module: str) -> Any:
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise ImportError(f"{error}: rl-zoo3 is an extra, install it with pip install 'sb3-actpc[zoo]'") from error
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,483 @@
+"""The commands, with SB3's TD3 as the algorithm, on an environment whose returns are known by hand."""
+
+import csv
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import imageio.v2 as imageio
+import numpy as np
+import pytest
+import yaml
+from stable_baselines3 import TD3
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
+
+from sb3_actpc.cli import main
+from sb3_actpc.demonstrations.dataset import DATA_FOLDER, Demonstrations
+from sb3_actpc.experiments.runs import ALGORITHMS, RunConfig, play_episodes, train_run
+from sb3_actpc.experiments.runs.config import find_demonstrations, load_preset, parse_assignments, parse_schedule
+from sb3_actpc.experiments.runs.evaluation import EpisodeStatistics
+from sb3_actpc.experiments.runs.video import RenderingUnavailable, choose_gl_backend
+
+EPISODE_LENGTH = 10
+ENV_ID = "SparseLine-v0"
+TRAIN = ["train", "--env", ENV_ID, "--algo", "td3", "--preset", "small.yml"]
+RESULTS = {"dense_return": 20.0, "dense_return_std": 0.0, "sparse_return": 10.0, "sparse_return_std": 0.0}
+RESULTS |= {"success_rate": 1.0, "episode_length": 10.0}
+
+
+class LineEnv(gym.Env[np.ndarray, np.ndarray]):
+    """Ten steps; each is paid 2 densely and 1 sparsely, whatever the action. ``gain`` multiplies the dense reward.
+
+    The observation is (the number drawn at reset, the step).
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012
+
+    def __init__(self, gain: float = 1.0, render_mode: str | None = None) -> None:
+        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (2,), np.float32)
+        self.action_space = gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
+        self.gain = gain
+        self.render_mode = render_mode
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.drawn, self.n_steps = self.np_random.uniform(), 0
+        return self._observation(), {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        self.n_steps += 1
+        info = {"dense_reward": 2.0 * self.gain, "is_success": self.n_steps == EPISODE_LENGTH}
+        return self._observation(), 1.0, self.n_steps == EPISODE_LENGTH, False, info
+
+    def render(self) -> Any:
+        return np.full((32, 48, 3), 20 * self.n_steps, dtype=np.uint8)
+
+    def _observation(self) -> np.ndarray:
+        return np.array([self.drawn, self.n_steps], dtype=np.float32)
+
+
+class SilentTD3(TD3):
+    """TD3 with a keyword for demonstrations, which it only remembers."""
+
+    received: Any = None
+
+    def __init__(self, policy: Any, env: Any, demonstrations: Any = None, **options: Any) -> None:
+        SilentTD3.received = demonstrations
+        super().__init__(policy, env, **options)
+
+
+class StatefulPolicy:
+    """Counts the steps of each episode in its recurrent state and remembers what it was given."""
+
+    def __init__(self) -> None:
+        self.calls: list[tuple[np.ndarray, np.ndarray]] = []
+
+    def predict(
+        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = False
+    ) -> tuple[np.ndarray, np.ndarray]:
+        assert deterministic
+        state = np.where(episode_start, 0, 0 if state is None else state) + 1
+        self.calls.append((observation.copy(), state))
+        return np.zeros((len(observation), 1), dtype=np.float32), state
+
+
+@pytest.fixture(autouse=True)
+def line_task(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Register the environment and TD3, and work in an empty folder with a preset for it."""
+    if ENV_ID not in gym.registry:
+        gym.register(ENV_ID, entry_point=f"{__name__}:LineEnv")
+    monkeypatch.setitem(ALGORITHMS, "td3", "stable_baselines3:TD3")
+    monkeypatch.setitem(ALGORITHMS, "silent", f"{__name__}:SilentTD3")
+    monkeypatch.chdir(tmp_path)
+    settings = {"n_timesteps": 60, "learning_starts": 20, "policy_kwargs": {"net_arch": [8]}}
+    Path("small.yml").write_text(yaml.safe_dump({"default": settings}), encoding="utf-8")
+
+
+def train(*arguments: str) -> int:
+    """``sb3-actpc train`` with TD3 on the line."""
+    return main([*TRAIN, "--no-progress", *arguments])
+
+
+def rows_of(folder: str | Path) -> list[dict[str, str]]:
+    with open(Path(folder) / "progress.csv", newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+RUN = Path("runs") / ENV_ID / "td3_small_seed0"
+
+
+def write_demonstrations(path: Path, dense_reward: float) -> None:
+    """Two episodes of three steps."""
+    Demonstrations(
+        observations=np.zeros((6, 2)),
+        actions=np.zeros((6, 1)),
+        next_observations=np.ones((6, 2)),
+        rewards=np.ones(6),
+        terminations=np.array([False, False, True] * 2),
+        episode_starts=np.array([0, 3]),
+        env_id=ENV_ID,
+        dense_rewards=np.full(6, dense_reward),
+    ).save(path)
+
+
+def test_training_writes_every_file_and_prints_the_table(capsys: pytest.CaptureFixture[str]) -> None:
+    assert train("--demonstrations", "none", "--eval-freq", "20", "--eval-episodes", "2") == 0
+    names = {path.name for path in RUN.iterdir()}
+    assert names == {
+        "model.zip",
+        "config.json",
+        "result.json",
+        "progress.csv",
+        "episodes.csv",
+        "diagnostics.csv",
+        "learning_curve.png",
+    }
+    assert (RUN / "learning_curve.png").read_bytes().startswith(b"\x89PNG")
+    printed = capsys.readouterr().out
+    for text in ("dense return", "demonstrators", "sparse return", "success rate", "steps per second", "20.0 ± 0.0"):
+        assert text in printed
+
+
+def test_evaluations_are_of_the_dense_task_from_step_zero_to_the_last() -> None:
+    assert train("--demonstrations", "none", "--eval-freq", "25") == 0
+    rows = rows_of(RUN)
+    assert list(rows[0]) == ["timesteps", "updates", "seconds", "evaluation_seconds", *RESULTS]
+    assert [int(row["timesteps"]) for row in rows] == [0, 25, 50, 60]
+    # an update after every step beyond the 20 random ones; an evaluation comes before the update of its step, the last after
+    assert [int(row["updates"]) for row in rows] == [0, 4, 29, 40]
+    for row in rows:
+        assert {name: float(row[name]) for name in RESULTS} == RESULTS
+        assert float(row["evaluation_seconds"]) <= float(row["seconds"])
+    seconds = [float(row["seconds"]) for row in rows]
+    assert seconds == sorted(seconds)
+
+
+def test_every_training_episode_is_recorded() -> None:
+    """Six episodes of ten steps, each with a sparse return of 10 and a dense one of 2 * 10 * 1.5."""
+    assert train("--demonstrations", "none", "--env-kwarg", "gain=1.5") == 0
+    with open(RUN / "episodes.csv", newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert [int(row["episode"]) for row in rows] == [1, 2, 3, 4, 5, 6]
+    assert [int(row["timesteps"]) for row in rows] == [10, 20, 30, 40, 50, 60]
+    for row in rows:
+        values = [float(row[name]) for name in ("length", "sparse_return", "dense_return", "success")]
+        assert values == [10.0, 10.0, 30.0, 1.0]
+    assert len({row["actions_crc32"] for row in rows}) == 6
+
+
+def test_the_episodes_of_parallel_environments_are_kept_apart() -> None:
+    assert train("--demonstrations", "none", "--n-envs", "2", "--steps", "40") == 0
+    with open(RUN / "episodes.csv", newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert [(int(row["episode"]), int(row["timesteps"])) for row in rows] == [(1, 20), (2, 20), (3, 40), (4, 40)]
+    assert {float(row["dense_return"]) for row in rows} == {20.0}
+
+
+def test_the_settings_say_how_to_repeat_the_run() -> None:
+    assert train("--demonstrations", "none", "--steps", "20", "--seed", "3", "--threads", "1") == 0
+    record = json.loads(Path(f"runs/{ENV_ID}/td3_small_seed3/config.json").read_text(encoding="utf-8"))
+    assert (record["seed"], record["threads"], record["n_timesteps"], record["demonstrations"]) == (3, 1, 20, "none")
+    assert record["versions"]["stable-baselines3"].startswith("2.")
+    assert record["git_commit"] is None or len(record["git_commit"].removesuffix("+changes")) == 40
+
+
+def test_the_result_is_the_last_evaluation() -> None:
+    result = train_run(
+        RunConfig(ENV_ID, "td3", "small.yml", demonstrations="none", env_kwargs={"gain": 3.0}, progress=False, n_timesteps=30)
+    )
+    assert result["dense_return"] == 60.0
+    assert result["sparse_return"] == 10.0
+    assert result["success_rate"] == 1.0
+    assert result["timesteps"] == 30
+    assert result["demonstrators_return"] is None
+    assert result["steps_per_second"] > 0
+    stored = json.loads(Path(result["folder"], "result.json").read_text(encoding="utf-8"))
+    assert {**stored, "folder": result["folder"]} == result
+
+
+def test_the_demonstrators_return_is_the_mean_over_their_episodes() -> None:
+    write_demonstrations(Path("demos.npz"), dense_reward=1.5)
+    result = train_run(RunConfig(ENV_ID, "td3", "small.yml", demonstrations="demos.npz", progress=False))
+    assert result["demonstrators_return"] == 4.5
+
+
+def test_an_algorithm_with_a_keyword_for_demonstrations_is_given_them() -> None:
+    write_demonstrations(Path("demos.npz"), dense_reward=1.0)
+    Path("plain.yml").write_text("default: {n_timesteps: 20}", encoding="utf-8")
+    train_run(RunConfig(ENV_ID, "silent", "plain.yml", demonstrations="demos.npz", progress=False))
+    assert SilentTD3.received == Path("demos.npz")
+    train_run(RunConfig(ENV_ID, "silent", "plain.yml", demonstrations="none", progress=False, seed=1))
+    assert SilentTD3.received is None
+
+
+def test_a_learning_rate_can_fall_linearly_to_zero() -> None:
+    schedule = parse_schedule("lin_4e-4")
+    assert callable(schedule) and [schedule(left) for left in (1.0, 0.5, 0.0)] == pytest.approx([4e-4, 2e-4, 0.0])
+    assert parse_schedule(1e-3) == 1e-3
+    for wrong in ("exp_1e-3", "fast", "lin_fast"):
+        with pytest.raises(ValueError, match="lin_<number>"):
+            parse_schedule(wrong)
+
+
+def test_evaluating_does_not_change_what_is_learned() -> None:
+    weights = []
+    for eval_freq, output in ((7, "often"), (60, "rarely")):
+        assert train("--demonstrations", "none", "--eval-freq", str(eval_freq), "--output", output) == 0
+        weights.append(TD3.load(Path(output) / "model.zip").policy.state_dict())
+    assert all(bool((value == weights[1][name]).all()) for name, value in weights[0].items())
+
+
+def test_settings_given_on_the_command_line_replace_the_presets() -> None:
+    arguments = ["--set", "gamma=0.5", "--set", "learning_rate=1e-4", "--set", "train_freq=[2, step]"]
+    assert train("--demonstrations", "none", "--steps", "20", "--n-envs", "2", *arguments) == 0
+    model = TD3.load(RUN / "model.zip")
+    assert (model.gamma, model.learning_rate, model.n_envs) == (0.5, 1e-4, 2)
+    assert model.train_freq == TrainFreq(2, TrainFrequencyUnit.STEP)
+    record = json.loads((RUN / "config.json").read_text(encoding="utf-8"))
+    assert record["settings"]["gamma"] == 0.5
+    assert record["settings"]["learning_starts"] == 20
+
+
+def test_action_noise_is_read_from_plain_values() -> None:
+    assert train("--demonstrations", "none", "--steps", "20", "--set", "noise_type=normal", "--set", "noise_std=0.3") == 0
+    noise = TD3.load(RUN / "model.zip").action_noise
+    assert noise is not None
+    assert np.std([noise()[0] for _ in range(500)]) == pytest.approx(0.3, rel=0.2)
+
+
+def test_a_finished_run_is_not_overwritten_and_an_unfinished_one_is() -> None:
+    arguments = ["--demonstrations", "none", "--steps", "20"]
+    assert train(*arguments) == 0
+    before = (RUN / "result.json").read_bytes()
+    assert train(*arguments) == 0
+    second = RUN.with_name(f"{RUN.name}_2")
+    assert (RUN / "result.json").read_bytes() == before
+    (second / "result.json").unlink()
+    assert train(*arguments) == 0
+    assert (second / "result.json").exists()
+    assert not RUN.with_name(f"{RUN.name}_3").exists()
+
+
+def test_an_explicit_folder_that_holds_a_finished_run_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["--demonstrations", "none", "--steps", "20", "--output", "mine"]
+    assert train(*arguments) == 0
+    assert train(*arguments) == 2
+    assert "mine already holds a finished run" in capsys.readouterr().err
+
+
+def test_an_interrupted_run_leaves_a_whole_model(monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupt(*arguments: Any, **keywords: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(TD3, "train", interrupt)
+    assert train("--demonstrations", "none", "--eval-freq", "10") == 130
+    assert not (RUN / "result.json").exists()
+    assert [int(row["timesteps"]) for row in rows_of(RUN)] == [0, 10, 20]
+    assert TD3.load(RUN / "model.zip").num_timesteps == 20
+
+
+def test_episodes_are_played_once_each_with_the_recurrent_state_carried() -> None:
+    envs = [gym.make(ENV_ID) for _ in range(2)]
+    policy = StatefulPolicy()
+    episodes = play_episodes(policy, envs, n_episodes=3, seed=5)
+    assert episodes.dense_returns.tolist() == [20.0, 20.0, 20.0]
+    assert episodes.lengths.tolist() == [10.0, 10.0, 10.0]
+    # two episodes side by side, then one; the step in the observation is the state less one
+    assert [len(observation) for observation, _ in policy.calls] == [2] * 10 + [1] * 10
+    for observation, state in policy.calls:
+        assert (observation[:, 1] + 1 == state).all()
+    drawn = [env.reset(seed=seed)[0][0] for env, seed in zip([envs[0]] * 3, (5, 6, 7), strict=True)]
+    assert [*policy.calls[0][0][:, 0], *policy.calls[10][0][:, 0]] == drawn
+
+
+def test_failed_episodes_are_counted_by_their_farthest_stage() -> None:
+    rewards = np.zeros(5)
+    successes = np.array([0.0, 1.0, 0.0, 0.0, 1.0])
+    stages = ("grasp", "lift", "reach", "grasp", "lift")
+    assert EpisodeStatistics(rewards, rewards, successes, rewards, stages).failed_after() == {"grasp": 2, "reach": 1}
+    unknown = EpisodeStatistics(rewards, rewards, np.full(5, np.nan), rewards, ("",) * 5)
+    assert unknown.failed_after() == {}
+
+
+def test_success_is_unknown_where_the_environment_does_not_report_it() -> None:
+    model = TD3("MlpPolicy", "Pendulum-v1", policy_kwargs={"net_arch": [4]}, buffer_size=10)
+    episodes = play_episodes(model, [gym.make("Pendulum-v1")], n_episodes=1, seed=0)
+    assert episodes.summary()["success_rate"] is None
+    assert episodes.dense_returns == episodes.sparse_returns
+
+
+def test_evaluate_replays_a_run_and_writes_a_video(capsys: pytest.CaptureFixture[str]) -> None:
+    assert train("--demonstrations", "none", "--steps", "20") == 0
+    capsys.readouterr()
+    assert main(["evaluate", str(RUN), "--episodes", "3", "--video", "line.gif"]) == 0
+    printed = capsys.readouterr().out
+    assert "20.0 ± 0.0" in printed
+    assert "3 episodes" in printed
+    assert Path("line.gif").read_bytes().startswith(b"GIF8")
+    assert main(["evaluate", str(RUN), "--episodes", "1", "--video", "line.png"]) == 0
+    assert imageio.imread("line.png").shape == (16, 6 * 24, 3)  # six pictures at half the size
+    assert main(["evaluate", str(RUN), "--episodes", "1"]) == 0
+    assert (RUN / "video.mp4").stat().st_size > 0
+
+
+@pytest.mark.parametrize("choice", ["shipped", "weak"])
+def test_the_demonstrator_beside_is_the_one_that_the_run_had(
+    choice: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert train("--demonstrations", "none", "--steps", "20") == 0
+    beside = ["evaluate", str(RUN), "--episodes", "1", "--video", "line.gif", "--beside-demonstrator"]
+    assert main(beside) == 2
+    assert "leave --beside-demonstrator out" in capsys.readouterr().err
+    config = json.loads((RUN / "config.json").read_text(encoding="utf-8"))
+    (RUN / "config.json").write_text(json.dumps({**config, "demonstrations": choice}), encoding="utf-8")
+    write_demonstrations(Path("others.npz"), dense_reward=1.0)
+    monkeypatch.setattr("sb3_actpc.experiments.runs.config.shipped_demonstrations", lambda env_id, weak=False: Path("others.npz"))
+    recorded: list[Any] = []
+    monkeypatch.setattr("sb3_actpc.experiments.runs.video.record_video", lambda *arguments: recorded.append(arguments) or 1)
+    assert main(beside) == 0
+    assert recorded[0][-1].n_episodes == 2
+
+
+def test_evaluate_goes_on_where_nothing_can_be_rendered(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert train("--demonstrations", "none", "--steps", "20") == 0
+
+    def fail(*arguments: Any) -> int:
+        raise RenderingUnavailable("no display")
+
+    monkeypatch.setattr("sb3_actpc.experiments.runs.video.record_video", fail)
+    assert main(["evaluate", str(RUN), "--episodes", "1"]) == 0
+    assert "no video: rendering is not available here (no display)" in capsys.readouterr().out
+
+
+def test_the_first_graphics_backend_that_works_is_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MUJOCO_GL", "mine")
+    monkeypatch.delenv("PYOPENGL_PLATFORM", raising=False)
+    for working in ("mine", "egl", "osmesa"):
+        monkeypatch.setattr("sb3_actpc.experiments.runs.video._probe", lambda variables, name=working: variables["MUJOCO_GL"] == name)
+        assert choose_gl_backend() == working
+        assert os.environ["MUJOCO_GL"] == working
+
+
+def test_a_graphics_backend_that_does_not_work_is_set_aside(monkeypatch: pytest.MonkeyPatch) -> None:
+    """MuJoCo cannot even be imported when ``MUJOCO_GL`` names one."""
+    monkeypatch.setenv("MUJOCO_GL", "mine")
+    monkeypatch.setattr("sb3_actpc.experiments.runs.video._probe", lambda variables: False)
+    assert choose_gl_backend() is None
+    assert "MUJOCO_GL" not in os.environ
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["train", "--env", "SparseNothing-v0"], "SparseNothing"),
+        (["train", "--env", ENV_ID, "--algo", "silent"], "no preset 'silent'"),
+        (["train", "--env", ENV_ID, "--algo", "unknown"], "unknown algorithm 'unknown'"),
+        (TRAIN, "sb3-actpc demos collect --env SparseLine-v0"),
+        ([*TRAIN, "--demonstrations", "no.npz"], "no.npz"),
+        ([*TRAIN, "--set", "gama=1"], "did you mean 'gamma'?"),
+        ([*TRAIN, "--set", "gamma"], "expected key=value"),
+        ([*TRAIN, "--set", "seed=1"], "use --seed"),
+        (["train", "--env", ENV_ID, "--algo", "td3", "--preset", "none.yml"], "no preset file at none.yml"),
+        (["train", "--env", ENV_ID, "--steps", "0"], "n_timesteps must be at least 1"),
+        (["train", "--env", ENV_ID, "--device", "abacus"], "'abacus'"),
+        ([*TRAIN, "--demonstrations", "none", "--env-kwarg", "colour=red"], "colour"),
+        (["train", "--env", "CartPole-v1", "--algo", "td3", "--preset", "small.yml"], "only supports"),
+        (["evaluate", "nowhere"], "no run in nowhere: config.json is missing"),
+        (["evaluate", "nowhere", "--video", "film.avi"], "must end in .mp4, .gif or .png"),
+    ],
+)
+def test_mistakes_give_one_line_and_exit_code_2(
+    arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(arguments) == 2
+    errors = capsys.readouterr().err.strip()
+    assert message in errors
+    assert errors.startswith("sb3-actpc: error: ")
+    assert "\n" not in errors
+    assert not Path("runs").exists()
+
+
+def test_debug_shows_where_an_error_came_from() -> None:
+    with pytest.raises(FileNotFoundError):
+        main(["--debug", "evaluate", "nowhere"])
+
+
+def test_a_damaged_run_is_named(capsys: pytest.CaptureFixture[str]) -> None:
+    Path("run").mkdir()
+    Path("run/model.zip").write_bytes(b"nonsense")
+    Path("run/config.json").write_text("[]", encoding="utf-8")
+    assert main(["evaluate", "run"]) == 2
+    assert "expected the settings of a run" in capsys.readouterr().err
+    settings = {"env": ENV_ID, "env_kwargs": {}, "algo": "td3", "seed": 0}
+    Path("run/config.json").write_text(json.dumps(settings), encoding="utf-8")
+    assert main(["evaluate", "run"]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_presets_are_plain_and_an_entry_replaces_the_default() -> None:
+    text = "default: {gamma: 0.9, tau: 1e-2}\nSparseLine-v0: {policy_kwargs: {optimizer_kwargs: {eps: 1e-5}}}"
+    Path("p.yml").write_text(text, encoding="utf-8")
+    assert load_preset("p.yml", "Other-v0") == {"gamma": 0.9, "tau": 0.01}
+    assert load_preset("p.yml", ENV_ID) == {"policy_kwargs": {"optimizer_kwargs": {"eps": 1e-5}}}
+    Path("p.yml").write_text("default: !!python/object/apply:os.getcwd []", encoding="utf-8")
+    with pytest.raises(ValueError, match="not YAML of plain values"):
+        load_preset("p.yml", ENV_ID)
+
+
+def test_the_shipped_preset_has_settings_for_every_task() -> None:
+    for env_id in ("SparseHalfCheetah-v5", "Anything-v0"):
+        assert load_preset("actpc", env_id)["n_timesteps"] >= 1
+
+
+# mean dense returns that the shipped demonstrators must reach; the paper's agents are compared with such ones
+AIMS = {"HalfCheetah": 5500.0, "Walker2d": 3000.0, "Hopper": 2200.0, "Swimmer": 100.0, "Reacher": -6.0}
+
+
+@pytest.mark.parametrize("task", AIMS)
+def test_every_task_ships_good_successful_demonstrations_and_the_command_that_made_them(task: str) -> None:
+    demonstrations = Demonstrations.load(find_demonstrations(f"Sparse{task}-v5", "shipped"))
+    assert demonstrations.n_episodes == 20
+    assert demonstrations.dense_returns.mean() >= AIMS[task]
+    assert (demonstrations.episode_returns > 0).all()
+    assert demonstrations.metadata["command"].startswith(f"sb3-actpc demos collect --env Sparse{task}-v5")
+    env = make_vec_env(f"Sparse{task}-v5")
+    demonstrations.check(env.observation_space, env.action_space, f"Sparse{task}-v5")
+    assert np.array_equal(demonstrations.rewarded_by(env).rewards, demonstrations.rewards)
+    env.close()
+
+
+def test_the_weak_demonstrators_reach_about_half() -> None:
+    weak = Demonstrations.load(find_demonstrations("SparseHalfCheetah-v5", "weak"))
+    assert 0.4 * AIMS["HalfCheetah"] < weak.dense_returns.mean() < 0.6 * AIMS["HalfCheetah"]
+    with pytest.raises(FileNotFoundError, match="no weak demonstrations of SparseHopper-v5"):
+        find_demonstrations("SparseHopper-v5", "weak")
+
+
+def test_shipped_files_stay_below_12_megabytes() -> None:
+    assert sum(path.stat().st_size for path in DATA_FOLDER.glob("*.npz")) < 12e6
+
+
+def test_assignments_are_read_as_yaml() -> None:
+    texts = ["a=1", "b=1e-3", "c=true", "d=[1, 2]", "e=x=y", "f="]
+    assert parse_assignments(texts) == {"a": 1, "b": 0.001, "c": True, "d": [1, 2], "e": "x=y", "f": None}
+
+
+def test_a_dense_task_needs_no_demonstrations() -> None:
+    assert find_demonstrations("Pendulum-v1", "shipped") is None
+
+
+def test_help_is_quick_and_lists_the_commands() -> None:
+    code = "import sys; from sb3_actpc.cli import main; sys.exit(main(['--help']))"
+    root = Path(__file__).resolve().parents[2]
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=root, timeout=60, check=False)
+    assert result.returncode == 0
+    for command in ("train", "evaluate", "demos"):
+        assert command in result.stdout

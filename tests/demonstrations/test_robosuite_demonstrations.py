@@ -1,0 +1,534 @@
+"""Demonstrations of the robosuite tasks: robomimic's and robosuite's files, scripted operators, the commands."""
+
+import functools
+import http.server
+import json
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import gymnasium as gym
+import h5py
+import numpy as np
+import pytest
+
+from sb3_actpc.cli import main
+from sb3_actpc.demonstrations import ScriptedOperator, collect_scripted, read_robomimic, read_robosuite, write_robomimic
+from sb3_actpc.demonstrations.dataset import Demonstrations, shipped_demonstrations
+from sb3_actpc.demonstrations.download import robomimic_url
+from sb3_actpc.demonstrations.operators import MIXED_OPERATORS, about_z, multiply, rotation_between, yaw_of
+from sb3_actpc.envs import ROBOSUITE_IDS
+from sb3_actpc.envs.robosuite_layouts import ROBOSUITE_TASKS, RobosuiteTask
+
+LIFT, CAN = ROBOSUITE_IDS
+HUMAN_WHEEL = "robosuite==1.4.1"
+HUMAN_FILE = "robosuite/models/assets/demonstrations/lift/demo.hdf5"
+
+
+def made_up(env_id: str, lengths: tuple[int, ...] = (4, 3, 5), obs: str = "paper", seed: int = 0) -> Demonstrations:
+    """Episodes of a robot that nobody simulated, the last step of each a success."""
+    task, rng = ROBOSUITE_TASKS[env_id], np.random.default_rng(seed)
+    layout, blocks = task.layout(obs), []
+    for length in lengths:
+        rows = rng.normal(size=(length + 1, task.obs_dim(obs)))
+        eef = rng.uniform([-0.1, -0.1, 1.0], [0.1, 0.1, 1.1], (length + 1, 3))
+        positions = np.tile([0.02, 0.01, 0.82], (length + 1, 1))
+        positions[-1] = [0.02, 0.01, 0.9] if env_id == LIFT else [0.2, 0.4, 0.86]
+        quats, eef_quats = (unit(rng.normal(size=(length + 1, 4))) for _ in range(2))
+        rows[:, layout["robot0_eef_pos"]], rows[:, layout["robot0_eef_quat"]] = eef, eef_quats
+        rows[:, layout["object"]] = task.object_states(positions, quats, eef, eef_quats)
+        blocks.append(rows.astype(np.float32))
+    n = sum(lengths)
+    ends = np.cumsum(lengths) - 1
+    rewards = np.zeros(n, np.float32)
+    rewards[ends] = 1.0
+    return Demonstrations(
+        observations=np.concatenate([block[:-1] for block in blocks]),
+        actions=rng.uniform(-1.0, 1.0, (n, 7)).astype(np.float32),
+        next_observations=np.concatenate([block[1:] for block in blocks]),
+        rewards=rewards,
+        terminations=rewards > 0,
+        episode_starts=np.array([0, *(ends[:-1] + 1)]),
+        env_id=env_id,
+        metadata={"filter_keys": [["better"], ["worse"], ["better", "20_percent"]]},
+    )
+
+
+def unit(quats: np.ndarray) -> np.ndarray:
+    return quats / np.linalg.norm(quats, axis=1, keepdims=True)
+
+
+@pytest.fixture
+def lift_file(tmp_path: Path) -> Path:
+    write_robomimic(made_up(LIFT), tmp_path / "lift.hdf5")
+    return tmp_path / "lift.hdf5"
+
+
+def assert_equal(first: Demonstrations, second: Demonstrations, atol: float = 0.0) -> None:
+    for name in ("observations", "actions", "next_observations", "rewards", "terminations", "episode_starts"):
+        np.testing.assert_allclose(getattr(first, name), getattr(second, name), atol=atol, rtol=0, err_msg=name)
+
+
+# ------------------------------------------------------------------ layouts
+
+
+@pytest.mark.parametrize(
+    ("env_id", "obs", "size"),
+    [(LIFT, "paper", 42), (CAN, "paper", 46), (LIFT, "robomimic", 19), (CAN, "robomimic", 23)],
+)
+def test_observations_have_the_published_sizes(env_id: str, obs: str, size: int) -> None:
+    task = ROBOSUITE_TASKS[env_id]
+    assert task.obs_dim(obs) == size
+    assert task.obs_of_size(size) == obs
+    columns = np.concatenate([np.arange(size)[part] for part in task.layout(obs).values()])
+    np.testing.assert_array_equal(columns, np.arange(size))
+
+
+def test_the_can_is_seen_from_the_gripper() -> None:
+    """The gripper at (1, 0, 0), turned a quarter about z: what lies ahead of it along y is at its x."""
+    quarter = about_z(np.pi / 2)[None]
+    state = ROBOSUITE_TASKS[CAN].object_states(np.array([[1.0, 2.0, 0.5]]), quarter, np.array([[1.0, 0.0, 0.0]]), quarter)
+    np.testing.assert_allclose(state[0, :7], [2.0, 0.0, 0.5, 0.0, 0.0, 0.0, 1.0], atol=1e-12)
+    np.testing.assert_allclose(state[0, 7:10], [1.0, 2.0, 0.5])
+
+
+def test_rotations_between_orientations_are_the_shortest() -> None:
+    np.testing.assert_allclose(rotation_between(about_z(0.3), about_z(1.0)), [0.0, 0.0, 0.7], atol=1e-12)
+    np.testing.assert_allclose(rotation_between(about_z(0.3), -about_z(1.0)), [0.0, 0.0, 0.7], atol=1e-12)
+    assert yaw_of(multiply(about_z(0.4), about_z(0.5))) == pytest.approx(0.9)
+
+
+# ------------------------------------------------------------------ robomimic's files
+
+
+@pytest.mark.parametrize("env_id", ROBOSUITE_IDS)
+@pytest.mark.parametrize("obs", ["paper", "robomimic"])
+def test_what_is_written_for_robomimic_is_read_again(env_id: str, obs: str, tmp_path: Path) -> None:
+    original = made_up(env_id, obs=obs)
+    write_robomimic(original, tmp_path / "a.hdf5")
+    assert_equal(read_robomimic(tmp_path / "a.hdf5", env_id, obs), original, atol=2e-6)
+
+
+def test_the_file_has_robomimics_layout(lift_file: Path) -> None:
+    """robomimic 0.5, docs/datasets/overview: what its SequenceDataset and env_meta readers look up."""
+    original = made_up(LIFT)
+    with h5py.File(lift_file) as file:
+        data = file["data"]
+        arguments = json.loads(data.attrs["env_args"])
+        assert (arguments["env_name"], arguments["type"]) == ("Lift", 1)
+        assert arguments["env_kwargs"]["controller_configs"]["body_parts"]["right"]["type"] == "OSC_POSE"
+        assert data.attrs["total"] == 12
+        assert [data[name].attrs["num_samples"] for name in ("demo_0", "demo_1", "demo_2")] == [4, 3, 5]
+        np.testing.assert_array_equal(data["demo_1/actions"][()], original.actions[4:7])
+        np.testing.assert_array_equal(data["demo_1/dones"][()], [0, 0, 1])
+        np.testing.assert_array_equal(data["demo_1/obs/robot0_eef_pos"][()], original.observations[4:7, 21:24])
+        np.testing.assert_array_equal(data["demo_1/next_obs/object"][()], original.next_observations[4:7, 32:])
+        assert [name.decode() for name in file["mask/better"][()]] == ["demo_0", "demo_2"]
+
+
+def test_filter_keys_select(lift_file: Path) -> None:
+    better = read_robomimic(lift_file, LIFT, filter_key="better")
+    np.testing.assert_allclose(better.actions, np.delete(made_up(LIFT).actions, [4, 5, 6], axis=0))
+    assert better.metadata["demos"] == ["demo_0", "demo_2"]
+    with pytest.raises(ValueError, match=r"no mask 'okay': choose one of 20_percent, better, worse"):
+        read_robomimic(lift_file, LIFT, filter_key="okay")
+
+
+def test_demonstrations_are_in_the_order_of_their_numbers(tmp_path: Path) -> None:
+    original = made_up(LIFT, lengths=tuple(range(2, 14)))
+    write_robomimic(original, tmp_path / "many.hdf5")
+    assert read_robomimic(tmp_path / "many.hdf5", LIFT).episode_starts.tolist() == original.episode_starts.tolist()
+
+
+def edit(path: Path, change: Callable[[h5py.File], object]) -> None:
+    with h5py.File(path, "r+") as file:
+        change(file)
+
+
+def remove_everywhere(path: Path, key: str) -> None:
+    with h5py.File(path, "r+") as file:
+        for name in file["data"]:
+            del file[f"data/{name}/{key}"]
+
+
+def replace(file: h5py.File, key: str, values: np.ndarray) -> None:
+    del file[key]
+    file[key] = values
+
+
+@pytest.mark.parametrize("env_id", ROBOSUITE_IDS)
+def test_objects_recorded_by_robosuite_1_4_become_those_of_1_5(env_id: str, tmp_path: Path) -> None:
+    original, path = made_up(env_id), tmp_path / "old.hdf5"
+    write_robomimic(original, path)
+
+    def as_1_4(file: h5py.File) -> None:
+        for name in file["data"]:
+            for kind in ("obs", "next_obs"):
+                states = file[f"data/{name}/{kind}/object"][()]
+                moved = [states[:, :7], -states[:, 7:]] if env_id == LIFT else [states[:, 7:], states[:, :7]]
+                replace(file, f"data/{name}/{kind}/object", np.concatenate(moved, axis=1))
+
+    edit(path, as_1_4)
+    assert_equal(read_robomimic(path, env_id), original, atol=2e-6)
+
+
+def test_the_lag_of_robosuite_1_5_is_taken_out(tmp_path: Path) -> None:
+    """It gives the can's pose in the gripper's frame one step late."""
+    original, path = made_up(CAN, lengths=(9,)), tmp_path / "lag.hdf5"
+    write_robomimic(original, path)
+
+    def lag(file: h5py.File) -> None:
+        states = file["data/demo_0/obs/object"][()]
+        states[:, 2] += 0.003
+        states[0, :7] = 0.0
+        replace(file, "data/demo_0/obs/object", states)
+
+    edit(path, lag)
+    assert_equal(read_robomimic(path, CAN), original, atol=2e-6)
+
+
+def test_missing_rewards_are_computed_and_dense_ones_kept_apart(lift_file: Path) -> None:
+    original = made_up(LIFT)
+    remove_everywhere(lift_file, "rewards")
+    read = read_robomimic(lift_file, LIFT)
+    assert read.rewards.tolist() == original.rewards.tolist()
+    assert read.dense_rewards is None
+
+    def shape(file: h5py.File) -> None:
+        for name in file["data"]:
+            file[f"data/{name}/rewards"] = np.linspace(0.1, 0.9, len(file[f"data/{name}/actions"]))
+
+    edit(lift_file, shape)
+    read = read_robomimic(lift_file, LIFT)
+    assert read.rewards.tolist() == original.rewards.tolist()
+    assert read.dense_rewards is not None
+    np.testing.assert_allclose(read.dense_rewards[4:7], [0.1, 0.5, 0.9])
+
+
+def test_an_episode_ends_at_its_first_success(lift_file: Path) -> None:
+    edit(lift_file, lambda file: replace(file, "data/demo_2/rewards", np.array([0.0, 1.0, 1.0, 0.0, 1.0])))
+    read = read_robomimic(lift_file, LIFT)
+    assert read.episode_bounds[2].tolist() == [7, 9]
+    assert read.terminations.tolist() == [False] * 3 + [True] + [False] * 2 + [True] + [False, True]
+
+
+def test_without_next_observations_the_last_one_follows_itself(lift_file: Path) -> None:
+    remove_everywhere(lift_file, "next_obs")
+    original, read = made_up(LIFT), read_robomimic(lift_file, LIFT)
+    np.testing.assert_allclose(read.next_observations[:3], original.next_observations[:3], atol=2e-6)
+    np.testing.assert_allclose(read.next_observations[3], original.observations[3], atol=2e-6)
+
+
+def with_nan(file: h5py.File) -> None:
+    file["data/demo_1/obs/robot0_joint_vel"][2, 3] = np.nan
+
+
+def with_another_arm(file: h5py.File) -> None:
+    arguments = json.loads(file["data"].attrs["env_args"])
+    arguments["env_kwargs"]["robots"] = ["Sawyer"]
+    file["data"].attrs["env_args"] = json.dumps(arguments)
+
+
+def with_old_controller(file: h5py.File) -> None:
+    arguments = json.loads(file["data"].attrs["env_args"])
+    arguments["env_kwargs"]["controller_configs"] = {"type": "JOINT_VELOCITY"}
+    file["data"].attrs["env_args"] = json.dumps(arguments)
+
+
+BAD_FILES: dict[str, tuple[Callable[[h5py.File], object], str]] = {
+    "no env_args": (lambda f: f["data"].attrs.pop("env_args"), r"attribute 'env_args' of 'data' is missing"),
+    "env_args": (lambda f: f["data"].attrs.__setitem__("env_args", "{"), r"attribute 'env_args' of 'data' is not JSON"),
+    "robot": (with_another_arm, r"expected demonstrations with robots = 'Panda', found 'Sawyer'"),
+    "controller": (with_old_controller, r"controller = 'OSC_POSE', found 'JOINT_VELOCITY'"),
+    "no data": (lambda f: f.pop("data"), r"expected a group 'data'"),
+    "no demos": (lambda f: [f["data"].pop(name) for name in list(f["data"])], r"expected demonstrations data/demo_0"),
+    "actions missing": (lambda f: f["data/demo_1"].pop("actions"), r"demo_1: key 'actions' is missing"),
+    "action size": (
+        lambda f: replace(f, "data/demo_1/actions", np.zeros((3, 6))),
+        r"demo_1: key 'actions' .*\(N, 7\).*\(3, 6\)",
+    ),
+    "action range": (
+        lambda f: replace(f, "data/demo_1/actions", np.full((3, 7), 2.0)),
+        r"demo_1: key 'actions' must lie in \[-1, 1\]",
+    ),
+    "no rows": (lambda f: replace(f, "data/demo_1/actions", np.zeros((0, 7))), r"demo_1: key 'actions' must have the shape"),
+    "obs missing": (lambda f: f["data/demo_1"].pop("obs"), r"demo_1: key 'obs' is missing"),
+    "obs key missing": (
+        lambda f: f["data/demo_2/obs"].pop("robot0_joint_vel"),
+        r"demo_2: obs: key 'robot0_joint_vel' is missing.*obs='robomimic' needs fewer keys",
+    ),
+    "length": (
+        lambda f: replace(f, "data/demo_2/obs/object", np.zeros((4, 10))),
+        r"demo_2: obs: key 'object' .*\(5, 10\).*\(4, 10\)",
+    ),
+    "nan": (with_nan, r"demo_1: obs: key 'robot0_joint_vel' must be finite, found nan at index \(2, 3\)"),
+    "text": (lambda f: replace(f, "data/demo_0/rewards", np.array([b"x"] * 4)), r"demo_0: key 'rewards' must hold numbers"),
+    "object": (
+        lambda f: replace(f, "data/demo_0/obs/object", np.ones((4, 10))),
+        r"demo_0: obs: key 'object' must hold the object's pos, quat, to_eef_pos.* do not agree with robot0_eef_pos",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", BAD_FILES)
+def test_a_bad_file_is_named_with_demonstration_and_key(name: str, lift_file: Path) -> None:
+    change, message = BAD_FILES[name]
+    edit(lift_file, change)
+    with pytest.raises(ValueError, match=message) as caught:
+        read_robomimic(lift_file, LIFT)
+    assert str(lift_file) in str(caught.value)
+
+
+def test_a_file_cut_short_anywhere_is_refused(lift_file: Path) -> None:
+    content = lift_file.read_bytes()
+    for size in (0, 1, 100, len(content) // 2, len(content) - 1000):
+        lift_file.write_bytes(content[:size])
+        with pytest.raises(ValueError, match=rf"{lift_file}"):
+            read_robomimic(lift_file, LIFT)
+
+
+def test_another_task_and_a_missing_file_are_refused(lift_file: Path, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="env_name = 'PickPlaceCan', found 'Lift'"):
+        read_robomimic(lift_file, CAN)
+    with pytest.raises(ValueError, match="is not a robosuite task"):
+        read_robomimic(lift_file, "SparseHopper-v5")
+    with pytest.raises(FileNotFoundError, match="no demonstrations file"):
+        read_robomimic(tmp_path / "none.hdf5", LIFT)
+    hopper = made_up(LIFT)
+    object.__setattr__(hopper, "env_id", "SparseHopper-v5")
+    with pytest.raises(ValueError, match="is not a robosuite task"):
+        write_robomimic(hopper, tmp_path / "x.hdf5")
+    assert not (tmp_path / "x.hdf5").exists()
+
+
+def test_a_failed_write_leaves_the_old_file(lift_file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = lift_file.read_bytes()
+    monkeypatch.setattr("os.replace", lambda *_: (_ for _ in ()).throw(OSError("disk full")))
+    with pytest.raises(OSError, match="disk full"):
+        write_robomimic(made_up(LIFT, seed=1), lift_file)
+    assert lift_file.read_bytes() == before
+    assert [path.name for path in lift_file.parent.iterdir()] == ["lift.hdf5"]
+
+
+# ------------------------------------------------------------------ commands
+
+
+def test_convert_goes_both_ways(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    original = made_up(LIFT)
+    original.save(tmp_path / "a.npz")
+    assert main(["demos", "convert", str(tmp_path / "a.npz")]) == 0
+    assert main(["demos", "convert", str(tmp_path / "a.hdf5"), "--env", LIFT, "--output", str(tmp_path / "b.npz")]) == 0
+    assert_equal(Demonstrations.load(tmp_path / "b.npz"), original, atol=2e-6)
+    assert main(["demos", "convert", str(tmp_path / "a.hdf5")]) == 2
+    assert "--env is needed" in capsys.readouterr().err
+
+
+def test_a_robomimic_file_in_the_place_of_an_npz_is_recognised(lift_file: Path) -> None:
+    with pytest.raises(ValueError, match="sb3-actpc demos convert"):
+        Demonstrations.load(lift_file)
+
+
+@pytest.fixture
+def server(tmp_path: Path) -> Iterator[tuple[str, Path]]:
+    """A web server on this machine, and the folder it serves."""
+
+    class Quiet(http.server.SimpleHTTPRequestHandler):
+        def log_message(self, format: str, *args: object) -> None:
+            pass
+
+    folder = tmp_path / "www"
+    folder.mkdir()
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(Quiet, directory=str(folder))) as running:
+        thread = threading.Thread(target=running.serve_forever)
+        thread.start()
+        yield f"http://127.0.0.1:{running.server_port}", folder
+        running.shutdown()
+        thread.join()
+
+
+def test_download_fetches_checks_and_converts(
+    server: tuple[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    url, folder = server
+    monkeypatch.chdir(tmp_path)
+    write_robomimic(made_up(CAN), folder / "can.hdf5")
+    command = ["demos", "download", "--env", CAN, "--url"]
+    assert main([*command, f"{url}/can.hdf5", "--output", "can.npz"]) == 0
+    assert_equal(Demonstrations.load("can.npz"), made_up(CAN), atol=2e-6)
+    capsys.readouterr()
+    write_robomimic(made_up(LIFT), folder / "lift.hdf5")
+    for name, message in (("lift.hdf5", "env_name = 'PickPlaceCan'"), ("nothing.hdf5", "could not fetch")):
+        assert main([*command, f"{url}/{name}", "--output", f"{name}.npz"]) == 2
+        error = capsys.readouterr().err
+        assert message in error and len(error.strip().splitlines()) == 1
+        assert not Path(f"{name}.npz").exists()
+
+
+def test_without_a_network_download_ends_with_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command = ["demos", "download", "--env", LIFT, "--url", "http://127.0.0.1:9/x.hdf5", "--output", str(tmp_path / "x.npz")]
+    assert main(command) == 2
+    error = capsys.readouterr().err.strip()
+    assert len(error.splitlines()) == 1 and "could not fetch" in error and "demos convert" in error
+    assert list(tmp_path.iterdir()) == []
+    assert robomimic_url(CAN, "ph").endswith("v1.5/can/ph/low_dim_v15.hdf5")
+
+
+# ------------------------------------------------------------------ with the simulator
+
+
+@pytest.fixture(scope="module")
+def with_robosuite() -> None:
+    pytest.importorskip("robosuite", reason="robosuite is an extra")
+
+
+@pytest.mark.usefixtures("with_robosuite")
+@pytest.mark.parametrize("env_id", ROBOSUITE_IDS)
+@pytest.mark.parametrize("obs", ["paper", "robomimic"])
+def test_a_sure_operator_succeeds(env_id: str, obs: str) -> None:
+    """More episodes: see the README; here a few starts."""
+    recorded = collect_scripted(env_id, 1.0, n_episodes=2, seed=50, max_tries=2, obs=obs)
+    assert recorded.episode_returns.tolist() == [1.0, 1.0]
+    assert recorded.terminations.sum() == 2
+    with gym.make(env_id, obs=obs) as env:
+        recorded.check(env.observation_space, env.action_space, env_id)
+
+
+@pytest.mark.usefixtures("with_robosuite")
+def test_proficiency_makes_operators_quicker() -> None:
+    lengths = [len(collect_scripted(LIFT, level, n_episodes=3, seed=3)) for level in (0.0, 1.0)]
+    assert lengths[0] > 1.5 * lengths[1]
+
+
+@pytest.mark.usefixtures("with_robosuite")
+def test_a_recording_can_be_repeated_and_played_again() -> None:
+    first, second = (collect_scripted(LIFT, 0.3, n_episodes=2, seed=5) for _ in range(2))
+    assert_equal(first, second)
+    env = gym.make(LIFT)
+    observation, _ = env.reset(seed=5)
+    for row in range(int(first.episode_bounds[0, 1])):
+        np.testing.assert_array_equal(observation, first.observations[row])
+        observation, reward, *_ = env.step(first.actions[row])
+        assert reward == first.rewards[row]
+    env.close()
+
+
+@pytest.mark.usefixtures("with_robosuite")
+def test_a_mixed_set_has_six_operators_of_three_levels(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    output = tmp_path / "mixed.npz"
+    command = ["demos", "collect", "--env", LIFT, "--expert", "scripted", "--proficiency", "mixed"]
+    assert main([*command, "--episodes", "6", "--output", str(output)]) == 0
+    mixed = Demonstrations.load(output)
+    assert mixed.n_episodes == 6
+    keys = mixed.metadata["filter_keys"]
+    assert [key[0] for key in keys] == ["worse", "worse", "okay", "okay", "better", "better"]
+    assert [key[1] for key in keys[:2]] == ["worse_operator_1", "worse_operator_2"]
+    write_robomimic(mixed, tmp_path / "mixed.hdf5")
+    picked = read_robomimic(tmp_path / "mixed.hdf5", LIFT, filter_key="okay_operator_2")
+    assert picked.metadata["demos"] == ["demo_3"]
+    assert main([*command, "--episodes", "10", "--output", str(output)]) == 2
+    assert "must be a multiple of its 6 operators: ask for 12" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("proficiency", [-0.1, 1.1, float("nan"), True])
+def test_a_wrong_proficiency_is_refused(proficiency: float) -> None:
+    with pytest.raises(ValueError, match="must be a number from 0"):
+        ScriptedOperator(LIFT, proficiency=proficiency)
+
+
+def test_the_levels_of_a_mixed_set_are_apart() -> None:
+    levels = {name: [value for level, value in MIXED_OPERATORS if level == name] for name in ("worse", "okay", "better")}
+    assert max(levels["worse"]) < min(levels["okay"]) < max(levels["okay"]) < min(levels["better"])
+
+
+@pytest.mark.parametrize("env_id", ROBOSUITE_IDS)
+def test_50_successful_episodes_are_shipped(env_id: str) -> None:
+    shipped = Demonstrations.load(shipped_demonstrations(env_id))
+    assert shipped.env_id == env_id
+    assert shipped.n_episodes == 50
+    assert (shipped.episode_returns == 1.0).all()
+    task: RobosuiteTask = ROBOSUITE_TASKS[env_id]
+    layout = task.layout("paper")
+    after = shipped.next_observations
+    solved = task.is_success(after[:, layout["object"]], after[:, layout["robot0_eef_pos"]])
+    np.testing.assert_array_equal(solved, shipped.terminations)
+    sizes = [shipped_demonstrations(one).stat().st_size for one in ROBOSUITE_IDS]
+    assert sum(sizes) < 6e6
+
+
+def write_states(path: Path, n: int = 6, size: int = 32, env_name: str = "Lift", high: bool = True) -> None:
+    """A file as robosuite's collect_human_demonstrations writes it: a cube that is lifted by nobody."""
+    states = np.zeros((n, size))
+    states[:, 1:8] = [0.0, 0.2, 0.0, -2.6, 0.0, 2.9, 0.8]
+    states[:, 10:13] = [0.0, 0.0, 0.821]
+    states[:, 13] = 1.0
+    if high:
+        states[3:, 12] = 0.9
+    with h5py.File(path, "w") as file:
+        data = file.create_group("data")
+        data.attrs["env"] = env_name
+        recorded = {"env_name": env_name, "robots": "Panda", "controller_configs": {"type": "OSC_POSE"}}
+        data.attrs["env_info"] = json.dumps(recorded)
+        demo = data.create_group("demo_1")
+        demo["states"], demo["actions"] = states, np.full((n, 7), 1.5)
+
+
+@pytest.mark.usefixtures("with_robosuite")
+def test_robosuites_own_states_are_replayed(tmp_path: Path) -> None:
+    write_states(tmp_path / "demo.hdf5")
+    read = read_robosuite(tmp_path / "demo.hdf5", LIFT)
+    assert read.rewards.tolist() == [0.0, 0.0, 1.0]
+    assert (read.actions == 1.0).all()
+    np.testing.assert_allclose(read.observations[0, :7], np.cos([0.0, 0.2, 0.0, -2.6, 0.0, 2.9, 0.8]), atol=1e-6)
+    np.testing.assert_allclose(read.next_observations[2, 32:35], [0.0, 0.0, 0.9], atol=1e-6)
+    write_states(tmp_path / "low.hdf5", high=False)
+    low = read_robosuite(tmp_path / "low.hdf5", LIFT)
+    assert (len(low), low.rewards.sum(), low.terminations.sum()) == (5, 0.0, 0)
+
+
+@pytest.mark.usefixtures("with_robosuite")
+def test_bad_files_of_robosuites_are_named(tmp_path: Path) -> None:
+    path = tmp_path / "demo.hdf5"
+    write_states(path, size=71)
+    with pytest.raises(ValueError, match=rf"{path}: demo_1: key 'states' .*\(6, 32\).*\(6, 71\)"):
+        read_robosuite(path, LIFT)
+    write_states(path, env_name="PickPlace")
+    with pytest.raises(ValueError, match="env_name = 'Lift', found 'PickPlace'"):
+        read_robosuite(path, LIFT)
+    write_states(path)
+    edit(path, lambda file: file["data/demo_1"].pop("states"))
+    with pytest.raises(ValueError, match="demo_1: key 'states' is missing"):
+        read_robosuite(path, LIFT)
+    path.write_bytes(path.read_bytes()[:900])
+    with pytest.raises(ValueError, match="expected a whole HDF5 file"):
+        read_robosuite(path, LIFT)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("with_robosuite")
+def test_human_demonstrations_of_robosuite_lift_the_cube() -> None:
+    """Three of a person's demonstrations (MIT licence) in the wheel of robosuite 1.4.1 on PyPI: 194 MB, kept in the cache."""
+    read = read_robosuite(human_file(), LIFT)
+    assert read.episode_returns.tolist() == [1.0, 1.0, 1.0]
+    assert read.actions.min() == -1.0 and read.actions.max() == 1.0  # clipped: they reach 3.75
+    for start, end in read.episode_bounds:
+        heights = read.next_observations[start:end, 34]
+        assert heights[0] < 0.84 < heights[-1]
+        assert (heights[:-1] <= 0.84).all()
+
+
+def human_file() -> Path:
+    """``demo.hdf5`` of the wheel, fetched with pip the first time."""
+    import zipfile
+
+    folder = Path.home() / ".cache" / "sb3_actpc"
+    target = folder / "lift_human.hdf5"
+    if not target.is_file():
+        folder.mkdir(parents=True, exist_ok=True)
+        fetch = [sys.executable, "-m", "pip", "download", "--quiet", "--no-deps", "--dest", str(folder), HUMAN_WHEEL]
+        subprocess.run(fetch, check=True)
+        (wheel,) = folder.glob("robosuite-1.4.1-*.whl")
+        with zipfile.ZipFile(wheel) as archive:
+            target.write_bytes(archive.read(HUMAN_FILE))
+    return target

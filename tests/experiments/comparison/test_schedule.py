@@ -1,0 +1,348 @@
+"""Which runs are begun, gone on with, tried again or left alone; in this process, with faults planted."""
+
+import errno
+import json
+import os
+import shutil
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from sb3_actpc.checkpoints import list_bundles
+from sb3_actpc.cli import main
+from sb3_actpc.experiments.comparison import PlannedRun
+from sb3_actpc.experiments.comparison.display import LineDisplay, Tally, duration, make_display
+from sb3_actpc.experiments.comparison.engines.cluster import _execute, pack_folder, unpack_folder
+from sb3_actpc.experiments.comparison.execution import (
+    FAILED,
+    FINISHED,
+    LOST,
+    NEW,
+    UNFINISHED,
+    Outcome,
+    execute_run,
+    run_status,
+)
+from sb3_actpc.experiments.comparison.lock import FolderBusy, folder_lock
+from sb3_actpc.experiments.comparison.schedule import MAX_LOSSES
+from sb3_actpc.experiments.runs.record import read_result
+from sb3_actpc.experiments.runs.run import CHECKPOINTS
+from tests.checkpoints.runs import log_rows
+from tests.experiments.comparison import tasks
+from tests.experiments.comparison.tasks import bring_to_end, interrupt_after, small_runs, write_preset
+
+OUT = Path("out")
+FILES = ("progress.csv", "episodes.csv")
+
+
+@pytest.fixture(autouse=True)
+def empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_preset()
+
+
+def measured(run: PlannedRun) -> list[Any]:
+    """What a run wrote, without times of the clock."""
+    return [log_rows(run.folder / name) for name in FILES]
+
+
+def test_all_runs_are_brought_to_their_end_once() -> None:
+    runs = small_runs(OUT, ["first", "second"])
+    summary, engine, _ = bring_to_end(runs, OUT)
+    assert (len(summary.finished), summary.failed, summary.unfinished) == (2, [], [])
+    assert engine.begun == runs
+    before = [(run.folder / "result.json").read_bytes() for run in runs]
+    summary, engine, display = bring_to_end(runs, OUT)
+    assert len(summary.finished) == 2 and engine.begun == []
+    assert display.lines == ["0 to do, 2 finished"]
+    assert [(run.folder / "result.json").read_bytes() for run in runs] == before
+
+
+def test_a_table_that_grows_is_only_added_to() -> None:
+    bring_to_end(small_runs(OUT, ["first"]), OUT)
+    _, engine, _ = bring_to_end(small_runs(OUT, ["first", "second"], seeds=2), OUT)
+    assert [(run.variant, run.config.seed) for run in engine.begun] == [("second", 0), ("first", 1), ("second", 1)]
+
+
+def test_an_unfinished_run_goes_on_from_its_checkpoint_and_ends_as_the_one_never_stopped() -> None:
+    [straight] = small_runs(Path("straight"))
+    bring_to_end([straight], Path("straight"))
+    [run] = small_runs(OUT)
+    interrupt_after(run, 33)
+    assert run_status(run.folder) == UNFINISHED
+    summary, engine, _ = bring_to_end([run], OUT)
+    assert summary.finished == [run]
+    assert "60 steps from step 33" in engine.lines[0]
+    assert measured(run) == measured(straight)
+    assert [row["timesteps"] for row in measured(run)[1]] == ["8", "16", "24", "32", "40", "48", "56"]
+
+
+def test_a_truncated_checkpoint_is_passed_over_for_the_one_before() -> None:
+    [straight] = small_runs(Path("straight"))
+    bring_to_end([straight], Path("straight"))
+    [run] = small_runs(OUT)
+    interrupt_after(run, 33)
+    newest = list_bundles(run.folder / CHECKPOINTS)[-1] / "state.json"
+    newest.write_bytes(newest.read_bytes()[:100])
+    _, engine, _ = bring_to_end([run], OUT)
+    assert "damaged checkpoint skipped" in engine.lines[0] and "state.json" in engine.lines[0]
+    assert "from step 30" in engine.lines[1]
+    assert measured(run) == measured(straight)
+
+
+def test_a_run_whose_checkpoints_are_all_damaged_starts_again() -> None:
+    [run] = small_runs(OUT)
+    interrupt_after(run, 33)
+    for bundle in list_bundles(run.folder / CHECKPOINTS):
+        (bundle / "manifest.json").write_bytes(b"{")
+    summary, engine, _ = bring_to_end([run], OUT)
+    assert summary.finished == [run]
+    assert any("checkpoints are damaged: the run starts again" in line for line in engine.lines)
+
+
+def test_a_damaged_config_starts_the_run_again() -> None:
+    [run] = small_runs(OUT)
+    interrupt_after(run, 33)
+    (run.folder / "config.json").write_bytes(b"{")
+    summary, engine, _ = bring_to_end([run], OUT)
+    assert summary.finished == [run]
+    assert "config.json: not a JSON file: the run starts again" in engine.lines[0]
+
+
+def test_a_corrupt_result_is_written_again_without_training() -> None:
+    [run] = small_runs(OUT)
+    bring_to_end([run], OUT)
+    before = (run.folder / "result.json").read_bytes()
+    for content in (b"", b"{", b"[]", b'{"env": 1}', b"\xff", before[:-40]):
+        (run.folder / "result.json").write_bytes(content)
+        assert run_status(run.folder) == UNFINISHED
+        summary, engine, display = bring_to_end([run], OUT)
+        assert summary.finished == [run] and engine.begun == []
+        assert "written again from the run's other files" in display.lines[0]
+        assert (run.folder / "result.json").read_bytes() == before
+
+
+def test_a_result_of_a_run_that_has_not_ended_is_removed_and_the_run_goes_on() -> None:
+    [run] = small_runs(OUT)
+    interrupt_after(run, 33)
+    (run.folder / "result.json").write_bytes(b"{")
+    summary, engine, display = bring_to_end([run], OUT)
+    assert "the run goes on from its last checkpoint" in display.lines[0]
+    assert "from step 33" in engine.lines[0] and summary.finished == [run]
+
+
+def test_a_failed_run_stops_no_other_and_is_tried_again_on_request_only() -> None:
+    Path("fault").touch()
+    runs = small_runs(OUT, ["first", "second"], fault=str(Path("fault").absolute()), at_fault="error")
+    summary, _, _ = bring_to_end(runs, OUT)
+    [(failed, message)] = summary.failed
+    assert failed == runs[0] and message == "RuntimeError: the planted fault"
+    assert summary.finished == runs[1:]
+    assert "tasks.py" in json.loads((failed.folder / "error.json").read_text(encoding="utf-8"))["details"]
+    summary, engine, _ = bring_to_end(runs, OUT)
+    assert engine.begun == [] and [run for run, _ in summary.failed] == [failed]
+    summary, engine, _ = bring_to_end(runs, OUT, retry_failed=True)
+    assert engine.begun == [failed]
+    assert "from step 20" in engine.lines[0]
+    assert summary.finished == runs and not (failed.folder / "error.json").exists()
+
+
+class FaultyEngine(tasks.InlineEngine):
+    """The process of a run dies so many times."""
+
+    n_losses = 0
+
+    def execute(self, run: PlannedRun) -> Outcome:
+        if self.n_losses:
+            self.n_losses -= 1
+            return Outcome(LOST, "the process of the run ended with signal 9")
+        return super().execute(run)
+
+
+@pytest.mark.parametrize("n_losses", [MAX_LOSSES - 1, MAX_LOSSES])
+def test_a_run_whose_process_dies_is_tried_again_but_not_for_ever(n_losses: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tasks, "InlineEngine", FaultyEngine)
+    monkeypatch.setattr(FaultyEngine, "n_losses", n_losses)
+    [run] = small_runs(OUT)
+    summary, engine, _ = bring_to_end([run], OUT)
+    assert len(engine.begun) == min(n_losses + 1, MAX_LOSSES)
+    if n_losses < MAX_LOSSES:
+        assert summary.finished == [run]
+    else:
+        assert summary.failed == [(run, "given up after 3 times: the process of the run ended with signal 9")]
+
+
+def test_a_full_disk_stops_the_command_and_loses_nothing() -> None:
+    Path("fault").touch()
+    runs = small_runs(OUT, ["first", "second"], fault=str(Path("fault").absolute()), at_fault="full")
+    summary, engine, _ = bring_to_end(runs, OUT)
+    assert summary.stopped_by == "disk full" and "No space left" in summary.message
+    assert engine.begun == runs[:1] and summary.unfinished == runs  # nothing further is begun
+    assert not (runs[0].folder / "error.json").exists()  # the run is not to blame
+    summary, engine, _ = bring_to_end(runs, OUT)
+    assert summary.finished == runs
+    assert "from step 20" in engine.lines[0]
+
+
+def can_mount() -> bool:
+    return hasattr(os, "geteuid") and os.geteuid() == 0 and shutil.which("mount") is not None
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A file system of 1 MB."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    if not can_mount():
+        pytest.skip("only root can mount a small file system")
+    mount = ["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", str(folder)]
+    if subprocess.run(mount, capture_output=True, check=False).returncode:
+        pytest.skip("no file system can be mounted here")
+    yield folder
+    subprocess.run(["umount", "-l", str(folder)], check=True)
+
+
+def test_on_a_disk_that_is_really_full_nothing_is_lost(small_disk: Path) -> None:
+    """The first run is finished and leaves 20 kB, the second does not fit; once there is room it goes on."""
+    [first] = small_runs(small_disk, ["first"])
+    bring_to_end([first], small_disk)
+    kept = measured(first)
+    free = shutil.disk_usage(small_disk).free
+    (small_disk / "ballast").write_bytes(b"x" * max(free - 20_000, 0))
+    runs = [first, *small_runs(small_disk, ["second"])]
+    summary, _, _ = bring_to_end(runs, small_disk)
+    assert summary.stopped_by == "disk full"
+    assert summary.finished == [first] and measured(first) == kept
+    (small_disk / "ballast").unlink()
+    summary, engine, _ = bring_to_end(runs, small_disk)
+    assert summary.finished == runs and engine.begun == runs[1:]
+    [straight] = small_runs(Path("straight"), ["second"])
+    bring_to_end([straight], Path("straight"))
+    assert measured(runs[1]) == measured(straight)
+
+
+def test_a_second_command_in_the_folder_is_refused_with_a_message(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sb3_actpc.experiments.comparison.schedule.LOCK_WAIT", 0.3)
+    with folder_lock(OUT, 0.0):
+        assert main(["compare", "--envs", "SparseReacher-v5", "--algos", "actpc", "--out", str(OUT)]) == 2
+    captured = capsys.readouterr()
+    assert f"out is in use by another process ({os.getpid()}): waiting" in captured.out
+    assert f"out is in use by another process ({os.getpid()}): wait until it has ended" in captured.err
+    assert not list(OUT.rglob("seed*"))
+
+
+def test_a_run_that_another_process_works_on_waits(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sb3_actpc.experiments.comparison.execution.LOCK_WAIT", 0.3)
+    [run] = small_runs(OUT)
+    with folder_lock(run.folder, 0.0):
+        lines: list[str] = []
+        outcome = execute_run(run, lines.append, lambda steps: None)
+        assert outcome.status == FAILED and "is in use by another process" in outcome.message
+        assert "waiting" in lines[0]
+    with folder_lock(run.folder, 0.0):  # free again
+        pass
+    with folder_lock(run.folder, 0.0), pytest.raises(FolderBusy), folder_lock(run.folder, 0.0):
+        raise AssertionError("two held one folder")
+
+
+def test_every_state_of_a_run_has_its_name() -> None:
+    [run] = small_runs(OUT)
+    assert run_status(run.folder) == NEW
+    bring_to_end([run], OUT)
+    assert run_status(run.folder) == FINISHED
+    assert read_result(run.folder)["timesteps"] == 60
+
+
+def test_a_node_without_the_folders_works_on_a_copy_that_comes_back() -> None:
+    """What the Ray engine's task does where the probe cannot be seen, after an interruption elsewhere."""
+    [straight] = small_runs(Path("straight"))
+    bring_to_end([straight], Path("straight"))
+    [run] = small_runs(OUT)
+    interrupt_after(run, 33)
+    packed = pack_folder(run.folder)
+    status, message, returned = _execute(run.to_json(), "/there/is/no/such/probe", packed, None)
+    assert (status, message) == (FINISHED, "") and returned is not None
+    assert run_status(run.folder) == UNFINISHED  # the copy was worked on
+    unpack_folder(returned, run.folder)
+    assert run_status(run.folder) == FINISHED
+    assert measured(run) == measured(straight)
+    assert not list((run.folder / CHECKPOINTS).rglob("*.json"))  # gone from the copy, gone from here
+
+
+def test_the_tally_counts_steps_and_estimates_the_time_left() -> None:
+    now = [0.0]
+    tally = Tally(lambda: now[0])
+    runs = small_runs(OUT, ["first", "second"])  # 60 steps each
+    tally.begin(runs, 3)
+    assert tally.seconds_left is None
+    tally.step(runs[0].id, 20)  # where it was found
+    now[0] = 10.0
+    tally.step(runs[0].id, 40)
+    # 20 steps in 10 seconds; 20 + 60 are left
+    assert (tally.steps_per_second, tally.seconds_left) == (2.0, 40.0)
+    tally.n_running = 1
+    assert tally.summary() == "3 of 5 runs done, 1 running, 2 steps/s, 40 s left"
+    tally.end(runs[0].id, FINISHED)
+    assert (tally.n_finished, tally.n_running) == (4, 0)
+
+
+def test_the_estimate_comes_from_what_was_measured_and_counts_what_is_left() -> None:
+    from sb3_actpc.experiments.comparison.estimate import GUESSED, MEASURED, estimate_runs, steps_done
+
+    finished, stopped, new = [*small_runs(OUT, seeds=2), *small_runs(OUT, ["second"])]
+    bring_to_end([finished], OUT)
+    interrupt_after(stopped, 33)
+    result = json.loads((finished.folder / "result.json").read_text(encoding="utf-8"))
+    (finished.folder / "result.json").write_text(json.dumps({**result, "wall_seconds": 600.0}), encoding="utf-8")
+    estimates = estimate_runs([finished, stopped, new])
+    assert steps_done(stopped.folder) == 33
+    # 600 seconds for 60 steps: 10 for each of the 27 that are left
+    assert (estimates[stopped.id].seconds, estimates[stopped.id].source) == (270.0, MEASURED)
+    assert (estimates[new.id].seconds, estimates[new.id].source) == (60 * 15.0 / 1000.0, GUESSED)
+
+
+def test_durations_are_for_people() -> None:
+    assert [duration(seconds) for seconds in (5.2, 61.0, 7500.0)] == ["5 s", "1 min 01 s", "2 h 05 min"]
+
+
+def test_without_a_terminal_there_are_lines() -> None:
+    display = make_display(live=True)
+    assert type(display) is LineDisplay
+    lines: list[str] = []
+    display = LineDisplay(lines.append)
+    [run] = small_runs(OUT)
+    display.begin([run], 0)
+    display.started(run)
+    display.ended(run, Outcome(FAILED, "a reason"))
+    assert "failed" in lines[-1] and "a reason" in lines[-1] and "1 failed" in lines[-1]
+
+
+def test_in_a_terminal_there_are_bars() -> None:
+    from io import StringIO
+
+    from rich.console import Console
+
+    from sb3_actpc.experiments.comparison.display import LiveDisplay
+
+    text = StringIO()
+    [run] = small_runs(OUT)
+    with LiveDisplay(Console(file=text, force_terminal=True, width=160)) as display:
+        display.begin([run], 1)
+        display.started(run)
+        display.stepped(run, 30)
+        display.progress.refresh()
+        display.ended(run, Outcome(FINISHED))
+    shown = text.getvalue()
+    assert "30/60" in shown and "2 of 2 runs done" in shown
+
+
+def test_disk_full_is_told_from_other_errors() -> None:
+    from sb3_actpc.experiments.comparison.execution import is_disk_full
+
+    assert is_disk_full(OSError(errno.ENOSPC, "")) and is_disk_full(OSError(errno.EDQUOT, ""))
+    assert not is_disk_full(OSError(errno.EACCES, "")) and not is_disk_full(ValueError())
