@@ -24,14 +24,14 @@ class BC(OfflineAlgorithm):
     """
     Behaviour cloning: the mean squared error between the demonstrated actions (scaled to [-1, 1]) and the network's.
 
-    A step of ``learn`` is one gradient step (see :class:`~sb3_actpc.baselines.offline.base.OfflineAlgorithm`). Observations are
-    normalised by the demonstrations' mean and standard deviation.
+    A step of ``learn`` is one gradient step (see :class:`~sb3_actpc.baselines.offline.base.OfflineAlgorithm`). Observations
+    are normalised by the demonstrations' mean and standard deviation.
 
     :param policy: "MlpPolicy"
     :param env: a task with Box observations and actions; for its spaces and for evaluations
     :param weight_decay: decoupled from the gradient (AdamW)
     :param input_noise: standard deviation of Gaussian noise on the normalised observations of each batch
-    :param options: keywords of :class:`~sb3_actpc.baselines.offline.base.OfflineAlgorithm`; ``policy_kwargs`` takes ``net_arch``
+    :param options: keywords of :class:`~sb3_actpc.baselines.offline.base.OfflineAlgorithm`; ``policy_kwargs``: ``net_arch``
     :raises ValueError: as there
     """
 

@@ -1,7 +1,7 @@
 """ActPC and the baselines in rl-zoo3: its own command line, with our algorithms, settings and tasks.
 
 ``sb3-actpc zoo train | enjoy | optimize | plot ...`` and ``python -m sb3_actpc.experiments.zoo ...`` put the algorithms of
-``sb3_actpc.experiments.runs.ALGORITHMS`` into ``rl_zoo3.ALGOS`` and hand over to rl_zoo3, so that every option of its scripts works.
+``sb3_actpc.experiments.runs.ALGORITHMS`` into ``rl_zoo3.ALGOS`` and hand over to rl_zoo3: every option of its scripts works.
 Ours are ``--preset`` and ``--demonstrations`` (as of ``sb3-actpc train``) before training, and ``--output`` of the plots.
 
 What rl_zoo3 gets is a settings file with one entry, made from the preset, because rl_zoo3

@@ -337,7 +337,8 @@ def test_the_demonstrator_beside_is_the_one_that_the_run_had(
     config = json.loads((RUN / "config.json").read_text(encoding="utf-8"))
     (RUN / "config.json").write_text(json.dumps({**config, "demonstrations": choice}), encoding="utf-8")
     write_demonstrations(Path("others.npz"), dense_reward=1.0)
-    monkeypatch.setattr("sb3_actpc.experiments.runs.config.shipped_demonstrations", lambda env_id, weak=False: Path("others.npz"))
+    shipped = "sb3_actpc.experiments.runs.config.shipped_demonstrations"
+    monkeypatch.setattr(shipped, lambda env_id, weak=False: Path("others.npz"))
     recorded: list[Any] = []
     monkeypatch.setattr("sb3_actpc.experiments.runs.video.record_video", lambda *arguments: recorded.append(arguments) or 1)
     assert main(beside) == 0
@@ -361,7 +362,8 @@ def test_the_first_graphics_backend_that_works_is_chosen(monkeypatch: pytest.Mon
     monkeypatch.setenv("MUJOCO_GL", "mine")
     monkeypatch.delenv("PYOPENGL_PLATFORM", raising=False)
     for working in ("mine", "egl", "osmesa"):
-        monkeypatch.setattr("sb3_actpc.experiments.runs.video._probe", lambda variables, name=working: variables["MUJOCO_GL"] == name)
+        probe = "sb3_actpc.experiments.runs.video._probe"
+        monkeypatch.setattr(probe, lambda variables, name=working: variables["MUJOCO_GL"] == name)
         assert choose_gl_backend() == working
         assert os.environ["MUJOCO_GL"] == working
 

@@ -1,4 +1,4 @@
-"""A program of :mod:`sb3_actpc.baselines.offline.servers`, started in its own virtual environment and asked through its pipes."""
+"""A program of :mod:`sb3_actpc.baselines.offline.servers`, in its own virtual environment, asked through its pipes."""
 
 from __future__ import annotations
 

@@ -90,8 +90,8 @@ class ServedAlgorithm(OfflineAlgorithm):
     :param batch_size: B
     :param method_kwargs: the method's own settings, by the names that its package gives them
     :param timeout: seconds that one gradient step, or the start, may take
-    :param options: further keywords of :class:`~sb3_actpc.baselines.offline.base.OfflineAlgorithm`; the learning rates are among
-        ``method_kwargs``
+    :param options: further keywords of :class:`~sb3_actpc.baselines.offline.base.OfflineAlgorithm`; the learning rates are
+        among ``method_kwargs``
     :raises ValueError: as there
     :raises ImportError: when the package's environment has not been made; the message names the command that does it
     """

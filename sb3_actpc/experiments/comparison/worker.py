@@ -1,4 +1,4 @@
-"""A process that brings one run to its end: ``python -m sb3_actpc.experiments.comparison.worker``, started by the local engine.
+"""A process that brings one run to its end (``python -m sb3_actpc.experiments.comparison.worker``), for the local engine.
 
 It reads the run as a line of JSON from its standard input and answers with lines of JSON on its standard output. When its
 standard input closes (the command wants it to stop, or was killed) it saves a checkpoint and ends.
