@@ -29,7 +29,7 @@ def run(args: argparse.Namespace) -> int:
     :raises FileNotFoundError: when the folder holds no runs
     :raises OSError: when a file cannot be written
     """
-    from sb3_actpc.experiments.comparison.ablations import without_effect
+    from sb3_actpc.experiments.report.ablations import without_effect
     from sb3_actpc.experiments.report.build import write_report
     from sb3_actpc.experiments.report.results import group_runs, load_runs
 

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
-from sb3_actpc.experiments.comparison.ablations import ablation_blocks
 from sb3_actpc.experiments.comparison.execution import FINISHED
 from sb3_actpc.experiments.report import figures
+from sb3_actpc.experiments.report.ablations import ablation_blocks
 from sb3_actpc.experiments.report.cells import interval, mean_and_deviation, number
 from sb3_actpc.experiments.report.document import Block, Heading, Paragraph, Picture, Table, to_html, to_markdown
 from sb3_actpc.experiments.report.r_stability import N_EPISODES, WINDOW

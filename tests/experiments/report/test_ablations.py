@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 
 from sb3_actpc.experiments.comparison import Variant, ablation_variants, plan_runs, read_comparison
-from sb3_actpc.experiments.comparison.ablations import arriving_gradient, changed_actions, without_effect
 from sb3_actpc.experiments.comparison.execution import FINISHED, execute_run
+from sb3_actpc.experiments.report.ablations import arriving_gradient, changed_actions, without_effect
 from sb3_actpc.experiments.report.results import Group, group_runs, load_runs
 from tests.experiments.comparison.tasks import TASK, write_demonstrations, write_preset
 
