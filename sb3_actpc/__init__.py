@@ -8,7 +8,7 @@ from sb3_actpc.envs import register_envs
 
 if TYPE_CHECKING:
     from sb3_actpc.actpc import ActPC, CnnPolicy, MlpPolicy, MultiInputPolicy
-    from sb3_actpc.demonstrations.dataset import Demonstrations, shipped_demonstrations
+    from sb3_actpc.demonstrations import Demonstrations, shipped_demonstrations
     from sb3_actpc.ngc import NGCCircuit
 
 try:
@@ -30,7 +30,7 @@ __all__ = [
 # imported when first used, so that registering the tasks and `sb3-actpc --help` do not wait for torch
 _MODULE_OF = {
     **dict.fromkeys(("ActPC", "CnnPolicy", "MlpPolicy", "MultiInputPolicy"), "sb3_actpc.actpc"),
-    **dict.fromkeys(("Demonstrations", "shipped_demonstrations"), "sb3_actpc.demonstrations.dataset"),
+    **dict.fromkeys(("Demonstrations", "shipped_demonstrations"), "sb3_actpc.demonstrations"),
     "NGCCircuit": "sb3_actpc.ngc",
 }
 

@@ -25,8 +25,8 @@ from sb3_actpc.actpc.features import Batch, CircuitInputs
 from sb3_actpc.actpc.policies import ActPCActor, ActPCPolicy, CnnPolicy, Critics, MlpPolicy, MultiInputPolicy
 from sb3_actpc.actpc.reward_signals import make_normalizer, summed_squared_errors
 from sb3_actpc.actpc.self_imitation import Episodes, map_observations, sample_union
-from sb3_actpc.baselines.demonstration_buffers import fit_demonstrations
 from sb3_actpc.checkpoints import between_updates, load_checkpoint, load_weights, save_weights
+from sb3_actpc.demonstrations import fit_demonstrations
 from sb3_actpc.demonstrations.dataset import Demonstrations
 from sb3_actpc.ngc import HebbianChanges, NGCCircuit, settle_coupled
 from sb3_actpc.utils.checks import check_finite, named_in_errors

@@ -14,9 +14,8 @@ from sb3_actpc.baselines.demonstration_buffers import (
     DemonstrationDictReplayBuffer,
     _DemonstrationReplay,
     demonstration_buffer_class,
-    fit_demonstrations,
 )
-from sb3_actpc.demonstrations.dataset import Demonstrations
+from sb3_actpc.demonstrations import Demonstrations, fit_demonstrations
 
 
 class DemonstratedAlgorithm(OffPolicyAlgorithm):

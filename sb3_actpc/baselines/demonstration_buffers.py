@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from operator import itemgetter
-from os import PathLike
 from typing import Any, ClassVar
 
 import numpy as np
@@ -13,41 +12,10 @@ from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
-from sb3_actpc.actpc.self_imitation import Episodes, map_observations, split_observations
-from sb3_actpc.demonstrations.dataset import Demonstrations, resolve
+from sb3_actpc.actpc.self_imitation import map_observations
+from sb3_actpc.demonstrations import Demonstrations, scaled_actions
+from sb3_actpc.demonstrations.rows import split_observations
 from sb3_actpc.utils.checks import check_range
-
-
-def fit_demonstrations(
-    source: str | PathLike[str] | Demonstrations,
-    env: VecEnv | None,
-    observation_space: spaces.Space,
-    action_space: spaces.Space,
-    n_episodes: int | None = None,
-    n_transitions: int | None = None,
-) -> Demonstrations:
-    """
-    The demonstrations as an environment would have shown them: of its task, in its spaces, paid as it pays.
-
-    :param source: a file, or the demonstrations
-    :param env: the environment, whose goal version and rewards count; None where there is none yet
-    :param observation_space: the environment's
-    :param action_space: the environment's
-    :param n_episodes: use only the first so many episodes, None for all
-    :param n_transitions: use only the first so many transitions, None for all
-    :return: demonstrations that fit
-    :raises FileNotFoundError: when there is no such file
-    :raises ValueError: when they are damaged, fewer than asked for, or of another task
-    """
-    demonstrations = resolve(source).select(n_episodes, n_transitions)
-    env_id = None
-    if env is not None:
-        if env.has_attr("goal_demonstrations"):
-            demonstrations = env.env_method("goal_demonstrations", demonstrations, indices=[0])[0]
-        spec = env.get_attr("spec", indices=0)[0] if env.has_attr("spec") else None
-        env_id = None if spec is None else spec.id
-    demonstrations.check(observation_space, action_space, env_id)
-    return demonstrations if env is None else demonstrations.rewarded_by(env)
 
 
 def fill_with_demonstrations(
@@ -62,16 +30,17 @@ def fill_with_demonstrations(
     :param action_space: whose actions are scaled to [-1, 1]
     :raises ValueError: for other observation spaces
     """
-    episodes = Episodes.from_demonstrations(demonstrations, observation_space, action_space)
+    observations = split_observations(observation_space, demonstrations.observations)
+    actions = scaled_actions(demonstrations, action_space)
     next_observations = split_observations(observation_space, demonstrations.next_observations)
-    ends = np.zeros(len(episodes), dtype=bool)
+    ends = np.zeros(len(demonstrations), dtype=bool)
     ends[demonstrations.episode_bounds[:, 1] - 1] = True
-    for row in range(len(episodes)):
+    for row in range(len(demonstrations)):
         one = itemgetter(slice(row, row + 1))
         buffer.add(
-            map_observations(one, episodes.observations),
+            map_observations(one, observations),
             map_observations(one, next_observations),
-            one(episodes.actions),
+            one(actions),
             one(demonstrations.rewards),
             one(ends),
             [{"TimeLimit.truncated": bool(ends[row] and not demonstrations.terminations[row])}],
@@ -86,10 +55,10 @@ class _DemonstrationReplay(ReplayBuffer):
     (n-step returns, hindsight relabelling, normalisation) is done to them too. They come last in the batch.
 
     ActPC does not use these classes: its demonstrations carry two internal signals and a working memory (see
-    :class:`sb3_actpc.actpc.demonstration_replay.DemonstrationReplay`). What both share is :func:`fit_demonstrations` and
-    :class:`~sb3_actpc.actpc.self_imitation.Episodes`.
+    :class:`sb3_actpc.actpc.demonstration_replay.DemonstrationReplay`). What both share is in
+    :mod:`sb3_actpc.demonstrations`.
 
-    :param demonstrations: transitions that fit the environment (see :func:`fit_demonstrations`), or None for none
+    :param demonstrations: transitions that fit the environment, or None for none
     :param demonstration_fraction: share of each batch, between 0 and 1
     :raises ValueError: for a share out of range
     """

@@ -19,8 +19,8 @@ from stable_baselines3.common.torch_layers import create_mlp
 from stable_baselines3.common.type_aliases import GymEnv
 from torch import nn
 
-from sb3_actpc.baselines.demonstration_buffers import fit_demonstrations
 from sb3_actpc.baselines.signatures import with_keywords_of
+from sb3_actpc.demonstrations import fit_demonstrations
 from sb3_actpc.demonstrations.dataset import Demonstrations
 from sb3_actpc.utils.checks import check_kinds, check_range
 

@@ -1,17 +1,24 @@
-"""Where demonstrations come from: recordings of experts and scripted operators, and the files of robomimic and robosuite.
+"""Demonstrations: recorded from whoever can do a task, or read from the files of this package, Minari, robomimic, robosuite.
 
-All of it ends in the one form of :class:`sb3_actpc.demonstrations.dataset.Demonstrations`.
+All of it ends in the one form of :class:`Demonstrations`.
 """
 
+from sb3_actpc.demonstrations.dataset import Demonstrations, shipped_demonstrations
+from sb3_actpc.demonstrations.fitting import fit_demonstrations, resolve, scaled_actions
 from sb3_actpc.demonstrations.operators import MIXED_OPERATORS, ScriptedOperator, collect_scripted
 from sb3_actpc.demonstrations.robomimic import read_robomimic, write_robomimic
 from sb3_actpc.demonstrations.robosuite_states import read_robosuite
 
 __all__ = [
     "MIXED_OPERATORS",
+    "Demonstrations",
     "ScriptedOperator",
     "collect_scripted",
+    "fit_demonstrations",
     "read_robomimic",
     "read_robosuite",
+    "resolve",
+    "scaled_actions",
+    "shipped_demonstrations",
     "write_robomimic",
 ]

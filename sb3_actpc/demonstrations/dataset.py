@@ -1,62 +1,34 @@
-"""Demonstrations: recorded episodes as flat arrays, checked when made, with an ``.npz`` file format and Minari exchange."""
+"""Demonstrations: recorded episodes as flat arrays, checked when made."""
 
 from __future__ import annotations
 
 import dataclasses
-import io
 import json
 import os
 import re
-import struct
-import zipfile
-import zlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
-from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_actpc.utils.files import atomic_write
+from sb3_actpc.demonstrations.minari import read_minari, write_minari
+from sb3_actpc.demonstrations.npz import read_npz, write_npz
+from sb3_actpc.demonstrations.rows import field_error, flat_size, unchained_indices
 
-FORMAT_VERSION = 1
+if TYPE_CHECKING:
+    from stable_baselines3.common.vec_env import VecEnv
+
 DATA_FOLDER = Path(__file__).resolve().parents[1] / "data"
 ACTION_TOLERANCE = 1e-4
-HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
-
-_STORED_FIELDS = (
-    "observations",
-    "actions",
-    "rewards",
-    "terminations",
-    "episode_starts",
-    "dense_rewards",
-    "next_observation_indices",
-    "next_observation_rows",
-    "env_id",
-    "metadata",
-)
-# what the zip, deflate and npy readers raise on bytes that are not theirs
-_CORRUPT_FILE_ERRORS = (
-    ValueError,
-    KeyError,
-    TypeError,
-    SyntaxError,
-    EOFError,
-    OSError,
-    RuntimeError,
-    MemoryError,
-    OverflowError,
-    struct.error,
-    zlib.error,
-    zipfile.BadZipFile,
-)
+COLUMNS = ("observations", "actions", "next_observations", "rewards", "terminations", "dense_rewards")
+"""The fields with one row for each transition."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Demonstrations:
     """N recorded transitions, one row each, episode after episode.
 
@@ -110,6 +82,21 @@ class Demonstrations:
         """Number of transitions N."""
         return len(self.observations)
 
+    def __repr__(self) -> str:
+        """What there is, in one line."""
+        returns = f"mean return {self.episode_returns.mean():.1f}"
+        if self.dense_returns is not None:
+            returns += f" (dense {self.dense_returns.mean():.1f})"
+        parts = [
+            f"{self.n_episodes} episodes",
+            f"{len(self)} transitions",
+            f"observations of {self.observations.shape[1]}",
+            f"actions of {self.actions.shape[1]}",
+            returns,
+            *([f"from {self.source}"] if self.source else []),
+        ]
+        return f"Demonstrations({self.env_id}: {', '.join(parts)})"
+
     @property
     def n_episodes(self) -> int:
         """Number of episodes."""
@@ -132,6 +119,42 @@ class Demonstrations:
             return None
         return np.add.reduceat(self.dense_rewards.astype(np.float64), self.episode_starts)
 
+    @classmethod
+    def from_episodes(
+        cls,
+        episodes: Sequence[Mapping[str, Any]],
+        env_id: str,
+        metadata: Mapping[str, Any] | None = None,
+        source: str = "",
+    ) -> Demonstrations:
+        """
+        :param episodes: columns of each episode, by the names of ``COLUMNS``; dense rewards count where all have them
+        :param env_id: Gymnasium id of the environment that was recorded
+        :param metadata: JSON values
+        :param source: where they come from, for error messages
+        :return: the episodes end to end
+        :raises ValueError: when there are none, or they do not fit together
+        """
+        if not episodes:
+            raise field_error(source, "observations", "at least one episode", "none")
+        columns = {}
+        for name in COLUMNS:
+            if name == "dense_rewards" and not all(episode.get(name) is not None for episode in episodes):
+                continue
+            try:
+                columns[name] = np.concatenate([episode[name] for episode in episodes])
+            except ValueError as error:
+                raise field_error(source, name, "rows of one size in every episode", str(error)) from None
+        starts = np.cumsum([0, *(len(episode["rewards"]) for episode in episodes[:-1])])
+        return cls(**columns, episode_starts=starts, env_id=env_id, metadata=dict(metadata or {}), source=source)
+
+    @property
+    def episodes(self) -> Iterator[dict[str, np.ndarray]]:
+        """The columns of each episode, as views; without ``dense_rewards`` where there are none."""
+        columns = {name: getattr(self, name) for name in COLUMNS if getattr(self, name) is not None}
+        for start, end in self.episode_bounds:
+            yield {name: column[start:end] for name, column in columns.items()}
+
     def select(self, n_episodes: int | None = None, n_transitions: int | None = None) -> Demonstrations:
         """The first episodes, or the first transitions; the last episode is then cut short where the limit falls.
 
@@ -147,16 +170,8 @@ class Demonstrations:
         if n_transitions is not None:
             self._check_count("n_transitions", n_transitions, end)
             end = int(n_transitions)
-        return dataclasses.replace(
-            self,
-            observations=self.observations[:end],
-            actions=self.actions[:end],
-            next_observations=self.next_observations[:end],
-            rewards=self.rewards[:end],
-            terminations=self.terminations[:end],
-            episode_starts=self.episode_starts[self.episode_starts < end],
-            dense_rewards=None if self.dense_rewards is None else self.dense_rewards[:end],
-        )
+        columns = {name: getattr(self, name)[:end] for name in COLUMNS if getattr(self, name) is not None}
+        return dataclasses.replace(self, **columns, episode_starts=self.episode_starts[self.episode_starts < end])
 
     def check(self, observation_space: spaces.Space[Any], action_space: spaces.Space[Any], env_id: str | None = None) -> None:
         """Check that the demonstrations fit an environment.
@@ -167,15 +182,15 @@ class Demonstrations:
         :param env_id: id of the environment, or None to skip it; the version (``-v5``) may differ from the recorded one
         :raises ValueError: naming the field that does not fit, what was found and what was expected
         """
-        if env_id is not None and _base_name(env_id) != _base_name(self.env_id):
+        if env_id is not None and base_name(env_id) != base_name(self.env_id):
             raise self._error("env_id", f"{env_id!r} (any version)", repr(self.env_id))
-        obs_dim = _flat_size(observation_space)
+        obs_dim = flat_size(observation_space)
         if self.observations.shape[1] != obs_dim:
             raise self._error("observations", f"{obs_dim} values a row", f"{self.observations.shape[1]}")
         if not isinstance(action_space, spaces.Box):
             raise self._error("actions", "a Box action space", repr(action_space))
-        if self.actions.shape[1] != _flat_size(action_space):
-            raise self._error("actions", f"{_flat_size(action_space)} values a row", f"{self.actions.shape[1]}")
+        if self.actions.shape[1] != flat_size(action_space):
+            raise self._error("actions", f"{flat_size(action_space)} values a row", f"{self.actions.shape[1]}")
         self._check_action_bounds(action_space.low.reshape(-1), action_space.high.reshape(-1))
 
     def rewarded_by(self, env: VecEnv) -> Demonstrations:
@@ -192,29 +207,10 @@ class Demonstrations:
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write a compressed ``.npz`` file, all at once or not at all, without pickles.
 
-        A next observation is stored only where it is not, bit for bit, the following row of ``observations`` of the same
-        episode, so that the file holds the observations about once.
-
         :param path: file to write (exactly this name)
         :raises OSError: when it cannot be written; an old file at ``path`` then stays as it was
         """
-        indices = self._unchained_indices()
-        arrays = {
-            "format_version": np.array(FORMAT_VERSION, dtype=np.int64),
-            "observations": self.observations,
-            "actions": self.actions,
-            "rewards": self.rewards,
-            "terminations": self.terminations,
-            "episode_starts": self.episode_starts,
-            # always present, so that a lost entry is noticed; N >= 1, so empty can only mean None
-            "dense_rewards": np.empty(0, dtype=np.float32) if self.dense_rewards is None else self.dense_rewards,
-            "next_observation_indices": indices,
-            "next_observation_rows": self.next_observations[indices],
-            "env_id": np.array(json.dumps(self.env_id)),
-            "metadata": np.array(json.dumps(self.metadata)),
-        }
-        with atomic_write(path) as file:
-            np.savez_compressed(file, **arrays)
+        write_npz(path, vars(self))
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Demonstrations:
@@ -226,26 +222,7 @@ class Demonstrations:
         :raises ValueError: when the file is empty, cut short, damaged, lacks a field, holds one of a wrong type, or has a
             newer format; the message names the file and the field
         """
-        source = str(path)
-        if not os.path.exists(path):
-            raise FileNotFoundError(f"no demonstrations file at {source}")
-        if not os.path.isfile(path):
-            raise ValueError(f"{source}: expected a demonstrations file, found a folder or device")
-        stored = _read_arrays(Path(path).read_bytes(), source)
-        dense_rewards = stored["dense_rewards"]
-        observations = stored["observations"]
-        return cls(
-            observations=observations,
-            actions=stored["actions"],
-            next_observations=_rebuild_next_observations(stored, source),
-            rewards=stored["rewards"],
-            terminations=stored["terminations"],
-            episode_starts=stored["episode_starts"],
-            env_id=_read_json(stored, "env_id", source),
-            dense_rewards=None if dense_rewards.shape == (0,) else dense_rewards,
-            metadata=_read_json(stored, "metadata", source),
-            source=source,
-        )
+        return cls(**read_npz(path))
 
     @classmethod
     def from_minari(
@@ -266,35 +243,8 @@ class Demonstrations:
         :raises ValueError: when the dataset has no episodes, no environment id, spaces other than Box (or Dicts of Box
             for observations), or data that fail the checks above
         """
-        if isinstance(dataset, str):
-            dataset = _import_minari().load_dataset(dataset)
-        source = f"Minari dataset {dataset.spec.dataset_id}"
-        metadata = dataset.storage.metadata
-        keys = metadata.get("observation_keys", _leaf_keys(dataset.observation_space))
-        if observation_space is not None:
-            keys = _leaf_keys(observation_space)
-        if not isinstance(dataset.action_space, spaces.Box):
-            raise _field_error(source, "actions", "a Box action space", repr(dataset.action_space))
-        episodes = [_episode_arrays(episode, keys, source) for episode in dataset.iterate_episodes()]
-        if not episodes:
-            raise _field_error(source, "observations", "at least one episode", "none")
-        lengths = [len(episode["rewards"]) for episode in episodes]
-        with_dense = [episode["dense_rewards"] is not None for episode in episodes]
-        if any(with_dense) != all(with_dense):
-            raise _field_error(
-                source,
-                "dense_rewards",
-                "infos['dense_reward'] in every episode or none",
-                f"it in {sum(with_dense)} of {len(episodes)}",
-            )
-        names = [name for name in episodes[0] if name != "dense_rewards" or with_dense[0]]
-        return cls(
-            **{name: np.concatenate([episode[name] for episode in episodes]) for name in names},
-            episode_starts=np.cumsum([0, *lengths[:-1]]),
-            env_id=env_id or (dataset.env_spec.id if dataset.env_spec is not None else metadata.get("env_id", "")),
-            metadata=metadata.get("demonstrations_metadata", {}),
-            source=source,
-        )
+        episodes, fields = read_minari(dataset, env_id, observation_space)
+        return cls.from_episodes(episodes, **fields)
 
     def to_minari(self, dataset_id: str, env: gym.Env[Any, Any] | None = None, **options: Any) -> Any:
         """Write the episodes as a new local Minari dataset (needs the ``minari`` extra).
@@ -308,77 +258,24 @@ class Demonstrations:
         :raises ValueError: when the id exists or is malformed, the demonstrations do not fit the environment, or an
             episode's next observations are not its following observations, which Minari cannot hold
         """
-        minari = _import_minari()
-        made_here = env is None and self.env_id in gym.registry
-        if made_here:
-            env = gym.make(self.env_id)
-        try:
-            return self._write_minari(minari, dataset_id, env, options)
-        finally:
-            if made_here and env is not None:
-                env.close()
-
-    def _write_minari(self, minari: Any, dataset_id: str, env: gym.Env[Any, Any] | None, options: dict[str, Any]) -> Any:
-        observation_space: spaces.Space[Any] = _unbounded_box(self.observations.shape[1])
-        action_space: spaces.Space[Any] = _unbounded_box(self.actions.shape[1])
+        if env is None and self.env_id in gym.registry:
+            with gym.make(self.env_id) as made:
+                return self.to_minari(dataset_id, made, **options)
+        sizes = (self.observations.shape[1], self.actions.shape[1])
+        observation_space, action_space = (spaces.Box(-np.inf, np.inf, (size,), np.float32) for size in sizes)
         if env is not None:
             observation_space, action_space = env.observation_space, env.action_space
             self.check(observation_space, action_space, None if env.spec is None else env.spec.id)
-        keys = _leaf_keys(observation_space)
-        unchained = np.setdiff1d(self._unchained_indices(), self.episode_bounds[:, 1] - 1)
-        if len(unchained) > 0:
-            raise self._error(
-                "next_observations",
-                "the following observation at every transition within an episode",
-                f"another one at transition {unchained[0]}",
-            )
-        dataset = minari.create_dataset_from_buffers(
-            dataset_id,
-            [self._minari_episode(start, end, observation_space, action_space) for start, end in self.episode_bounds],
-            env=env if _has_json_spec(env) else None,
-            observation_space=observation_space,
-            action_space=action_space,
-            **options,
-        )
-        dataset.storage.update_metadata(
-            {
-                "env_id": self.env_id,
-                "demonstrations_metadata": self.metadata,
-                "observation_keys": keys,
-            }
-        )
-        return dataset
-
-    def _minari_episode(self, start: int, end: int, observation_space: spaces.Space[Any], action_space: Any) -> Any:
-        from minari.data_collector import EpisodeBuffer
-
-        observations = np.concatenate([self.observations[start:end], self.next_observations[end - 1 : end]])
-        terminations = self.terminations[start:end]
-        truncations = np.zeros(end - start, dtype=bool)
-        truncations[-1] = not terminations[-1]
-        infos = None
-        if self.dense_rewards is not None:
-            # Minari records infos at the reset too
-            infos = {"dense_reward": np.concatenate([np.zeros(1, dtype=np.float32), self.dense_rewards[start:end]])}
-        return EpisodeBuffer(
-            observations=_unflatten_rows(observations, observation_space),
-            actions=_unflatten_rows(self.actions[start:end], action_space),
-            rewards=self.rewards[start:end],
-            terminations=terminations,
-            truncations=truncations,
-            infos=infos,
-        )
-
-    def _unchained_indices(self) -> np.ndarray:
-        """Transitions whose next observation is not, bit for bit, the next row of the same episode, (M,) int64."""
-        unchained = np.ones(len(self), dtype=bool)
-        next_bits, following_bits = self.next_observations[:-1].view(np.int32), self.observations[1:].view(np.int32)
-        unchained[:-1] = np.any(next_bits != following_bits, axis=1)
-        unchained[self.episode_starts[1:] - 1] = True
-        return np.flatnonzero(unchained)
+        unchained = unchained_indices(self.observations, self.next_observations, self.episode_starts)
+        jumps = np.setdiff1d(unchained, self.episode_bounds[:, 1] - 1)
+        if len(jumps) > 0:
+            expected = "the following observation at every transition within an episode"
+            raise self._error("next_observations", expected, f"another one at transition {jumps[0]}")
+        metadata = {"env_id": self.env_id, "demonstrations_metadata": self.metadata}
+        return write_minari(dataset_id, list(self.episodes), observation_space, action_space, env, metadata, options)
 
     def _error(self, name: str, expected: str, found: str) -> ValueError:
-        return _field_error(self.source, name, expected, found)
+        return field_error(self.source, name, expected, found)
 
     def _numbers(self, name: str) -> np.ndarray:
         try:
@@ -472,21 +369,6 @@ class Demonstrations:
             raise self._error("actions", expected, f"{self.actions[row, column]} at transition {row}")
 
 
-def resolve(source: str | os.PathLike[str] | Demonstrations) -> Demonstrations:
-    """Demonstrations from a file path, or as they are.
-
-    :param source: path of an ``.npz`` file, or the demonstrations themselves
-    :return: the demonstrations
-    :raises FileNotFoundError: when there is no such file
-    :raises ValueError: when the file is not valid, or ``source`` is neither
-    """
-    if isinstance(source, Demonstrations):
-        return source
-    if isinstance(source, (str, os.PathLike)):
-        return Demonstrations.load(source)
-    raise ValueError(f"demonstrations must be a file path or a Demonstrations object, found {source!r}")
-
-
 def shipped_demonstrations(env_id: str, weak: bool = False) -> Path:
     """The demonstrations file of a sparse task that comes with the package.
 
@@ -495,8 +377,7 @@ def shipped_demonstrations(env_id: str, weak: bool = False) -> Path:
     :return: its path
     :raises FileNotFoundError: when none is shipped; the message says how to collect them
     """
-    name = re.sub(r"-v\d+$", "", env_id.rpartition(":")[2])
-    path = DATA_FOLDER / f"sparse_{name.removeprefix('Sparse').lower()}{'_weak' if weak else ''}.npz"
+    path = DATA_FOLDER / f"sparse_{base_name(env_id).removeprefix('Sparse').lower()}{'_weak' if weak else ''}.npz"
     if not path.is_file():
         raise FileNotFoundError(
             f"no {'weak ' if weak else ''}demonstrations of {env_id} are shipped: collect them (sb3-actpc demos collect --env "
@@ -505,154 +386,6 @@ def shipped_demonstrations(env_id: str, weak: bool = False) -> Path:
     return path
 
 
-def _field_error(source: str, name: str, expected: str, found: str) -> ValueError:
-    prefix = f"{source}: " if source else ""
-    return ValueError(f"{prefix}demonstrations field '{name}': expected {expected}, found {found}")
-
-
-def _base_name(env_id: str) -> str:
+def base_name(env_id: str) -> str:
     """The environment id without the module before a colon and without its version."""
     return re.sub(r"-v\d+$", "", env_id.rpartition(":")[2])
-
-
-def _flat_size(space: spaces.Space[Any]) -> int:
-    try:
-        return int(spaces.utils.flatdim(space))
-    except (NotImplementedError, ValueError):
-        raise ValueError(f"demonstrations need a space that can be flattened, found {space!r}") from None
-
-
-def _unbounded_box(size: int) -> spaces.Box:
-    return spaces.Box(-np.inf, np.inf, (size,), np.float32)
-
-
-def _read_arrays(content: bytes, source: str) -> dict[str, np.ndarray]:
-    """Every stored field; each entry's checksum is verified before it is parsed."""
-    try:
-        archive = zipfile.ZipFile(io.BytesIO(content))
-    except _CORRUPT_FILE_ERRORS as error:
-        if content.startswith(HDF5_SIGNATURE):
-            raise ValueError(
-                f"{source}: expected a demonstrations .npz file, found HDF5: convert it with `sb3-actpc demos convert`"
-            ) from None
-        raise ValueError(f"{source}: expected a demonstrations .npz file, found {len(content)} bytes ({error})") from None
-    with archive:
-        version = _read_array(archive, "format_version", source)
-        if version.shape != () or version.dtype.kind not in "iu" or version < 1:
-            found = f"type {version.dtype}, shape {version.shape}" if version.shape else repr(version.item())
-            raise _field_error(source, "format_version", "a whole number of at least 1", found)
-        if version > FORMAT_VERSION:
-            raise _field_error(source, "format_version", f"at most {FORMAT_VERSION} (update sb3-actpc)", str(version))
-        return {name: _read_array(archive, name, source) for name in _STORED_FIELDS}
-
-
-def _read_array(archive: zipfile.ZipFile, name: str, source: str) -> np.ndarray:
-    if f"{name}.npy" not in archive.namelist():
-        raise _field_error(source, name, f"an entry {name}.npy", f"only {', '.join(archive.namelist()) or 'none'}")
-    try:
-        return np.lib.format.read_array(io.BytesIO(archive.read(f"{name}.npy")), allow_pickle=False)
-    except _CORRUPT_FILE_ERRORS as error:
-        raise _field_error(source, name, "a readable array", f"{type(error).__name__}: {str(error)[:200]}") from None
-
-
-def _read_json(stored: dict[str, np.ndarray], name: str, source: str) -> Any:
-    array = stored[name]
-    try:
-        if array.shape == () and array.dtype.kind == "U":
-            return json.loads(array.item())
-    except json.JSONDecodeError as error:
-        raise _field_error(source, name, "JSON text", f"{array.item()[:60]!r} ({error})") from None
-    raise _field_error(source, name, "JSON text", f"type {array.dtype}, shape {array.shape}")
-
-
-def _rebuild_next_observations(stored: dict[str, np.ndarray], source: str) -> np.ndarray:
-    """Next observations, (N, obs_dim): the following rows, except where others are stored."""
-    observations, starts = stored["observations"], stored["episode_starts"]
-    indices, rows = stored["next_observation_indices"], stored["next_observation_rows"]
-    if observations.ndim != 2 or len(observations) == 0 or observations.dtype.kind != "f":
-        found = f"type {observations.dtype}, shape {observations.shape}"
-        raise _field_error(source, "observations", "floats of shape (N, size)", found)
-    if indices.dtype.kind not in "iu" or indices.ndim != 1 or np.any(np.diff(indices) <= 0):
-        found = f"type {indices.dtype}, shape {indices.shape}"
-        raise _field_error(source, "next_observation_indices", "increasing whole numbers", found)
-    if starts.dtype.kind not in "iu" or starts.ndim != 1:
-        found = f"type {starts.dtype}, shape {starts.shape}"
-        raise _field_error(source, "episode_starts", "a row of whole numbers", found)
-    last = np.append(starts[1:], len(observations)) - 1
-    if np.any(indices < 0) or np.any(indices >= len(observations)) or not np.isin(last, indices).all():
-        expected = f"indices below {len(observations)} that include the end of every episode"
-        raise _field_error(source, "next_observation_indices", expected, f"{len(indices)} indices that do not")
-    if rows.shape != (len(indices), observations.shape[1]) or rows.dtype != observations.dtype:
-        expected = f"shape {(len(indices), observations.shape[1])} of {observations.dtype}"
-        raise _field_error(source, "next_observation_rows", expected, f"shape {rows.shape} of {rows.dtype}")
-    next_observations = np.empty_like(observations)
-    next_observations[:-1] = observations[1:]
-    next_observations[indices] = rows
-    return next_observations
-
-
-def _import_minari() -> Any:
-    try:
-        import minari
-    except ImportError as error:
-        raise ImportError('Minari datasets need the extra: pip install "sb3-actpc[minari]"') from error
-    return minari
-
-
-def _has_json_spec(env: gym.Env[Any, Any] | None) -> bool:
-    """Whether Minari can record how the environment is made; it cannot for entry points that are not text."""
-    try:
-        return env is not None and env.spec is not None and bool(env.spec.to_json())
-    except (TypeError, ValueError):
-        return False
-
-
-def _episode_arrays(episode: Any, keys: list[list[str]], source: str) -> dict[str, Any]:
-    """One Minari episode (n + 1 observations for n steps) as rows."""
-    observations = _flatten_rows(episode.observations, keys, source)
-    n_steps = len(episode.rewards)
-    if len(observations) != n_steps + 1:
-        expected = f"{n_steps + 1} rows for {n_steps} steps in episode {episode.id}"
-        raise _field_error(source, "observations", expected, f"{len(observations)}")
-    dense_rewards = (episode.infos or {}).get("dense_reward")
-    if dense_rewards is not None:
-        dense_rewards = np.asarray(dense_rewards)[-n_steps:]  # one more when the reset's info was recorded
-    return {
-        "observations": observations[:-1],
-        "actions": np.asarray(episode.actions).reshape(n_steps, -1),
-        "next_observations": observations[1:],
-        "rewards": np.asarray(episode.rewards),
-        "terminations": np.asarray(episode.terminations),
-        "dense_rewards": dense_rewards,
-    }
-
-
-def _leaf_keys(space: spaces.Space[Any]) -> list[list[str]]:
-    """The way to every Box of a space, in ``flatten``'s order: ``[[]]`` for a Box, ``[["goal"], …]`` for a Dict."""
-    if isinstance(space, spaces.Dict):
-        return [[key, *rest] for key, part in space.items() for rest in _leaf_keys(part)]
-    if not isinstance(space, spaces.Box):
-        raise ValueError(f"demonstrations in Minari need a Box space (or a Dict of them), found {space!r}")
-    return [[]]
-
-
-def _flatten_rows(observations: Any, keys: list[list[str]], source: str) -> np.ndarray:
-    """Minari's nested arrays, (n, ...) each, as rows (n, flat size)."""
-    parts = []
-    for path in keys:
-        part = observations
-        for key in path:
-            if not isinstance(part, Mapping) or key not in part:
-                raise _field_error(source, "observations", f"an entry {'/'.join(path)!r}", "none")
-            part = part[key]
-        parts.append(np.asarray(part).reshape(len(part), -1))
-    return np.concatenate(parts, axis=1)
-
-
-def _unflatten_rows(rows: np.ndarray, space: spaces.Space[Any]) -> Any:
-    """The inverse of ``_flatten_rows``."""
-    if isinstance(space, spaces.Dict):
-        ends = np.cumsum([_flat_size(part) for part in space.values()])[:-1]
-        parts = zip(space.items(), np.split(rows, ends, axis=1), strict=True)
-        return {key: _unflatten_rows(part_rows, part) for (key, part), part_rows in parts}
-    return rows.reshape(len(rows), *(space.shape or ()))

@@ -13,9 +13,8 @@ from sb3_actpc.baselines.demonstration_buffers import (
     DemonstrationNStepReplayBuffer,
     DemonstrationReplayBuffer,
     demonstration_buffer_class,
-    fit_demonstrations,
 )
-from sb3_actpc.demonstrations.dataset import Demonstrations
+from sb3_actpc.demonstrations import Demonstrations, fit_demonstrations
 from tests.recordings import record
 
 BOX = spaces.Box(-1.0, 1.0, (2,), np.float32)

@@ -9,8 +9,8 @@ from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_actpc import ActPC
 from sb3_actpc.baselines import HER
-from sb3_actpc.baselines.demonstration_buffers import fit_demonstrations
 from sb3_actpc.baselines.prioritized import PrioritizedHerReplayBuffer, SumTree
+from sb3_actpc.demonstrations import fit_demonstrations
 from sb3_actpc.envs import GOAL_MUJOCO_IDS, sparse_env_id
 from sb3_actpc.experiments.runs import RunConfig, train_run
 from tests.checkpoints.runs import assert_same, learn_in_two, learn_straight

@@ -15,7 +15,9 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from sb3_actpc.demonstrations.dataset import FORMAT_VERSION, Demonstrations, resolve
+from sb3_actpc.demonstrations import Demonstrations, resolve
+from sb3_actpc.demonstrations.minari import episode_buffer
+from sb3_actpc.demonstrations.npz import FORMAT_VERSION
 from sb3_actpc.utils.files import atomic_write
 
 OBS_DIM, ACTION_DIM = 4, 2
@@ -53,6 +55,11 @@ STORED_NAMES = sorted(
 
 def make_demonstrations(**changes: Any) -> Demonstrations:
     return Demonstrations(**{**make_fields(), **changes})
+
+
+def buffer_of(demonstrations: Demonstrations, *spaces_of: spaces.Space[Any]) -> Any:
+    """The first episode as Minari's buffer."""
+    return episode_buffer(next(demonstrations.episodes), *spaces_of)
 
 
 def assert_equal(left: Demonstrations, right: Demonstrations) -> None:
@@ -449,7 +456,7 @@ class TestFile:
 
     @pytest.mark.parametrize("source", [None, 3, {"observations": []}])
     def test_resolve_refuses_anything_else(self, source: Any) -> None:
-        with pytest.raises(ValueError, match="must be a file path or a Demonstrations object, found"):
+        with pytest.raises(ValueError, match="must be a file path, a Minari id or a Demonstrations object, found"):
             resolve(source)
 
 
@@ -619,7 +626,7 @@ class TestMinari:
     def test_dense_rewards_in_some_episodes_only_are_refused(self) -> None:
         dataset = make_demonstrations().to_minari("tiny/some-v0")
         dataset.update_dataset_from_buffer(
-            [make_demonstrations(dense_rewards=None)._minari_episode(0, 3, dataset.observation_space, dataset.action_space)]
+            [buffer_of(make_demonstrations(dense_rewards=None), dataset.observation_space, dataset.action_space)]
         )
         with pytest.raises(ValueError, match=r"tiny/some-v0.*'dense_rewards'.*3 of 4"):
             Demonstrations.from_minari(dataset)
@@ -627,7 +634,7 @@ class TestMinari:
     def test_an_unknown_environment_id_is_refused_or_given(self, minari: Any) -> None:
         demonstrations = make_demonstrations()
         space, action_space = spaces.Box(-9, 9, (OBS_DIM,)), spaces.Box(-1, 1, (ACTION_DIM,))
-        episode = demonstrations._minari_episode(0, 3, space, action_space)
+        episode = buffer_of(demonstrations, space, action_space)
         dataset = minari.create_dataset_from_buffers(
             "tiny/nameless-v0", [episode], observation_space=space, action_space=action_space
         )
@@ -643,7 +650,7 @@ class TestMinari:
             Demonstrations.from_minari("tiny/absent-v0")
 
     def test_discrete_actions_are_refused(self, minari: Any) -> None:
-        episode = make_demonstrations()._minari_episode(0, 3, spaces.Box(-9, 9, (OBS_DIM,)), spaces.Box(-1, 1, (ACTION_DIM,)))
+        episode = buffer_of(make_demonstrations(), spaces.Box(-9, 9, (OBS_DIM,)), spaces.Box(-1, 1, (ACTION_DIM,)))
         dataset = minari.create_dataset_from_buffers(
             "tiny/discrete-v0",
             [dataclasses.replace(episode, actions=np.zeros(3, dtype=np.int64))],

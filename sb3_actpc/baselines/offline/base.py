@@ -14,7 +14,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 
-from sb3_actpc.baselines.demonstration_buffers import fit_demonstrations
+from sb3_actpc.demonstrations import fit_demonstrations
 from sb3_actpc.demonstrations.dataset import Demonstrations
 from sb3_actpc.utils.checks import check_kinds, check_range
 

@@ -1,0 +1,80 @@
+"""Demonstrations as an environment would have shown them, and as the rows of a buffer."""
+
+from __future__ import annotations
+
+import os
+import re
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from gymnasium import spaces
+
+from sb3_actpc.demonstrations.dataset import Demonstrations
+
+if TYPE_CHECKING:
+    from stable_baselines3.common.vec_env import VecEnv
+
+MINARI_ID = re.compile(r"([\w-]+/)*[\w-]+-v\d+")
+
+
+def resolve(
+    source: str | os.PathLike[str] | Demonstrations, observation_space: spaces.Space[Any] | None = None
+) -> Demonstrations:
+    """Demonstrations from a file path or a Minari id, or as they are.
+
+    :param source: path of an ``.npz`` file, the id of a local Minari dataset, or the demonstrations themselves
+    :param observation_space: the environment's, whose order a Minari dataset's Dict is flattened in; None for its own order
+    :return: the demonstrations
+    :raises FileNotFoundError: when there is no such file or dataset
+    :raises ImportError: when it is a Minari id and Minari is not installed
+    :raises ValueError: when the file is not valid, or ``source`` is neither
+    """
+    if isinstance(source, Demonstrations):
+        return source
+    if isinstance(source, str) and MINARI_ID.fullmatch(source) and not os.path.exists(source):
+        return Demonstrations.from_minari(source, observation_space=observation_space)
+    if isinstance(source, (str, os.PathLike)):
+        return Demonstrations.load(source)
+    raise ValueError(f"demonstrations must be a file path, a Minari id or a Demonstrations object, found {source!r}")
+
+
+def fit_demonstrations(
+    source: str | os.PathLike[str] | Demonstrations,
+    env: VecEnv | None,
+    observation_space: spaces.Space[Any],
+    action_space: spaces.Space[Any],
+    n_episodes: int | None = None,
+    n_transitions: int | None = None,
+) -> Demonstrations:
+    """
+    The demonstrations as an environment would have shown them: of its task, in its spaces, paid as it pays.
+
+    :param source: a file, a Minari id, or the demonstrations
+    :param env: the environment, whose goal version and rewards count; None where there is none yet
+    :param observation_space: the environment's
+    :param action_space: the environment's
+    :param n_episodes: use only the first so many episodes, None for all
+    :param n_transitions: use only the first so many transitions, None for all
+    :return: demonstrations that fit
+    :raises FileNotFoundError: when there is no such file
+    :raises ValueError: when they are damaged, fewer than asked for, or of another task
+    """
+    demonstrations = resolve(source, observation_space).select(n_episodes, n_transitions)
+    env_id = None
+    if env is not None:
+        if env.has_attr("goal_demonstrations"):
+            demonstrations = env.env_method("goal_demonstrations", demonstrations, indices=[0])[0]
+        spec = env.get_attr("spec", indices=0)[0] if env.has_attr("spec") else None
+        env_id = None if spec is None else spec.id
+    demonstrations.check(observation_space, action_space, env_id)
+    return demonstrations if env is None else demonstrations.rewarded_by(env)
+
+
+def scaled_actions(demonstrations: Demonstrations, action_space: spaces.Box) -> np.ndarray:
+    """
+    :param demonstrations: N transitions that fit the space
+    :param action_space: the environment's
+    :return: (N, action_dim) float32, the actions scaled to [-1, 1]
+    """
+    low, high = action_space.low.ravel(), action_space.high.ravel()
+    return np.clip(2.0 * (demonstrations.actions - low) / (high - low) - 1.0, -1.0, 1.0).astype(np.float32)

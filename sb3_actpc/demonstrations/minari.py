@@ -1,0 +1,154 @@
+"""Exchange with Minari, the Farama Foundation's format of offline data sets; episodes as arrays, in and out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+
+from sb3_actpc.demonstrations.rows import box_paths, field_error, join_observations, split_observations
+
+
+def import_minari() -> Any:
+    """:raises ImportError: when Minari is not installed; the message says how to install it"""
+    try:
+        import minari
+    except ImportError as error:
+        raise ImportError('Minari datasets need the extra: pip install "sb3-actpc[minari]"') from error
+    return minari
+
+
+def read_minari(
+    dataset: Any, env_id: str | None = None, observation_space: spaces.Space[Any] | None = None
+) -> tuple[list[dict[str, np.ndarray]], dict[str, Any]]:
+    """
+    :param dataset: a ``minari.MinariDataset``, or the id of one in the local Minari folder
+    :param env_id: environment id; None for the one recorded in the dataset
+    :param observation_space: whose order a Dict is flattened in; None for the recorded order
+    :return: the columns of each episode, and the further fields of a ``Demonstrations``
+    :raises ImportError: when Minari is not installed
+    :raises FileNotFoundError: when no local dataset has this id
+    :raises ValueError: when the dataset has no episodes, other spaces, or episodes of wrong lengths
+    """
+    if isinstance(dataset, str):
+        dataset = _load(dataset)
+    source = f"Minari dataset {dataset.spec.dataset_id}"
+    metadata = dataset.storage.metadata
+    paths = metadata.get("observation_keys", box_paths(dataset.observation_space))
+    if observation_space is not None:
+        paths = box_paths(observation_space)
+    if not isinstance(dataset.action_space, spaces.Box):
+        raise field_error(source, "actions", "a Box action space", repr(dataset.action_space))
+    episodes = [_columns(episode, paths, source) for episode in dataset.iterate_episodes()]
+    if not episodes:
+        raise field_error(source, "observations", "at least one episode", "none")
+    n_dense = sum("dense_rewards" in episode for episode in episodes)
+    if n_dense not in (0, len(episodes)):
+        found = f"it in {n_dense} of {len(episodes)}"
+        raise field_error(source, "dense_rewards", "infos['dense_reward'] in every episode or none", found)
+    recorded_id = dataset.env_spec.id if dataset.env_spec is not None else metadata.get("env_id", "")
+    return episodes, {
+        "env_id": env_id or recorded_id,
+        "metadata": metadata.get("demonstrations_metadata", {}),
+        "source": source,
+    }
+
+
+def write_minari(
+    dataset_id: str,
+    episodes: Sequence[dict[str, Any]],
+    observation_space: spaces.Space[Any],
+    action_space: spaces.Space[Any],
+    env: gym.Env[Any, Any] | None,
+    metadata: dict[str, Any],
+    options: dict[str, Any],
+) -> Any:
+    """
+    :param dataset_id: Minari id that does not exist yet
+    :param episodes: the columns of each episode
+    :param observation_space: of the environment
+    :param action_space: of the environment
+    :param env: environment whose specification is recorded, if JSON can hold it; None for none
+    :param metadata: further entries, JSON values
+    :param options: further keywords of ``minari.create_dataset_from_buffers``
+    :return: the ``minari.MinariDataset``
+    :raises ImportError: when Minari is not installed
+    :raises ValueError: when the id exists or is malformed
+    """
+    dataset = import_minari().create_dataset_from_buffers(
+        dataset_id,
+        [episode_buffer(episode, observation_space, action_space) for episode in episodes],
+        env=env if _has_json_spec(env) else None,
+        observation_space=observation_space,
+        action_space=action_space,
+        **options,
+    )
+    dataset.storage.update_metadata({**metadata, "observation_keys": box_paths(observation_space)})
+    return dataset
+
+
+def episode_buffer(episode: dict[str, Any], observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> Any:
+    """
+    :param episode: columns of one episode of n steps
+    :param observation_space: of the environment
+    :param action_space: of the environment
+    :return: a ``minari.data_collector.EpisodeBuffer`` with n + 1 observations
+    """
+    from minari.data_collector import EpisodeBuffer
+
+    observations = np.concatenate([episode["observations"], episode["next_observations"][-1:]])
+    terminations = episode["terminations"]
+    truncations = np.zeros(len(terminations), dtype=bool)
+    truncations[-1] = not terminations[-1]
+    dense_rewards = episode.get("dense_rewards")
+    if dense_rewards is not None:  # Minari records infos at the reset too
+        dense_rewards = {"dense_reward": np.concatenate([np.zeros(1, dtype=np.float32), dense_rewards])}
+    return EpisodeBuffer(
+        observations=split_observations(observation_space, observations),
+        actions=split_observations(action_space, episode["actions"]),
+        rewards=episode["rewards"],
+        terminations=terminations,
+        truncations=truncations,
+        infos=dense_rewards,
+    )
+
+
+def _load(dataset_id: str) -> Any:
+    minari = import_minari()
+    try:
+        return minari.load_dataset(dataset_id)
+    except FileNotFoundError:
+        raise FileNotFoundError(
+            f"no Minari dataset {dataset_id!r} on this machine: fetch it with `minari download {dataset_id}`"
+        ) from None
+
+
+def _has_json_spec(env: gym.Env[Any, Any] | None) -> bool:
+    """Whether Minari can record how the environment is made; it cannot for entry points that are not text."""
+    try:
+        return env is not None and env.spec is not None and bool(env.spec.to_json())
+    except (TypeError, ValueError):
+        return False
+
+
+def _columns(episode: Any, paths: list[list[str]], source: str) -> dict[str, np.ndarray]:
+    """One Minari episode (n + 1 observations for n steps) as columns."""
+    observations = join_observations(episode.observations, paths, source)
+    n_steps = len(episode.rewards)
+    if len(observations) != n_steps + 1:
+        expected = f"{n_steps + 1} rows for {n_steps} steps in episode {episode.id}"
+        raise field_error(source, "observations", expected, f"{len(observations)}")
+    columns = {
+        "observations": observations[:-1],
+        "actions": np.asarray(episode.actions).reshape(n_steps, -1),
+        "next_observations": observations[1:],
+        "rewards": np.asarray(episode.rewards),
+        "terminations": np.asarray(episode.terminations),
+    }
+    dense_rewards = (episode.infos or {}).get("dense_reward")
+    if dense_rewards is not None:  # one more when the reset's info was recorded
+        columns["dense_rewards"] = np.asarray(dense_rewards)[-n_steps:]
+    return columns

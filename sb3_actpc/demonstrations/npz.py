@@ -1,0 +1,152 @@
+"""The ``.npz`` file format of demonstrations: compressed, without pickles, every mistake in a file named."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import struct
+import zipfile
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sb3_actpc.demonstrations.rows import field_error, unchained_indices
+from sb3_actpc.utils.files import atomic_write
+
+FORMAT_VERSION = 1
+HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
+
+_ARRAYS = ("observations", "actions", "rewards", "terminations", "episode_starts")
+_TEXTS = ("env_id", "metadata")
+_NEXT = ("next_observation_indices", "next_observation_rows")
+# what the zip, deflate and npy readers raise on bytes that are not theirs
+_CORRUPT_FILE_ERRORS = (
+    ValueError,
+    KeyError,
+    TypeError,
+    SyntaxError,
+    EOFError,
+    OSError,
+    RuntimeError,
+    MemoryError,
+    OverflowError,
+    struct.error,
+    zlib.error,
+    zipfile.BadZipFile,
+)
+
+
+def write_npz(path: str | os.PathLike[str], fields: Mapping[str, Any]) -> None:
+    """Write a file, all at once or not at all.
+
+    A next observation is stored only where it is not, bit for bit, the following row of ``observations`` of the same
+    episode, so that the file holds the observations about once.
+
+    :param path: file to write (exactly this name)
+    :param fields: the fields of a ``Demonstrations``
+    :raises OSError: when it cannot be written; an old file at ``path`` then stays as it was
+    """
+    next_observations, dense_rewards = fields["next_observations"], fields["dense_rewards"]
+    indices = unchained_indices(fields["observations"], next_observations, fields["episode_starts"])
+    arrays = {
+        "format_version": np.array(FORMAT_VERSION, dtype=np.int64),
+        **{name: fields[name] for name in _ARRAYS},
+        # always present, so that a lost entry is noticed; N >= 1, so empty can only mean None
+        "dense_rewards": np.empty(0, dtype=np.float32) if dense_rewards is None else dense_rewards,
+        **dict(zip(_NEXT, (indices, next_observations[indices]), strict=True)),
+        **{name: np.array(json.dumps(fields[name])) for name in _TEXTS},
+    }
+    with atomic_write(path) as file:
+        np.savez_compressed(file, **arrays)
+
+
+def read_npz(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """Read a file written by :func:`write_npz`; never unpickles.
+
+    :param path: the file
+    :return: the fields of a ``Demonstrations``, bit for bit as saved
+    :raises FileNotFoundError: when there is no such file
+    :raises ValueError: when the file is empty, cut short, damaged, lacks an entry, holds one of a wrong type, or has a newer
+        format; the message names the file and the entry
+    """
+    source = str(path)
+    if not os.path.exists(path):
+        raise FileNotFoundError(f"no demonstrations file at {source}")
+    if not os.path.isfile(path):
+        raise ValueError(f"{source}: expected a demonstrations file, found a folder or device")
+    stored = _read_entries(Path(path).read_bytes(), source)
+    dense_rewards = stored["dense_rewards"]
+    return {
+        **{name: stored[name] for name in _ARRAYS},
+        "next_observations": _rebuild_next_observations(stored, source),
+        "dense_rewards": None if dense_rewards.shape == (0,) else dense_rewards,
+        **{name: _read_json(stored[name], name, source) for name in _TEXTS},
+        "source": source,
+    }
+
+
+def _read_entries(content: bytes, source: str) -> dict[str, np.ndarray]:
+    """Every stored entry; each one's checksum is verified before it is parsed."""
+    try:
+        archive = zipfile.ZipFile(io.BytesIO(content))
+    except _CORRUPT_FILE_ERRORS as error:
+        found = f"{len(content)} bytes ({error})"
+        if content.startswith(HDF5_SIGNATURE):
+            found = "HDF5: convert it with `sb3-actpc demos convert`"
+        raise ValueError(f"{source}: expected a demonstrations .npz file, found {found}") from None
+    with archive:
+        version = _read_array(archive, "format_version", source)
+        if version.shape != () or version.dtype.kind not in "iu" or version < 1:
+            found = f"type {version.dtype}, shape {version.shape}" if version.shape else repr(version.item())
+            raise field_error(source, "format_version", "a whole number of at least 1", found)
+        if version > FORMAT_VERSION:
+            raise field_error(source, "format_version", f"at most {FORMAT_VERSION} (update sb3-actpc)", str(version))
+        return {name: _read_array(archive, name, source) for name in (*_ARRAYS, "dense_rewards", *_NEXT, *_TEXTS)}
+
+
+def _read_array(archive: zipfile.ZipFile, name: str, source: str) -> np.ndarray:
+    if f"{name}.npy" not in archive.namelist():
+        raise field_error(source, name, f"an entry {name}.npy", f"only {', '.join(archive.namelist()) or 'none'}")
+    try:
+        return np.lib.format.read_array(io.BytesIO(archive.read(f"{name}.npy")), allow_pickle=False)
+    except _CORRUPT_FILE_ERRORS as error:
+        raise field_error(source, name, "a readable array", f"{type(error).__name__}: {str(error)[:200]}") from None
+
+
+def _read_json(array: np.ndarray, name: str, source: str) -> Any:
+    try:
+        if array.shape == () and array.dtype.kind == "U":
+            return json.loads(array.item())
+    except json.JSONDecodeError as error:
+        raise field_error(source, name, "JSON text", f"{array.item()[:60]!r} ({error})") from None
+    raise field_error(source, name, "JSON text", f"type {array.dtype}, shape {array.shape}")
+
+
+def _rebuild_next_observations(stored: dict[str, np.ndarray], source: str) -> np.ndarray:
+    """Next observations, (N, obs_dim): the following rows, except where others are stored."""
+    observations, starts = stored["observations"], stored["episode_starts"]
+    indices, rows = (stored[name] for name in _NEXT)
+    if observations.ndim != 2 or len(observations) == 0 or observations.dtype.kind != "f":
+        found = f"type {observations.dtype}, shape {observations.shape}"
+        raise field_error(source, "observations", "floats of shape (N, size)", found)
+    if indices.dtype.kind not in "iu" or indices.ndim != 1 or np.any(np.diff(indices) <= 0):
+        found = f"type {indices.dtype}, shape {indices.shape}"
+        raise field_error(source, "next_observation_indices", "increasing whole numbers", found)
+    if starts.dtype.kind not in "iu" or starts.ndim != 1:
+        found = f"type {starts.dtype}, shape {starts.shape}"
+        raise field_error(source, "episode_starts", "a row of whole numbers", found)
+    last = np.append(starts[1:], len(observations)) - 1
+    if np.any(indices < 0) or np.any(indices >= len(observations)) or not np.isin(last, indices).all():
+        expected = f"indices below {len(observations)} that include the end of every episode"
+        raise field_error(source, "next_observation_indices", expected, f"{len(indices)} indices that do not")
+    if rows.shape != (len(indices), observations.shape[1]) or rows.dtype != observations.dtype:
+        expected = f"shape {(len(indices), observations.shape[1])} of {observations.dtype}"
+        raise field_error(source, "next_observation_rows", expected, f"shape {rows.shape} of {rows.dtype}")
+    next_observations = np.empty_like(observations)
+    next_observations[:-1] = observations[1:]
+    next_observations[indices] = rows
+    return next_observations

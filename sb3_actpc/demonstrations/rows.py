@@ -1,0 +1,98 @@
+"""Between the observations of an environment and rows of numbers; how a wrong field of demonstrations is named."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+
+
+def field_error(source: str, name: str, expected: str, found: str) -> ValueError:
+    """
+    :param source: file or data set the field comes from, or an empty text
+    :param name: the field
+    :param expected: what it must hold
+    :param found: what it holds
+    :return: the error to raise
+    """
+    prefix = f"{source}: " if source else ""
+    return ValueError(f"{prefix}demonstrations field '{name}': expected {expected}, found {found}")
+
+
+def flat_size(space: spaces.Space[Any]) -> int:
+    """
+    :param space: of observations or actions
+    :return: how many numbers one of them has when flattened
+    :raises ValueError: for a space that cannot be flattened
+    """
+    try:
+        return int(spaces.utils.flatdim(space))
+    except (NotImplementedError, ValueError):
+        raise ValueError(f"demonstrations need a space that can be flattened, found {space!r}") from None
+
+
+def box_paths(space: spaces.Space[Any]) -> list[list[str]]:
+    """
+    :param space: a Box, or a Dict of these or of further Dicts
+    :return: the way to every Box, in the order of ``gymnasium.spaces.utils.flatten``: ``[[]]`` for a Box, ``[["goal"], ...]``
+        for a Dict
+    :raises ValueError: for other spaces
+    """
+    if isinstance(space, spaces.Dict):
+        return [[key, *rest] for key, part in space.items() for rest in box_paths(part)]
+    if not isinstance(space, spaces.Box):
+        raise ValueError(f"demonstrations need Box observations or a Dict of Boxes, found {space!r}")
+    return [[]]
+
+
+def split_observations(space: spaces.Space[Any], rows: np.ndarray) -> Any:
+    """
+    Undo ``gymnasium.spaces.utils.flatten`` for many rows at once.
+
+    :param space: a Box, or a Dict of these or of further Dicts
+    :param rows: (N, flat size)
+    :return: (N, *shape), or a dict of such
+    :raises ValueError: for other spaces
+    """
+    box_paths(space)
+    if isinstance(space, spaces.Dict):
+        ends = np.cumsum([flat_size(part) for part in space.values()])[:-1]
+        parts = zip(space.items(), np.split(rows, ends, axis=1), strict=True)
+        return {key: split_observations(part, part_rows) for (key, part), part_rows in parts}
+    return rows.reshape(len(rows), *(space.shape or ()))
+
+
+def join_observations(observations: Any, paths: list[list[str]], source: str = "") -> np.ndarray:
+    """
+    The inverse of :func:`split_observations`.
+
+    :param observations: (N, *shape), or nested mappings of such
+    :param paths: the way to every part, see :func:`box_paths`
+    :param source: where they come from, for the message
+    :return: (N, flat size)
+    :raises ValueError: when a part is missing
+    """
+    parts = []
+    for path in paths:
+        part = observations
+        for key in path:
+            try:
+                part = part[key]
+            except (KeyError, IndexError, TypeError, ValueError):
+                raise field_error(source, "observations", f"an entry {'/'.join(path)!r}", "none") from None
+        parts.append(np.asarray(part).reshape(len(part), -1))
+    return np.concatenate(parts, axis=1)
+
+
+def unchained_indices(observations: np.ndarray, next_observations: np.ndarray, episode_starts: np.ndarray) -> np.ndarray:
+    """
+    :param observations: (N, obs_dim) float32
+    :param next_observations: (N, obs_dim) float32
+    :param episode_starts: (n_episodes,)
+    :return: (M,) int64, the transitions whose next observation is not, bit for bit, the next row of the same episode
+    """
+    unchained = np.ones(len(observations), dtype=bool)
+    unchained[:-1] = np.any(next_observations[:-1].view(np.int32) != observations[1:].view(np.int32), axis=1)
+    unchained[episode_starts[1:] - 1] = True
+    return np.flatnonzero(unchained)
