@@ -39,17 +39,17 @@ if TYPE_CHECKING:
 LOCOMOTION_CONDITIONS: tuple[str, ...] = ("displacement", "forward")
 
 
-def _check_threshold(threshold: float | None, default: float, meaning: str) -> float:
+def _check_threshold(threshold: float | None, default: float, meaning: str, *, allow_zero: bool = False) -> float:
     """Return the threshold in use.
 
-    :raises ValueError: if it is not a positive finite number
+    :raises ValueError: if it is not a positive finite number, or with ``allow_zero`` 0
     """
     if threshold is None:
         return default
-    if isinstance(threshold, bool) or not isinstance(threshold, int | float) or not 0.0 < threshold < math.inf:
-        raise ValueError(
-            f"threshold={threshold!r} must be a positive finite number ({meaning}): give one, or None for {default}"
-        )
+    is_number = isinstance(threshold, int | float) and not isinstance(threshold, bool)
+    if not is_number or not (0.0 < threshold < math.inf or (allow_zero and threshold == 0.0)):
+        kind = "finite number of at least 0" if allow_zero else "positive finite number"
+        raise ValueError(f"threshold={threshold!r} must be a {kind} ({meaning}): give one, or None for {default}")
     return float(threshold)
 
 
@@ -150,7 +150,8 @@ class SparseLocomotionEnv(_SparseMujocoEnv):
 
     :param condition: ``"displacement"`` pays every step at which x - x_0 exceeds the threshold, x_0 being x after the
         reset; ``"forward"`` pays every step whose mean forward velocity exceeds it
-    :param threshold: metres or metres per second, None for the task's own ``default_distance`` or ``default_velocity``
+    :param threshold: metres or metres per second, None for the task's own ``default_distance`` or ``default_velocity``;
+        with ``"forward"`` it may be 0: any forward motion is paid, the paper's wording for Walker2d, Hopper and Swimmer
     :param kwargs: the base task's keywords
     :raises ValueError: for an unknown condition, a threshold that is not positive and finite, or a ``miss_reward``
     """
@@ -177,7 +178,7 @@ class SparseLocomotionEnv(_SparseMujocoEnv):
         if condition == "displacement":
             self.distance = _check_threshold(threshold, self.default_distance, "metres from the start")
         else:
-            self.velocity = _check_threshold(threshold, self.default_velocity, "metres per second")
+            self.velocity = _check_threshold(threshold, self.default_velocity, "metres per second", allow_zero=True)
         self._start_x = 0.0
         self._has_passed = False
         super().__init__(**kwargs)

@@ -182,6 +182,21 @@ def test_forward_is_paid_above_the_velocity_and_success_is_still_the_distance(en
 
 
 @pytest.mark.parametrize("env_id", LOCOMOTION_IDS)
+def test_a_threshold_of_zero_pays_any_motion_forward(env_id: str) -> None:
+    """As the paper words it of Walker2d, Hopper and Swimmer."""
+    env = gym.make(env_id, condition="forward", threshold=0.0)
+    env.reset(seed=0)
+    for velocity in (-0.5, 0.5, 8.0):
+        shift_x(env, 0.0, velocity)
+        reward, _, info = still_step(env)
+        assert reward == float(info["x_velocity"] > 0.0)
+    shift_x(env, 0.0, 0.2)
+    reward, _, info = still_step(env)
+    assert (0.0 < info["x_velocity"] < VELOCITIES[task_of(env_id)], reward) == (True, 1.0)
+    env.close()
+
+
+@pytest.mark.parametrize("env_id", LOCOMOTION_IDS)
 def test_threshold_moves_the_paying_condition(env_id: str) -> None:
     env = gym.make(env_id, threshold=0.5)
     env.reset(seed=0)
@@ -230,9 +245,11 @@ def test_bad_locomotion_keywords_name_the_value_and_the_fix(env_id: str) -> None
     with pytest.raises(ValueError, match=r"condition='sideways'.*'displacement', 'forward'.*choose"):
         gym.make(env_id, condition="sideways")
     for condition in ("displacement", "forward"):
-        for threshold in (0.0, -1.0, float("nan"), float("inf"), "far", True):
-            with pytest.raises(ValueError, match=r"threshold=.* must be a positive finite number .* or None"):
+        for threshold in (-1.0, float("nan"), float("inf"), "far", True):
+            with pytest.raises(ValueError, match=r"threshold=.* must be a .*finite number .* or None"):
                 gym.make(env_id, condition=condition, threshold=threshold)
+    with pytest.raises(ValueError, match=r"threshold=0.0 must be a positive finite number \(metres from"):
+        gym.make(env_id, threshold=0.0)
     with pytest.raises(ValueError, match=r"miss_reward=-1.0 is not allowed here.*leave it out"):
         gym.make(env_id, miss_reward=-1.0)
 

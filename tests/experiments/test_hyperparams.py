@@ -10,8 +10,8 @@ import torch as th
 import yaml
 
 from sb3_actpc.baselines.offline.served import ServedAlgorithm
-from sb3_actpc.envs import ROBOSUITE_IDS, register_envs, sparse_env_id
-from sb3_actpc.experiments.runs import ALGORITHMS, RunConfig
+from sb3_actpc.envs import ROBOSUITE_IDS, sparse_env_id
+from sb3_actpc.experiments.runs import ALGORITHMS, RunConfig, load_preset
 from sb3_actpc.experiments.runs.config import HYPERPARAMS_FOLDERS, resolve_run
 from sb3_actpc.experiments.runs.environments import make_train_env, register_tasks
 from sb3_actpc.experiments.runs.run import build_model
@@ -108,54 +108,7 @@ def test_settings_are_plain_values(path: Path) -> None:
         assert not isinstance(value, str) or not set(value) & set("()[]{}= ")
 
 
-MUJOCO = ("Reacher", "HalfCheetah", "Walker2d", "Hopper", "Swimmer")
-# the tables of arXiv 2209.09174, appendix: actor's rule and rate, critic's rate, discount
-TD3_TABLE = {
-    "Reacher": ("adamw", 1e-4, 3e-4, 0.991),
-    "HalfCheetah": ("adam", 5e-4, 4e-4, 0.992),
-    "Walker2d": ("adam", 5e-4, 2e-4, 0.992),
-    "Hopper": ("adamw", 1e-4, 3e-4, 0.991),
-    "Swimmer": ("adam", 5e-4, 4e-4, 0.992),
-}
-
-
-@pytest.mark.parametrize("task", MUJOCO)
-@pytest.mark.parametrize("version", ["v5", "v4"])
-def test_settings_are_those_of_the_papers_tables(task: str, version: str) -> None:
-    rule, actor_rate, critic_rate, gamma = TD3_TABLE[task]
-    td3 = settings("td3", f"Sparse{task}-{version}")
-    assert (td3["actor_kwargs"]["optimizer"], td3["actor_kwargs"]["learning_rate"]) == (rule, actor_rate)
-    assert (td3["critic_kwargs"]["learning_rate"], td3["gamma"], td3["batch_size"]) == (critic_rate, gamma, 1024)
-    assert (td3["target_policy_noise"], td3["policy_delay"], td3["noise_std"]) == (0.3, 5, 0.1)
-    her = settings("her", f"Goal{task}-{version}")
-    # the same rules and rates of the actor; the critic's are a tenth
-    assert (her["actor_kwargs"]["optimizer"], her["actor_kwargs"]["learning_rate"]) == (rule, actor_rate)
-    assert her["critic_kwargs"]["learning_rate"] == pytest.approx(critic_rate / 10)
-    assert (her["gamma"], her["batch_size"], her["policy_kwargs"]["net_arch"]) == (0.98, 2048, [256, 256])
-    logo = settings("logo", f"Sparse{task}-{version}")
-    deltas = {"Reacher": 0.01, "HalfCheetah": 0.2, "Walker2d": 0.05, "Hopper": 0.01, "Swimmer": 0.2}
-    assert (logo["guidance_delta"], logo["learning_rate"]) == (deltas[task], critic_rate)
-    assert (logo["gamma"], logo["n_steps"], logo["guidance_iterations"]) == (0.991, 2048, 50)
-
-
-def test_the_robosuite_settings_are_those_of_the_papers_table() -> None:
-    lift, can = settings("ddpg", "SparseLift-v0"), settings("ddpg", "SparsePickPlaceCan-v0")
-    for entry, expected in ((lift, (0.02, 0.05, 3e-4, 5e-4, 0.98)), (can, (0.05, 0.05, 3e-4, 3.5e-4, 0.989))):
-        actor, critic = entry["actor_kwargs"], entry["critic_kwargs"]
-        assert (actor["tau"], critic["tau"], actor["learning_rate"], critic["learning_rate"], entry["gamma"]) == expected
-        assert entry["batch_size"] == 512
-    assert lift["policy_kwargs"]["net_arch"] == {"pi": [512, 256], "qf": [512, 512]}
-    assert can["policy_kwargs"]["net_arch"] == {"pi": [512, 256], "qf": [512, 256]}
-
-
 @pytest.mark.parametrize("preset", ["td3", "her", "logo", "ddpg"])
 def test_the_baselines_get_minus_one_for_a_miss_of_the_reacher(preset: str) -> None:
     prefix = "Goal" if preset == "her" else "Sparse"
-    assert settings(preset, f"{prefix}Reacher-v5")["env_kwargs"] == {"miss_reward": -1.0}
-
-
-def settings(preset: str, env_id: str) -> dict:
-    from sb3_actpc.experiments.runs import load_preset
-
-    register_envs()
-    return load_preset(preset, env_id)
+    assert load_preset(preset, f"{prefix}Reacher-v5")["env_kwargs"] == {"miss_reward": -1.0}
