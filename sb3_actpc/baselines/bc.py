@@ -13,25 +13,23 @@ from torch import nn
 
 from sb3_actpc.actpc.self_imitation import Episodes
 from sb3_actpc.baselines.bc_policies import BCPolicy, BCRNNPolicy, CloningPolicy
-from sb3_actpc.baselines.offline.base import OfflineAlgorithm
-from sb3_actpc.baselines.signatures import with_keywords_of
+from sb3_actpc.baselines.offline_algorithm import OfflineAlgorithm
 from sb3_actpc.demonstrations.dataset import Demonstrations
 from sb3_actpc.utils.checks import check_kinds, check_range
 
 
-@with_keywords_of(OfflineAlgorithm)
 class BC(OfflineAlgorithm):
     """
     Behaviour cloning: the mean squared error between the demonstrated actions (scaled to [-1, 1]) and the network's.
 
-    A step of ``learn`` is one gradient step (see :class:`~sb3_actpc.baselines.offline.base.OfflineAlgorithm`). Observations
-    are normalised by the demonstrations' mean and standard deviation.
+    A step of ``learn`` is one gradient step. Observations are normalised by the demonstrations' mean and standard deviation.
 
     :param policy: "MlpPolicy"
     :param env: a task with Box observations and actions; for its spaces and for evaluations
     :param weight_decay: decoupled from the gradient (AdamW)
     :param input_noise: standard deviation of Gaussian noise on the normalised observations of each batch
-    :param options: keywords of :class:`~sb3_actpc.baselines.offline.base.OfflineAlgorithm`; ``policy_kwargs``: ``net_arch``
+    :param options: keywords of :class:`~sb3_actpc.baselines.offline_algorithm.OfflineAlgorithm`; ``policy_kwargs`` takes
+        ``net_arch``
     :raises ValueError: as there
     """
 
@@ -116,7 +114,6 @@ class BC(OfflineAlgorithm):
         return ["policy", "policy.optimizer"], []
 
 
-@with_keywords_of(BC)
 class BCRNN(BC):
     """
     Behaviour cloning with a recurrent network, in the way of robomimic's BC-RNN (Mandlekar et al., arXiv 2108.03298).

@@ -12,7 +12,7 @@ from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_actpc.baselines.demonstration_buffers import (
     DemonstrationDictReplayBuffer,
-    _DemonstrationReplay,
+    WithDemonstrations,
     demonstration_buffer_class,
 )
 from sb3_actpc.demonstrations import Demonstrations, fit_demonstrations
@@ -44,15 +44,13 @@ class DemonstratedAlgorithm(OffPolicyAlgorithm):
         self.demonstration_fraction = demonstration_fraction
 
     def _setup_model(self) -> None:
-        asked = self.replay_buffer_class, dict(self.replay_buffer_kwargs), self.n_steps
+        asked = self.replay_buffer_class
         if self.replay_buffer is None:
             self.replay_buffer = self._make_replay_buffer()
-        # the buffer is made: SB3 is not to warn of, nor to choose, another
-        self.replay_buffer_class, self.n_steps = type(self.replay_buffer), 1
         super()._setup_model()
-        self.replay_buffer_class, self.replay_buffer_kwargs, self.n_steps = asked
+        self.replay_buffer_class = asked  # SB3 puts its own default in the place of None; the agent is saved as it was made
 
-    def _replay_class(self) -> type[_DemonstrationReplay]:
+    def _replay_class(self) -> type[WithDemonstrations]:
         return demonstration_buffer_class(self.replay_buffer_class, self.observation_space, self.n_steps)
 
     def _make_replay_buffer(self) -> ReplayBuffer:
@@ -121,6 +119,6 @@ class DemonstratedAlgorithm(OffPolicyAlgorithm):
         return 0 if demonstrated is None else demonstrated.buffer_size
 
 
-def _placeholder(kind: type[_DemonstrationReplay]) -> type[_DemonstrationReplay]:
+def _placeholder(kind: type[WithDemonstrations]) -> type[WithDemonstrations]:
     """A class that needs no environment, with observations of the same kind."""
     return DemonstrationDictReplayBuffer if issubclass(kind, DictReplayBuffer) else kind

@@ -47,7 +47,7 @@ def fill_with_demonstrations(
         )
 
 
-class _DemonstrationReplay(ReplayBuffer):
+class WithDemonstrations(ReplayBuffer):
     """
     What the buffers of this module add to SB3's; combine it with one of them.
 
@@ -108,28 +108,28 @@ class _DemonstrationReplay(ReplayBuffer):
         shown = self.demonstrated.sample(n_demonstrated, env)
         if n_demonstrated == batch_size:
             return shown
-        return _joined(super().sample(batch_size - n_demonstrated, env), shown)
+        return join_batches(super().sample(batch_size - n_demonstrated, env), shown)
 
 
-class DemonstrationReplayBuffer(_DemonstrationReplay):
-    """SB3's replay buffer with demonstrations; see :class:`_DemonstrationReplay`."""
+class DemonstrationReplayBuffer(WithDemonstrations):
+    """SB3's replay buffer with demonstrations; see :class:`WithDemonstrations`."""
 
     _demonstrated_class = ReplayBuffer
 
 
-class DemonstrationNStepReplayBuffer(_DemonstrationReplay, NStepReplayBuffer):
+class DemonstrationNStepReplayBuffer(WithDemonstrations, NStepReplayBuffer):
     """SB3's n-step replay buffer with demonstrations, whose returns are n-step too."""
 
     _demonstrated_class = NStepReplayBuffer
 
 
-class DemonstrationDictReplayBuffer(_DemonstrationReplay, DictReplayBuffer):
+class DemonstrationDictReplayBuffer(WithDemonstrations, DictReplayBuffer):
     """SB3's replay buffer for Dict observations with demonstrations."""
 
     _demonstrated_class = DictReplayBuffer
 
 
-class DemonstrationHerReplayBuffer(_DemonstrationReplay, HerReplayBuffer):
+class DemonstrationHerReplayBuffer(WithDemonstrations, HerReplayBuffer):
     """SB3's hindsight replay buffer with demonstrations, which are relabelled as the agent's own transitions are."""
 
     _demonstrated_class = HerReplayBuffer
@@ -143,7 +143,7 @@ class DemonstrationHerReplayBuffer(_DemonstrationReplay, HerReplayBuffer):
 
 def demonstration_buffer_class(
     given: type[ReplayBuffer] | str | None, observation_space: spaces.Space, n_steps: int = 1
-) -> type[_DemonstrationReplay]:
+) -> type[WithDemonstrations]:
     """
     :param given: a class of SB3's or of this module, its name, or None
     :param observation_space: Dict or not
@@ -158,7 +158,7 @@ def demonstration_buffer_class(
         if is_dict:
             return DemonstrationDictReplayBuffer
         return DemonstrationNStepReplayBuffer if n_steps > 1 else DemonstrationReplayBuffer
-    if isinstance(given, type) and issubclass(given, _DemonstrationReplay):
+    if isinstance(given, type) and issubclass(given, WithDemonstrations):
         return given
     same = {
         "ReplayBuffer": DemonstrationReplayBuffer,
@@ -171,8 +171,12 @@ def demonstration_buffer_class(
     return same[name]
 
 
-def _joined(own: Any, shown: Any) -> Any:
-    """Two batches of one kind as one, field by field; fields that SB3 leaves at None stay None."""
+def join_batches(own: Any, shown: Any) -> Any:
+    """
+    :param own: a batch of SB3's, a named tuple of tensors (B, ...)
+    :param shown: another of the same kind, (C, ...)
+    :return: both as one, (B + C, ...), field by field; fields that SB3 leaves at None stay None
+    """
     columns: dict[str, Any] = {}
     for name, mine in own._asdict().items():
         theirs = getattr(shown, name)

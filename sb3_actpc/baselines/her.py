@@ -11,14 +11,12 @@ from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 from stable_baselines3.td3.policies import TD3Policy
 
-from sb3_actpc.baselines.demonstration_buffers import DemonstrationHerReplayBuffer, _DemonstrationReplay
+from sb3_actpc.baselines.demonstration_buffers import DemonstrationHerReplayBuffer, WithDemonstrations
 from sb3_actpc.baselines.prioritized import DemonstrationPrioritizedHerReplayBuffer, PrioritizedHerReplayBuffer
-from sb3_actpc.baselines.signatures import with_keywords_of
 from sb3_actpc.baselines.td3 import DDPGDemo
 from sb3_actpc.utils.checks import check_range
 
 
-@with_keywords_of(DDPGDemo)
 class HER(DDPGDemo):
     """
     DDPG with hindsight experience replay (Andrychowicz et al., arXiv 1707.01495) and demonstrations, on goal tasks.
@@ -80,7 +78,7 @@ class HER(DDPGDemo):
             **options,
         )
 
-    def _replay_class(self) -> type[_DemonstrationReplay]:
+    def _replay_class(self) -> type[WithDemonstrations]:
         keys = set(getattr(self.observation_space, "spaces", {}))
         if not {"observation", "achieved_goal", "desired_goal"} <= keys:
             raise ValueError(

@@ -19,7 +19,6 @@ from stable_baselines3.common.torch_layers import create_mlp
 from stable_baselines3.common.type_aliases import GymEnv
 from torch import nn
 
-from sb3_actpc.baselines.signatures import with_keywords_of
 from sb3_actpc.demonstrations import fit_demonstrations
 from sb3_actpc.demonstrations.dataset import Demonstrations
 from sb3_actpc.utils.checks import check_kinds, check_range
@@ -45,7 +44,6 @@ class Guidance(NamedTuple):
     returns: th.Tensor
 
 
-@with_keywords_of(TRPO)
 class LOGO(TRPO):
     """
     Learning online with guidance offline (Rengarajan et al., arXiv 2202.04628), on sb3-contrib's TRPO.

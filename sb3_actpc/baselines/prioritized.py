@@ -10,7 +10,7 @@ from stable_baselines3.common.type_aliases import DictReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
-from sb3_actpc.baselines.demonstration_buffers import _DemonstrationReplay, _joined
+from sb3_actpc.baselines.demonstration_buffers import WithDemonstrations, join_batches
 from sb3_actpc.utils.checks import check_range
 
 
@@ -132,7 +132,7 @@ class PrioritizedHerReplayBuffer(HerReplayBuffer):
         self.importance_weights = self.to_torch((weights / weights.max()).astype(np.float32)[:, None])
         self.beta = min(1.0, self.beta + self.beta_increment)
         self._drawn = drawn
-        return parts[0] if len(parts) == 1 else _joined(*parts)
+        return parts[0] if len(parts) == 1 else join_batches(*parts)
 
     def update_priorities(self, errors: np.ndarray) -> None:
         """:param errors: (B,) TD errors of the transitions sampled last, in their order"""
@@ -153,7 +153,7 @@ class PrioritizedHerReplayBuffer(HerReplayBuffer):
         self._tree[np.arange(self.priorities.size)] = self.priorities.reshape(-1)
 
 
-class DemonstrationPrioritizedHerReplayBuffer(_DemonstrationReplay, PrioritizedHerReplayBuffer):
+class DemonstrationPrioritizedHerReplayBuffer(WithDemonstrations, PrioritizedHerReplayBuffer):
     """The same with demonstrations, which are drawn uniformly and have weight 1."""
 
     _demonstrated_class = HerReplayBuffer

@@ -14,7 +14,6 @@ from stable_baselines3.sac.policies import SACPolicy
 from torch import nn
 
 from sb3_actpc.baselines.demonstrated import DemonstratedAlgorithm
-from sb3_actpc.baselines.signatures import with_keywords_of
 from sb3_actpc.demonstrations.dataset import Demonstrations
 from sb3_actpc.utils.checks import check_range
 
@@ -89,7 +88,6 @@ class LayerNormMultiInputPolicy(LayerNormSACPolicy):
         super().__init__(*args, **{"features_extractor_class": CombinedExtractor, **kwargs})
 
 
-@with_keywords_of(SAC)
 class RLPD(DemonstratedAlgorithm, SAC):
     """
     SAC in the way of RLPD (Ball et al., arXiv 2302.02948): half of every batch from the demonstrations, layer-normalised

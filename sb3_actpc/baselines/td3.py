@@ -17,7 +17,6 @@ from stable_baselines3.td3.policies import TD3Policy
 
 from sb3_actpc.actpc.self_imitation import map_observations
 from sb3_actpc.baselines.demonstrated import DemonstratedAlgorithm
-from sb3_actpc.baselines.signatures import with_keywords_of
 from sb3_actpc.demonstrations.dataset import Demonstrations
 from sb3_actpc.utils.checks import check_kinds, check_range
 
@@ -25,7 +24,6 @@ OPTIMIZERS: dict[str, type[th.optim.Optimizer]] = {"adam": th.optim.Adam, "adamw
 NETWORK_KEYWORDS = ("learning_rate", "optimizer", "optimizer_kwargs", "tau")
 
 
-@with_keywords_of(TD3)
 class TD3Demo(DemonstratedAlgorithm, TD3):
     """
     Stable-Baselines3's TD3 (Fujimoto et al., arXiv 1802.09477) with a share of demonstrations in every batch.
@@ -184,7 +182,6 @@ class TD3Demo(DemonstratedAlgorithm, TD3):
         return [*super()._excluded_save_params(), "_losses"]
 
 
-@with_keywords_of(TD3Demo)
 class DDPGDemo(TD3Demo):
     """
     DDPG with demonstrations (the paper's DDPG-Demo), after Nair et al., arXiv 1709.10089.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import os
 from collections.abc import Mapping
 from enum import Enum
@@ -24,6 +23,7 @@ from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, Line
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_actpc.actpc import buffers
+from sb3_actpc.utils.constructors import constructor_keywords
 
 _ACTIVATIONS = ("ReLU", "LeakyReLU", "Tanh", "ELU", "GELU", "SiLU", "Mish", "Sigmoid", "Softplus", "Identity", "ReLU6")
 _OPTIMIZERS = ("Adam", "AdamW", "SGD", "RMSprop", "Adamax", "NAdam", "RAdam", "Adagrad")
@@ -49,7 +49,7 @@ _NOISES: dict[str, tuple[Any, dict[str, str]]] = {
     ),
 }
 # chosen anew by whoever loads, or stored otherwise
-_NOT_STORED = {"self", "env", "policy", "device", "verbose", "tensorboard_log", "_init_setup_model"}
+_NOT_STORED = {"env", "policy", "device", "verbose", "tensorboard_log"}
 _ATTRIBUTE_OF = {"stats_window_size": "_stats_window_size"}
 
 
@@ -60,7 +60,7 @@ def constructor_settings(model: BaseAlgorithm) -> dict[str, Any]:
         out and its keyword listed under ``"unnamed"``
     """
     record: dict[str, Any] = {"policy": policy_name(model), "keywords": {}, "unnamed": []}
-    for name in inspect.signature(type(model).__init__).parameters:
+    for name in constructor_keywords(type(model)):
         attribute = _ATTRIBUTE_OF.get(name, name)
         if name in _NOT_STORED or not hasattr(model, attribute):
             continue

@@ -31,13 +31,13 @@ import yaml
 from sb3_actpc.experiments.runs.config import (
     ALGORITHMS,
     check_keywords,
-    constructor_parameters,
     find_demonstrations,
     load_algorithm,
     load_preset,
 )
 from sb3_actpc.experiments.runs.environments import check_env_id, make_env, register_tasks
 from sb3_actpc.experiments.runs.run import EVALUATION_SEED_OFFSET
+from sb3_actpc.utils.constructors import constructor_keywords
 
 SCRIPTS = {
     "train": "rl_zoo3.train:train",
@@ -232,14 +232,14 @@ def _zoo_settings(ours: argparse.Namespace) -> dict[str, Any]:
     settings = load_preset(ours.preset or ours.algo, ours.env)
     check_keywords(algorithm, {name: value for name, value in settings.items() if name not in _RUN_KEYS})
     settings.setdefault("policy", "MlpPolicy")
-    if "demonstrations" in constructor_parameters(algorithm):
+    if "demonstrations" in constructor_keywords(algorithm):
         demonstrations = find_demonstrations(ours.env, ours.demonstrations)
         settings["demonstrations"] = None if demonstrations is None else str(demonstrations.absolute())
     if _reports_success(ours.env, settings.get("env_kwargs") or {}):
         # the Monitor wants a tuple, which a settings file cannot hold but as the Python that rl_zoo3 evaluates
         settings["monitor_kwargs"] = "dict(info_keywords=('is_success',))"
     # hindsight cannot sample before its first whole episode
-    if ours.trained_agent and "learning_starts" in constructor_parameters(algorithm) and not _uses_hindsight(ours, settings):
+    if ours.trained_agent and "learning_starts" in constructor_keywords(algorithm) and not _uses_hindsight(ours, settings):
         settings["learning_starts"] = 0
     return settings
 

@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 from stable_baselines3.common.evaluation import evaluate_policy
 
-from sb3_actpc.baselines import BCQ, CQL, HBC, IRIS, installation
+from sb3_actpc.baselines import BCQ, CQL, HBC, IRIS
+from sb3_actpc.baselines.offline import installation
 from sb3_actpc.baselines.offline.installation import environment_python, install
 from sb3_actpc.baselines.offline.process import ServerFailed, ServerProcess
 from sb3_actpc.baselines.offline.served import SERVERS, ServedAlgorithm

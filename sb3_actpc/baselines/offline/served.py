@@ -20,11 +20,10 @@ from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
 from sb3_actpc.actpc.self_imitation import Episodes
 from sb3_actpc.baselines.bc_policies import LARGEST_INPUT, SMALLEST_SPREAD
-from sb3_actpc.baselines.offline.base import OfflineAlgorithm
 from sb3_actpc.baselines.offline.installation import environment_python
 from sb3_actpc.baselines.offline.process import ServerProcess
 from sb3_actpc.baselines.offline.servers.frames import Arrays
-from sb3_actpc.baselines.signatures import with_keywords_of
+from sb3_actpc.baselines.offline_algorithm import OfflineAlgorithm
 from sb3_actpc.demonstrations.dataset import Demonstrations
 from sb3_actpc.utils.checks import check_kinds, check_range
 
@@ -76,7 +75,6 @@ class ServedPolicy(BasePolicy):
         return (actions if is_batch else actions[0]), after
 
 
-@with_keywords_of(OfflineAlgorithm)
 class ServedAlgorithm(OfflineAlgorithm):
     """
     What the four have in common.
@@ -90,8 +88,8 @@ class ServedAlgorithm(OfflineAlgorithm):
     :param batch_size: B
     :param method_kwargs: the method's own settings, by the names that its package gives them
     :param timeout: seconds that one gradient step, or the start, may take
-    :param options: further keywords of :class:`~sb3_actpc.baselines.offline.base.OfflineAlgorithm`; the learning rates are
-        among ``method_kwargs``
+    :param options: further keywords of :class:`~sb3_actpc.baselines.offline_algorithm.OfflineAlgorithm`; the learning
+        rates are among ``method_kwargs``
     :raises ValueError: as there
     :raises ImportError: when the package's environment has not been made; the message names the command that does it
     """

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import importlib
-import inspect
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
@@ -19,8 +18,8 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.utils import LinearSchedule
 
-from sb3_actpc.baselines.offline.served import ServedAlgorithm
 from sb3_actpc.utils.checks import check_device
+from sb3_actpc.utils.constructors import constructor_keywords
 from sb3_actpc.demonstrations.dataset import shipped_demonstrations
 from sb3_actpc.envs import sparse_env_id
 
@@ -164,7 +163,7 @@ class RunPlan:
     @property
     def uses_demonstrations(self) -> bool:
         """Whether the algorithm is given the demonstrations (TD3, say, has no keyword for them)."""
-        return self.demonstrations is not None and "demonstrations" in constructor_parameters(self.algorithm)
+        return self.demonstrations is not None and "demonstrations" in constructor_keywords(self.algorithm)
 
 
 def resolve_run(config: RunConfig) -> RunPlan:
@@ -188,15 +187,14 @@ def resolve_run(config: RunConfig) -> RunPlan:
         raise ValueError(f"policy must be a name, found {policy!r}")
     noise = _pop_noise(settings)
     normalize = _pop_normalize(settings)
-    if noise is not None and "action_noise" not in constructor_parameters(algorithm):
+    if noise is not None and "action_noise" not in constructor_keywords(algorithm):
         raise ValueError(f"{algorithm.__name__} takes no action noise: leave noise_type and noise_std out")
     for name in ("n_timesteps", "n_envs"):
         settings.pop(name, None)
     if isinstance(settings.get("train_freq"), list):
         settings["train_freq"] = tuple(settings["train_freq"])
     check_keywords(algorithm, settings)
-    if issubclass(algorithm, ServedAlgorithm):
-        algorithm.check_installed()
+    getattr(algorithm, "check_installed", lambda: None)()  # methods of packages in an environment of their own
     eval_freq = config.eval_freq or max(1, n_timesteps // 10)
     plan = RunPlan(
         algorithm=algorithm,
@@ -306,7 +304,7 @@ def check_keywords(algorithm: type[BaseAlgorithm], settings: Mapping[str, Any]) 
     :param settings: constructor keywords
     :raises ValueError: naming the first one that it does not take, or that has an option of its own
     """
-    known = constructor_parameters(algorithm)
+    known = constructor_keywords(algorithm)
     for name in settings:
         if name in _OPTION_OF:
             raise ValueError(f"{name!r} is not set here: use {_OPTION_OF[name]}")
@@ -388,12 +386,3 @@ def _with_floats(value: Any) -> Any:
     if isinstance(value, list):
         return [_with_floats(part) for part in value]
     return value
-
-
-def constructor_parameters(algorithm: type[BaseAlgorithm]) -> list[str]:
-    """Keywords that a class takes.
-
-    :param algorithm: the class
-    :return: their names
-    """
-    return [name for name in inspect.signature(algorithm).parameters if not name.startswith("_")]

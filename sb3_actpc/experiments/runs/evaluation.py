@@ -16,7 +16,6 @@ import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_actpc.baselines.offline.base import OfflineAlgorithm
 from sb3_actpc.utils.files import atomic_write
 
 UNTRAINED_EPISODES = 5
@@ -231,7 +230,7 @@ class EvaluationCallback(BaseCallback):
         self._started = time.perf_counter()
         with atomic_write(self.folder / PROGRESS, "w") as file:
             csv.writer(file, lineterminator="\n").writerow(PROGRESS_COLUMNS)
-        if isinstance(model, OfflineAlgorithm):
+        if getattr(model, "is_offline", False):
             self._last_timesteps = 0
         else:
             self._evaluate(min(self.eval_episodes, UNTRAINED_EPISODES))

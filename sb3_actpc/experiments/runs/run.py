@@ -18,7 +18,6 @@ from stable_baselines3.common.noise import ActionNoise, NormalActionNoise, Ornst
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_actpc.baselines.offline.served import ServedAlgorithm
 from sb3_actpc.checkpoints import CheckpointCallback, list_bundles, restore
 from sb3_actpc.demonstrations.dataset import Demonstrations
 from sb3_actpc.experiments.runs.config import RunConfig, RunPlan, load_algorithm, parse_schedule, resolve_run
@@ -243,8 +242,7 @@ def close_model(model: Any) -> None:
     """
     :param model: ends its other process, where it has one
     """
-    if isinstance(model, ServedAlgorithm):
-        model.close()
+    getattr(model, "close", lambda: None)()
 
 
 def _checkpoints(folder: Path, plan: RunPlan, report: Callable[[str], None]) -> list[BaseCallback]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch as th
@@ -46,6 +46,8 @@ class OfflineAlgorithm(BaseAlgorithm):
         fit the environment, for other spaces, and for an environment that normalises observations
     """
 
+    is_offline: ClassVar[bool] = True  # for those who run any algorithm: its steps do nothing in the environment
+
     def __init__(
         self,
         policy: str | type[BasePolicy],
@@ -85,6 +87,13 @@ class OfflineAlgorithm(BaseAlgorithm):
         self.batch_size = batch_size
         if _init_setup_model:
             self._setup_model()
+
+    @classmethod
+    def check_installed(cls) -> None:
+        """:raises ImportError: when something that the method needs is not installed; the message says how to install it"""
+
+    def close(self) -> None:
+        """Let go of what the agent holds beside its memory; here nothing."""
 
     @abstractmethod
     def train(self) -> None:

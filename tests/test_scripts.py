@@ -1,0 +1,17 @@
+"""The scripts beside the tests, as far as they can be tried quickly."""
+
+import pytest
+
+from tests import sb3_suite
+
+
+@pytest.mark.parametrize(("ci", "code"), [("1", 1), ("", 0)])
+def test_sb3s_own_tests_are_not_passed_over_in_silence(
+    ci: str, code: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Without the archive nothing is tested: a failure where nobody reads, a loud line where somebody does."""
+    monkeypatch.setattr(sb3_suite, "fetch_archive", lambda: None)
+    monkeypatch.setattr("sys.argv", ["sb3_suite.py"])
+    monkeypatch.setenv("CI", ci)
+    assert sb3_suite.main() == code
+    assert "SKIPPED" in capsys.readouterr().out
