@@ -3,28 +3,20 @@
 from collections.abc import Sequence
 from math import inf
 from numbers import Integral, Real
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch as th
 from torch import nn
 
 from sb3_actpc.ngc.activations import ACTIVATIONS, get_activation
-from sb3_actpc.ngc.dynamics import DYNAMICS, SettledState, SettlingChain, predict
+from sb3_actpc.ngc.dynamics import DYNAMICS, ChainSettings, SettledState, SettlingChain
 from sb3_actpc.ngc.plasticity import SYNAPTIC_SCALINGS, HebbianChanges, bound_columns_, hebbian_changes, soft_bound_
 from sb3_actpc.ngc.stability import arrival_fractions, power_iteration_, settling_rates
+from sb3_actpc.ngc.synapses import Synapses, predict
 
 SETTLINGS = ("iterative", "scheduled")
 FEEDBACKS = ("learned", "tied")
 LARGEST_SIZE = 2**20  # of a layer, and of the number of steps
-
-
-class Synapses(NamedTuple):
-    """The parameters of a circuit as plain lists, in forward order."""
-
-    weights: list[th.Tensor]
-    biases: list[th.Tensor]
-    memory: list[th.Tensor]
-    feedback: list[th.Tensor]
 
 
 class NGCCircuit(nn.Module):
@@ -42,7 +34,9 @@ class NGCCircuit(nn.Module):
     :param activation: φ of the hidden layers: relu6 (paper), relu, leaky_relu, elu, tanh or identity
     :param output_activation: g of the output layer, same choices
     :param settling: "iterative" (``n_settling_steps`` steps of eq. 1, then one change) or "scheduled" (each layer's change is
-        taken when the error first reaches it; numerically the gradient of the output's loss, about K times cheaper)
+        taken when the error first reaches it, one ordered sweep; the zero-divergence schedule, Z-IL, of the predictive-coding
+        literature; about K times cheaper). Scheduled with tied feedback is, numerically, the gradient of the output's loss;
+        with learned error synapses it is where the error neurons rest under an infinitesimal error, and uses no W^T
     :param n_settling_steps: K (paper: 10 to 25)
     :param dynamics: "error" (error neurons integrate, states follow their predictions) or "state" (eq. 1 to the letter);
         same fixed points, see :class:`~sb3_actpc.ngc.dynamics.SettlingChain`
@@ -122,7 +116,6 @@ class NGCCircuit(nn.Module):
         _check_flags(compensate_arrival=compensate_arrival, derivative_free=derivative_free)
         if settling == "scheduled":
             _check_scheduled(
-                feedback=feedback,
                 feedback_scale=feedback_scale,
                 leak=leak,
                 settling_rate=settling_rate,
@@ -174,32 +167,14 @@ class NGCCircuit(nn.Module):
         """Number of hidden layers."""
         return len(self.sizes) - 2
 
-    def layer_biases(self, memory: th.Tensor | None) -> list[th.Tensor]:
+    def input_feedback(self, tied: bool = False) -> th.Tensor:
         """
-        What every layer's prediction adds to W φ(z): b (n_out,), or with a memory b + α_m M m_t, (B, n_out).
+        E^T of the input's last ``n_feedback_inputs`` columns, (n_first, n_feedback_inputs).
 
-        :raises ValueError: when a memory is missing, not wanted or of the wrong size
+        :param tied: the weights themselves, whatever the circuit uses
         """
-        if (memory is not None) != bool(self.n_memory) or (memory is not None and memory.shape[1] != self.n_memory):
-            found = "no memory" if memory is None else f"a memory of size {memory.shape[1]}"
-            raise ValueError(f"this circuit has n_memory={self.n_memory} but was given {found}")
-        if memory is None:
-            return self.synapses.biases
-        return [
-            th.addmm(bias, memory, weights.t(), alpha=self.memory_weight)
-            for bias, weights in zip(self.synapses.biases, self.synapses.memory, strict=True)
-        ]
-
-    def feedback_matrix(self, layer: int, tied: bool = False) -> th.Tensor:
-        """
-        E^T of hidden layer ``layer`` (1 = first), shape (n_below, n_layer); layer 0 is the input's last
-        ``n_feedback_inputs`` columns. With ``tied`` the weights themselves, whatever the circuit uses.
-        """
-        if self.feedback == "learned" and not tied:
-            return self.synapses.feedback[layer if self.n_feedback_inputs else layer - 1]
-        weights = self.synapses.weights[layer]
-        weights = weights if layer else weights[:, self.sizes[0] - self.n_feedback_inputs :]
-        return weights if tied or self.feedback_scale == 1.0 else self.feedback_scale * weights
+        matrix = self.synapses.feedback_matrix(0, self.feedback_scale, tied)
+        return matrix[:, matrix.shape[1] - self.n_feedback_inputs :]
 
     # ------------------------------------------------------------------ inference
 
@@ -211,7 +186,7 @@ class NGCCircuit(nn.Module):
         :param memory: m_t, (B, n_memory), for a circuit with a working memory
         :return: (B, n_outputs)
         """
-        biases = self.layer_biases(memory)
+        biases = self.synapses.layer_biases(memory, self.memory_weight)
         for weights, bias in zip(self.synapses.weights[:-1], biases[:-1], strict=True):
             latents = predict(x, weights, bias)
             x = self.activation.apply(latents, latents)
@@ -227,7 +202,7 @@ class NGCCircuit(nn.Module):
         :param memory: m_t, (B, n_memory), for a circuit with a working memory
         :return: latents, activations and errors of every layer
         """
-        chain = SettlingChain(self, x, memory)
+        chain = self.chain(x, memory)
         chain.clamp_output(target)
         if self.settling == "scheduled":
             chain.sweep()
@@ -239,6 +214,19 @@ class NGCCircuit(nn.Module):
             chain.integrate(rates)
             chain.predict()
         return chain.state()
+
+    def chain(self, x: th.Tensor, memory: th.Tensor | None = None) -> SettlingChain:
+        """The projected chain of this circuit's layers, to be clamped and settled; see :meth:`settle` for the shapes."""
+        settings = ChainSettings(
+            self.activation,
+            self.output_activation,
+            self.dynamics,
+            self.leak,
+            self.derivative_free,
+            self.feedback_scale,
+            self.memory_weight,
+        )
+        return SettlingChain(self.synapses, settings, x, memory)
 
     def energy(self, state: SettledState) -> th.Tensor:
         """1/2 Σ ||e||^2 over the layers, per sample, (B,) (paper: total discrepancy, appendix)."""
@@ -252,7 +240,7 @@ class NGCCircuit(nn.Module):
         """
         moves, drives = [], []
         for layer in range(1, self.n_hidden + 1):
-            signal = state.postsynaptic[layer] @ self.feedback_matrix(layer)
+            signal = state.postsynaptic[layer] @ self.synapses.feedback_matrix(layer, self.feedback_scale)
             if not self.derivative_free:
                 signal = self.activation.damp(signal, state.latents[layer], state.activations[layer])
             drives.append(signal.square().sum())
@@ -331,7 +319,7 @@ class NGCCircuit(nn.Module):
         named = [(f"singular_vector_{layer}", self.synapses.weights[layer]) for layer in range(1, self.n_hidden + 1)]
         if self.feedback == "learned":
             named += [
-                (f"feedback_singular_vector_{layer}", self.feedback_matrix(layer)) for layer in range(1, self.n_hidden + 1)
+                (f"feedback_singular_vector_{layer}", self.synapses.feedback_matrix(layer, self.feedback_scale)) for layer in range(1, self.n_hidden + 1)
             ]
         return named
 
@@ -383,7 +371,6 @@ def _check_flags(**given: Any) -> None:
 def _check_scheduled(**given: Any) -> None:
     """Scheduled settling implies these settings: say which explicit one conflicts."""
     implied: dict[str, tuple[Any, ...]] = {
-        "feedback": ("tied",),
         "feedback_scale": (1.0,),
         "leak": (0.0,),
         "settling_rate": ("auto", 1.0),

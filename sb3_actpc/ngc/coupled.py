@@ -57,15 +57,15 @@ def settle_coupled(
     for name in ("settling", "n_settling_steps"):
         if getattr(actor, name) != getattr(critic, name):
             raise ValueError(f"actor {name}={getattr(actor, name)!r} and critic {name}={getattr(critic, name)!r} must agree")
-    motor = SettlingChain(actor, x, memory)
-    value = SettlingChain(critic, th.cat([x, motor.output], dim=1), None)
+    motor = actor.chain(x, memory)
+    value = critic.chain(th.cat([x, motor.output], dim=1))
     infinitesimal = nudge is None and all(c.dynamics == "error" and not c.leak for c in (actor, critic))
     scale = 1.0 if nudge is None or actor.settling == "scheduled" else nudge
     value.clamp_output_drive(_damped(value, th.full_like(value.output, scale / value.output.shape[1])))
     if actor.settling == "scheduled":
-        _sweep_both(motor, value)
+        _sweep_both(motor, value, critic.input_feedback())
     else:
-        _settle_both(motor, value, states_move=not infinitesimal)
+        _settle_both(actor, critic, motor, value, states_move=not infinitesimal)
         for error in [*motor.errors, motor.output_error]:
             error.div_(scale)
         if motor.drive is not motor.output_error:
@@ -80,55 +80,55 @@ def policy_gradient(actor: NGCCircuit, critic: NGCCircuit, x: th.Tensor, memory:
     :param actor: as for :func:`settle_coupled`, and so are the others
     :return: the ascent direction of the mean action-value, batch mean
     """
-    motor = SettlingChain(actor, x, memory)
-    value = SettlingChain(critic, th.cat([x, motor.output], dim=1), None)
+    motor = actor.chain(x, memory)
+    value = critic.chain(th.cat([x, motor.output], dim=1))
     value.clamp_output_drive(_damped(value, th.full_like(value.output, 1.0 / value.output.shape[1])))
-    _sweep_both(motor, value, exact=True)
+    _sweep_both(motor, value, critic.input_feedback(tied=True), exact=True)
     return actor.hebbian_update(motor.state())
 
 
-def _sweep_both(motor: SettlingChain, value: SettlingChain, exact: bool = False) -> None:
+def _sweep_both(motor: SettlingChain, value: SettlingChain, to_action: th.Tensor, exact: bool = False) -> None:
     value.sweep(exact)
-    _clamp_actor(motor, value, exact)
+    _clamp_actor(motor, value, to_action)
     motor.sweep(exact)
 
 
-def _settle_both(motor: SettlingChain, value: SettlingChain, states_move: bool) -> None:
+def _settle_both(
+    actor: NGCCircuit, critic: NGCCircuit, motor: SettlingChain, value: SettlingChain, states_move: bool
+) -> None:
     value.start_settling()
     motor.start_settling()
-    value_rates, motor_rates = _coupled_rates(value), _coupled_rates(motor)
-    n_steps, actor_waits = value.circuit.n_settling_steps, value.n_hidden
+    value_rates, motor_rates = _coupled_rates(critic), _coupled_rates(actor)
+    to_action, n_steps = critic.input_feedback(), critic.n_settling_steps
     motor.arrived = arrival_fractions((*motor_rates, *value_rates), n_steps)[: motor.n_hidden + 1]
     for step in range(n_steps):
-        if step >= actor_waits:  # only now has the critic's first layer an error to pass on
-            _clamp_actor(motor, value)
+        if step >= value.n_hidden:  # only now has the critic's first layer an error to pass on
+            _clamp_actor(motor, value, to_action)
             motor.integrate(motor_rates)
         value.integrate(value_rates)
         if states_move:
             motor.predict(output=False)
             value.predict(output=False)
-    _clamp_actor(motor, value)
+    _clamp_actor(motor, value, to_action)
 
 
-def _coupled_rates(chain: SettlingChain) -> list[float]:
+def _coupled_rates(circuit: NGCCircuit) -> list[float]:
     """The circuit's own rates; with the default dynamics, where the pair has no loop to keep stable, a larger one."""
-    circuit = chain.circuit
     if circuit.dynamics == "error" and circuit.settling_rate == "auto":
-        return [COUPLED_RATE] * chain.n_hidden
-    return circuit.rates.tolist()[: chain.n_hidden]
+        return [COUPLED_RATE] * circuit.n_hidden
+    return circuit.rates.tolist()[: circuit.n_hidden]
 
 
-def _clamp_actor(motor: SettlingChain, value: SettlingChain, exact: bool = False) -> None:
+def _clamp_actor(motor: SettlingChain, value: SettlingChain, to_action: th.Tensor) -> None:
     """The actor's output error becomes d_a = E_a e of the critic's first layer (of its output, without hidden layers)."""
-    below = value.errors[0] if value.n_hidden else value.drive
-    perturbation = below @ value.circuit.feedback_matrix(0, tied=exact)
+    perturbation = (value.errors[0] if value.n_hidden else value.drive) @ to_action
     motor.output_error = perturbation
     motor.drive = _damped(motor, perturbation)
 
 
 def _damped(chain: SettlingChain, error: th.Tensor) -> th.Tensor:
     """The output error times g' at the held output; the error itself when g is the identity."""
-    activation = chain.circuit.output_activation
+    activation = chain.settings.output_activation
     if activation.name == "identity":
         return error
     return activation.damp(error.clone(), chain.output_prediction, chain.output)

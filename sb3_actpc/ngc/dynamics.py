@@ -1,12 +1,12 @@
 """Settling: how the latent states and error neurons of a circuit move while its synapses stand still."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import NamedTuple
 
 import torch as th
 
-if TYPE_CHECKING:
-    from sb3_actpc.ngc.circuit import NGCCircuit
+from sb3_actpc.ngc.activations import Activation
+from sb3_actpc.ngc.synapses import Synapses, predict
 
 DYNAMICS = ("error", "state")
 
@@ -42,6 +42,18 @@ class SettledState:
         return 0.5 * th.stack([error.square().sum(1) for error in self.errors]).sum(0)
 
 
+class ChainSettings(NamedTuple):
+    """What a chain asks of its circuit beside the synapses; see :class:`~sb3_actpc.ngc.circuit.NGCCircuit` for each."""
+
+    activation: Activation
+    output_activation: Activation
+    dynamics: str = "error"
+    leak: float = 0.0
+    derivative_free: bool = False
+    feedback_scale: float = 1.0
+    memory_weight: float = 1.0
+
+
 class SettlingChain:
     """
     The live latents and errors of one circuit, advanced step by step without any allocation.
@@ -53,23 +65,25 @@ class SettlingChain:
 
     Layers that no error has reached yet stand still and cost nothing.
 
-    :param circuit: the circuit whose synapses are used (never changed)
+    :param synapses: used, never changed
+    :param settings: how the layers move
     :param x: the clamped input, (B, n_inputs)
     :param memory: m_t, (B, n_memory), or None
     """
 
-    def __init__(self, circuit: "NGCCircuit", x: th.Tensor, memory: th.Tensor | None) -> None:
-        self.circuit = circuit
+    def __init__(self, synapses: Synapses, settings: ChainSettings, x: th.Tensor, memory: th.Tensor | None) -> None:
+        self.synapses = synapses
+        self.settings = settings
         self.memory = memory
-        self.biases = circuit.layer_biases(memory)
+        self.biases = synapses.layer_biases(memory, settings.memory_weight)
         self.latents: list[th.Tensor] = [x]
         self.activations: list[th.Tensor] = [x]
-        for weights, bias in zip(circuit.synapses.weights[:-1], self.biases[:-1], strict=True):
+        for weights, bias in zip(synapses.weights[:-1], self.biases[:-1], strict=True):
             latents = predict(self.activations[-1], weights, bias)
             self.latents.append(latents)
-            self.activations.append(circuit.activation.apply(latents, th.empty_like(latents)))
-        self.output_prediction = predict(self.activations[-1], circuit.synapses.weights[-1], self.biases[-1])
-        self.output = circuit.output_activation.apply(self.output_prediction, th.empty_like(self.output_prediction))
+            self.activations.append(settings.activation.apply(latents, th.empty_like(latents)))
+        self.output_prediction = predict(self.activations[-1], synapses.weights[-1], self.biases[-1])
+        self.output = settings.output_activation.apply(self.output_prediction, th.empty_like(self.output_prediction))
         self.n_hidden = len(self.latents) - 1
         self.lowest_reached = self.n_hidden + 1
         self.target: th.Tensor | None = None
@@ -88,7 +102,7 @@ class SettlingChain:
         """Clamp the output layer to ``target`` (B, n_outputs): its error is target - g(z̄), now and after every step."""
         self.target = target
         self.output_error = th.empty_like(self.output)
-        self.drive = th.empty_like(self.output) if self.circuit.output_activation.name != "identity" else self.output_error
+        self.drive = th.empty_like(self.output) if self.settings.output_activation.name != "identity" else self.output_error
         self._refresh_output_error()
 
     def clamp_output_drive(self, drive: th.Tensor) -> None:
@@ -101,7 +115,7 @@ class SettlingChain:
         th.sub(self.target, self.output, out=self.output_error)
         if self.drive is not self.output_error:
             self.drive.copy_(self.output_error)
-            self.circuit.output_activation.damp(self.drive, self.output_prediction, self.output)
+            self.settings.output_activation.damp(self.drive, self.output_prediction, self.output)
 
     def feedback_to(self, layer: int, exact: bool = False) -> th.Tensor:
         """
@@ -109,22 +123,23 @@ class SettlingChain:
 
         With ``exact`` through W^T and with φ', whatever the circuit uses.
         """
-        circuit = self.circuit
+        settings = self.settings
         below = self.drive if layer == self.n_hidden else self.errors[layer]
-        signal = th.mm(below, circuit.feedback_matrix(layer, tied=exact), out=self.feedback[layer - 1])
-        if exact or not circuit.derivative_free:
-            circuit.activation.damp(signal, self.latents[layer], self.activations[layer])
+        matrix = self.synapses.feedback_matrix(layer, settings.feedback_scale, tied=exact)
+        signal = th.mm(below, matrix, out=self.feedback[layer - 1])
+        if exact or not settings.derivative_free:
+            settings.activation.damp(signal, self.latents[layer], self.activations[layer])
         return signal
 
     def integrate(self, rates: list[float]) -> None:
         """One step of eq. 1 for every hidden layer that an error has reached; ``rates`` are the β, first layer first."""
-        circuit = self.circuit
-        self.lowest_reached = 1 if circuit.leak else max(1, self.lowest_reached - 1)
+        settings = self.settings
+        self.lowest_reached = 1 if settings.leak else max(1, self.lowest_reached - 1)
         for layer in range(self.lowest_reached, self.n_hidden + 1):
             signal, error, rate = self.feedback_to(layer), self.errors[layer - 1], rates[layer - 1]
-            if circuit.leak:
-                signal.sub_(self.latents[layer], alpha=circuit.leak)
-            if circuit.dynamics == "error" or layer == 1:  # the first layer's prediction is constant: both are the same
+            if settings.leak:
+                signal.sub_(self.latents[layer], alpha=settings.leak)
+            if settings.dynamics == "error" or layer == 1:  # the first layer's prediction is constant: both are the same
                 error.lerp_(signal, rate)
             else:
                 self.latents[layer].add_(signal.sub_(error), alpha=rate)
@@ -135,30 +150,33 @@ class SettlingChain:
 
         :param output: also predict the output (needless where its error is clamped)
         """
-        circuit = self.circuit
+        settings = self.settings
         for layer in range(self.lowest_reached, self.n_hidden + 1):
             latents, error = self.latents[layer], self.errors[layer - 1]
             if layer == 1:
                 th.add(self.first_prediction, error, out=latents)
-            elif circuit.dynamics == "error":
+            elif settings.dynamics == "error":
                 th.add(error, self.biases[layer - 1], out=latents)
-                latents.addmm_(self.activations[layer - 1], circuit.synapses.weights[layer - 1].t())
+                latents.addmm_(self.activations[layer - 1], self.synapses.weights[layer - 1].t())
             else:
                 th.sub(latents, self.biases[layer - 1], out=error)
-                error.addmm_(self.activations[layer - 1], circuit.synapses.weights[layer - 1].t(), alpha=-1.0)
-            self.activations[layer] = circuit.activation.apply(latents, self.activations[layer])
+                error.addmm_(self.activations[layer - 1], self.synapses.weights[layer - 1].t(), alpha=-1.0)
+            self.activations[layer] = settings.activation.apply(latents, self.activations[layer])
         if output:
-            th.addmm(self.biases[-1], self.activations[-1], circuit.synapses.weights[-1].t(), out=self.output_prediction)
-            self.output = circuit.output_activation.apply(self.output_prediction, self.output)
+            th.addmm(self.biases[-1], self.activations[-1], self.synapses.weights[-1].t(), out=self.output_prediction)
+            self.output = settings.output_activation.apply(self.output_prediction, self.output)
             if self.target is not None:
                 self._refresh_output_error()
 
     def sweep(self, exact: bool = False) -> None:
         """
-        The scheduled shortcut: every layer's error is taken at the step when it first arrives, the states at projection.
+        One ordered pass, e_l = φ'(z_l) ⊙ (E_l e_{l+1}) from the output to the first layer, with the states at projection.
 
-        From ago109/active-neural-generative-coding, ``src/model/ngc.py``. With tied feedback this is, numerically, the
-        gradient of the output's loss; with ``exact`` it is so for every circuit.
+        This is where the error neurons rest under an infinitesimal output error, whatever E is: eq. 1 is triangular there. It
+        is also the zero-divergence schedule of the predictive-coding literature (Z-IL: Song et al., 2020), and how
+        ago109/active-neural-generative-coding, ``src/model/ngc.py``, updates: every layer's change is taken at the step when
+        the error first reaches it. With tied feedback it is, numerically, the gradient of the output's loss; with learned
+        error synapses no W^T is used anywhere. With ``exact`` it is that gradient for every circuit.
         """
         self.feedback = [th.empty_like(z) for z in self.latents[1:]]
         self.errors = self.feedback
@@ -176,8 +194,3 @@ class SettlingChain:
             memory=self.memory,
             arrived=self.arrived,
         )
-
-
-def predict(activations: th.Tensor, weights: th.Tensor, bias: th.Tensor) -> th.Tensor:
-    """z̄ = W φ(z) + b, with ``bias`` (n_out,) or, memory included, (B, n_out)."""
-    return th.addmm(bias, activations, weights.t())

@@ -194,7 +194,6 @@ def test_circuits_without_hidden_layers_work():
         ({"hidden": (0,)}, "hidden"),
         ({"leak": -1.0}, "leak"),
         ({"synaptic_scaling": "l2"}, "l2"),
-        ({"settling": "scheduled", "feedback": "learned"}, "feedback='learned' conflicts"),
         ({"settling": "scheduled", "leak": 0.1}, "leak=0.1 conflicts"),
         ({"settling": "scheduled", "settling_rate": 0.5}, "settling_rate=0.5 conflicts"),
         ({"settling": "scheduled", "feedback_scale": 0.5}, "feedback_scale=0.5 conflicts"),

@@ -1,0 +1,57 @@
+"""The synapses of a circuit as plain tensors: what a layer predicts, and the way an error takes back."""
+
+from typing import NamedTuple
+
+import torch as th
+
+
+class Synapses(NamedTuple):
+    """
+    The parameters of a circuit as plain lists, in forward order (indexing a ``ParameterList`` costs more than a small product).
+
+    :param weights: W, each (n_out, n_in)
+    :param biases: b, each (n_out,)
+    :param memory: M, each (n_out, n_memory); empty without a working memory
+    :param feedback: E^T in the layout of W, so that ``errors @ E^T`` is one product without a transposition; empty where the
+        feedback is tied, and else without the input's (or with that of its last columns, where errors reach them)
+    """
+
+    weights: list[th.Tensor]
+    biases: list[th.Tensor]
+    memory: list[th.Tensor]
+    feedback: list[th.Tensor]
+
+    def layer_biases(self, memory: th.Tensor | None, memory_weight: float) -> list[th.Tensor]:
+        """
+        What every layer's prediction adds to W φ(z): b (n_out,), or with a memory b + α_m M m_t, (B, n_out).
+
+        :raises ValueError: when a memory is missing, not wanted or of the wrong size
+        """
+        n_memory = self.memory[0].shape[1] if self.memory else 0
+        if (memory is not None) != bool(n_memory) or (memory is not None and memory.shape[1] != n_memory):
+            found = "no memory" if memory is None else f"a memory of size {memory.shape[1]}"
+            raise ValueError(f"this circuit has n_memory={n_memory} but was given {found}")
+        if memory is None:
+            return self.biases
+        return [
+            th.addmm(bias, memory, weights.t(), alpha=memory_weight)
+            for bias, weights in zip(self.biases, self.memory, strict=True)
+        ]
+
+    def feedback_matrix(self, layer: int, scale: float = 1.0, tied: bool = False) -> th.Tensor:
+        """
+        What carries the error of the layer that ``weights[layer]`` predicts back to its source, in the layout of W.
+
+        :param layer: 1 for the first hidden layer; 0, the input, only where learned error synapses reach it
+        :param scale: λ_e of tied error synapses
+        :param tied: through the weights themselves, whatever the circuit uses
+        :return: E^T, or λ_e W, (n_out, n_in)
+        """
+        if self.feedback and not tied:
+            return self.feedback[layer - (len(self.weights) - len(self.feedback))]
+        return self.weights[layer] if tied or scale == 1.0 else scale * self.weights[layer]
+
+
+def predict(activations: th.Tensor, weights: th.Tensor, bias: th.Tensor) -> th.Tensor:
+    """z̄ = W φ(z) + b, with ``bias`` (n_out,) or, memory included, (B, n_out)."""
+    return th.addmm(bias, activations, weights.t())
