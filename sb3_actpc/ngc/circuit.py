@@ -10,12 +10,13 @@ from torch import nn
 
 from sb3_actpc.ngc.activations import ACTIVATIONS, get_activation
 from sb3_actpc.ngc.dynamics import DYNAMICS, ChainSettings, SettledState, SettlingChain
-from sb3_actpc.ngc.plasticity import SYNAPTIC_SCALINGS, HebbianChanges, bound_columns_, hebbian_changes, soft_bound_
+from sb3_actpc.ngc.plasticity import SYNAPTIC_SCALINGS, HebbianChanges, bound_columns_, hebbian_changes, mirrored, soft_bound_
 from sb3_actpc.ngc.stability import arrival_fractions, power_iteration_, settling_rates
 from sb3_actpc.ngc.synapses import Synapses, predict
 
 SETTLINGS = ("iterative", "scheduled")
 FEEDBACKS = ("learned", "tied")
+FEEDBACK_STARTS = ("independent", "mirrored")
 LARGEST_SIZE = 2**20  # of a layer, and of the number of steps
 
 
@@ -36,7 +37,7 @@ class NGCCircuit(nn.Module):
     :param settling: "iterative" (``n_settling_steps`` steps of eq. 1, then one change) or "scheduled" (each layer's change is
         taken when the error first reaches it, one ordered sweep; the zero-divergence schedule, Z-IL, of the predictive-coding
         literature; about K times cheaper). Scheduled with tied feedback is, numerically, the gradient of the output's loss;
-        with learned error synapses it is where the error neurons rest under an infinitesimal error, and uses no W^T
+        with learned error synapses it is where the error neurons rest under an infinitesimal error that is held (no W^T)
     :param n_settling_steps: K (paper: 10 to 25)
     :param dynamics: "error" (error neurons integrate, states follow their predictions) or "state" (eq. 1 to the letter);
         same fixed points, see :class:`~sb3_actpc.ngc.dynamics.SettlingChain`
@@ -45,10 +46,12 @@ class NGCCircuit(nn.Module):
         bring there (:func:`~sb3_actpc.ngc.stability.arrival_fractions`; 1 for large K). Without it the first layers' changes
         shrink by orders of magnitude as the rates follow the growing synapses, faster than an adaptive optimiser forgets
     :param leak: γ of eq. 1; 0 by default
-    :param feedback: "tied" (``feedback_scale`` W^T) or "learned" (own error synapses E, started independently of W: the
-        paper's; they take some thousand updates to align with W^T, and do so wholly only with a ``weight_decay``)
+    :param feedback: "tied" (``feedback_scale`` W^T) or "learned" (own error synapses E: the paper's)
     :param feedback_scale: λ_e of tied error synapses
-    :param feedback_rate: γ_e, learning rate of E over that of W (the paper: below 1)
+    :param feedback_start: how learned error synapses begin: "independent" of W (the paper; they take many thousand updates to
+        align with W^T, and do so wholly only with a ``weight_decay``) or "mirrored": see :meth:`mirror_feedback`
+    :param feedback_rate: γ_e, learning rate of E over that of W (the paper: below 1). At 1 both take the same steps, from any
+        optimiser that works element by element, so that the gap E - W^T never grows
     :param derivative_free: leave out φ' in the state update (appendix)
     :param synaptic_scaling: "none", "soft_bound" (no synapse passes ±``weight_bound``) or "column_norm" (no column of W or E
         has a norm above ``weight_bound``); acts on the step after the optimiser
@@ -81,7 +84,8 @@ class NGCCircuit(nn.Module):
         leak: float = 0.0,
         feedback: str = "tied",  # the paper's is "learned"; see above
         feedback_scale: float = 1.0,
-        feedback_rate: float = 0.9,
+        feedback_start: str = "independent",
+        feedback_rate: float = 1.0,  # the paper's is below 1
         derivative_free: bool = False,
         synaptic_scaling: str = "none",
         weight_bound: float = 1.0,
@@ -95,6 +99,7 @@ class NGCCircuit(nn.Module):
         _check_choice("dynamics", dynamics, DYNAMICS)
         _check_choice("synaptic_scaling", synaptic_scaling, SYNAPTIC_SCALINGS)
         _check_choice("feedback", feedback, FEEDBACKS)
+        _check_choice("feedback_start", feedback_start, FEEDBACK_STARTS)
         _check_choice("activation", activation, tuple(ACTIVATIONS))
         _check_choice("output_activation", output_activation, tuple(ACTIVATIONS))
         if not isinstance(hidden, Sequence) or isinstance(hidden, str):
@@ -132,6 +137,9 @@ class NGCCircuit(nn.Module):
         self.n_memory, self.memory_weight = n_memory, memory_weight
         self.n_feedback_inputs = n_feedback_inputs
         self._create_synapses()
+        if feedback_start == "mirrored":
+            self.mirror_feedback()
+        self._create_rates()
 
     # ------------------------------------------------------------------ synapses
 
@@ -153,6 +161,8 @@ class NGCCircuit(nn.Module):
             parameter.requires_grad_(False)
         # the same parameters as plain lists: indexing a ParameterList costs more than a small product
         self.synapses = Synapses(*map(list, (self.weights, self.biases, self.memory_weights, self.feedback_weights)))
+
+    def _create_rates(self) -> None:
         self.register_buffer("rates", th.zeros(max(1, self.n_hidden)))
         self._keep_rates = self.settling == "iterative" and self.settling_rate == "auto" and self.n_hidden > 0
         if self._keep_rates:
@@ -161,6 +171,17 @@ class NGCCircuit(nn.Module):
             self.update_settling_rates(n_iterations=30)
         elif self.settling_rate != "auto":
             self.rates.fill_(float(self.settling_rate))
+
+    def mirror_feedback(self) -> None:
+        """
+        Let learned error synapses copy the weights' action from noise: E = mean of ξ (W ξ)^T over Gaussian noise ξ.
+
+        Weight mirroring (Akrout et al., "Deep learning without weight transport", NeurIPS 2019): Hebbian, each synapse sees
+        the two neurons it joins and no weight is read across. Cosine with W^T: 0.995. Does nothing where feedback is tied.
+        """
+        above = self.synapses.weights[len(self.synapses.weights) - len(self.synapses.feedback) :]
+        for feedback, weights in zip(self.synapses.feedback, above, strict=True):
+            feedback.copy_(mirrored(weights[:, weights.shape[1] - feedback.shape[1] :]))
 
     @property
     def n_hidden(self) -> int:

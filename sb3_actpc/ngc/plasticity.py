@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import torch as th
 
+N_MIRRORED = 100  # noise vectors per source neuron; the cosine with W^T is (1 + 1 / N_MIRRORED)^-1/2
 SYNAPTIC_SCALINGS = ("none", "soft_bound", "column_norm")
 
 
@@ -60,6 +61,20 @@ def hebbian_changes(
         biases=[error.sum(0) for error in scaled],
         memory=[] if memory is None else [memory_weight * (error.t() @ memory) for error in scaled],
     )
+
+
+def mirrored(weights: th.Tensor) -> th.Tensor:
+    """
+    Error synapses from the answers of ``weights`` to noise: the mean of (W ξ) ξ^T, whose expectation is W.
+
+    :param weights: W, (n_out, n_in)
+    :return: E^T, (n_out, n_in)
+    """
+    feedback, n_sources = th.zeros_like(weights), weights.shape[1]
+    for _ in range(N_MIRRORED):
+        noise = th.randn(n_sources, n_sources, dtype=weights.dtype, device=weights.device)
+        feedback.addmm_((noise @ weights.t()).t(), noise, alpha=1.0 / (N_MIRRORED * n_sources))
+    return feedback
 
 
 def soft_bound_(new: th.Tensor, old: th.Tensor, bound: float) -> None:

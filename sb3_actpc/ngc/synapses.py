@@ -7,7 +7,7 @@ import torch as th
 
 class Synapses(NamedTuple):
     """
-    The parameters of a circuit as plain lists, in forward order (indexing a ``ParameterList`` costs more than a small product).
+    The parameters of a circuit as plain lists, in forward order: indexing a ``ParameterList`` is slow.
 
     :param weights: W, each (n_out, n_in)
     :param biases: b, each (n_out,)

@@ -1,9 +1,13 @@
-"""Scheduled settling is, numerically, the gradient of the output's loss; coupled, the deterministic policy gradient."""
+"""
+Scheduled settling with tied feedback is, numerically, the gradient of the output's loss; coupled, the deterministic policy
+gradient. With learned error synapses it is where the error neurons rest under an infinitesimal error.
+"""
 
 import pytest
 import torch as th
 
 from sb3_actpc.ngc import NGCCircuit, policy_gradient, settle_coupled
+from sb3_actpc.ngc.synapses import Synapses
 from tests.ngc import oracle
 
 
@@ -92,3 +96,65 @@ def test_the_coupled_pair_starts_along_the_policy_gradient_with_the_default_sett
     pairs = list(zip(changes.weights, exact.weights, strict=True))
     print("cosine", [oracle.cosine(c, g) for c, g in pairs], "ratio", [float(c.norm() / g.norm()) for c, g in pairs])
     assert min(oracle.cosine(c, g) for c, g in pairs) > 0.9
+
+
+LEARNED = {"settling": "scheduled", "feedback": "learned", "activation": "tanh"}
+
+
+@pytest.mark.parametrize("hidden", [(16,), (16, 12), (16, 12, 9)])
+def test_the_learned_sweep_is_where_error_neurons_rest_under_an_infinitesimal_error(hidden):
+    circuit = NGCCircuit(6, 3, hidden, output_activation="tanh", **LEARNED).double()
+    x, error = th.randn(32, 6, dtype=th.float64), 1e-8 * th.randn(32, 3, dtype=th.float64)
+    swept, settled = circuit.chain(x), circuit.chain(x)
+    swept.clamp_output_drive(error)
+    swept.sweep()
+    settled.clamp_output_drive(error)
+    settled.start_settling()
+    for _ in range(400):
+        settled.integrate([0.3] * len(hidden))
+        settled.predict(output=False)
+    for mine, rest in zip(swept.errors, settled.errors, strict=True):
+        assert mine.abs().max() > 1e-10 and th.allclose(mine, rest, rtol=1e-4, atol=1e-13)
+
+
+def test_the_coupled_learned_sweep_is_where_the_pair_rests_under_an_infinitesimal_error():
+    actor, critic, x = (m.double() for m in make_pair((16, 12), **LEARNED))
+    swept = settle_coupled(actor, critic, x).actor
+    for circuit in (actor, critic):
+        circuit.settling, circuit.n_settling_steps = "iterative", 400
+    settled = settle_coupled(actor, critic, x).actor
+    for mine, rest in zip(swept.postsynaptic, settled.postsynaptic, strict=True):
+        assert mine.abs().max() > 1e-5 and th.allclose(mine, rest, rtol=1e-6, atol=1e-12)
+
+
+def test_the_learned_sweep_is_its_equation_with_the_error_synapses():
+    """e_l = φ'(z_l) ⊙ (E_l e_{l+1}), written out."""
+    circuit = NGCCircuit(6, 3, (16, 12), **LEARNED)
+    x, target = th.randn(32, 6), th.randn(32, 3)
+    state = circuit.settle(x, target)
+    error = target - circuit.project(x)
+    for layer in (2, 1):
+        error = (1.0 - state.activations[layer].square()) * (error @ circuit.feedback_weights[layer - 1])
+        assert th.allclose(state.errors[layer - 1], error, atol=1e-6)
+
+
+@pytest.mark.parametrize("feedback", ["learned", "tied"])
+def test_no_transposed_weight_carries_an_error_of_the_learned_sweep(feedback, monkeypatch):
+    """With noise in the place of the weights on every way back, learned sweeps stay bit for bit the same; tied ones do not."""
+    keywords = {**LEARNED, "feedback": feedback}
+    circuit = NGCCircuit(6, 3, (16, 12), **keywords)
+    x, target = th.randn(32, 6), th.randn(32, 3)
+    actor, critic, observations = make_pair((16, 12), **keywords)
+
+    def changes():
+        alone = circuit.hebbian_update(circuit.settle(x, target)).tensors()
+        return [*alone, *actor.hebbian_update(settle_coupled(actor, critic, observations).actor).tensors()]
+
+    honest, asked = changes(), Synapses.feedback_matrix
+
+    def from_noise(synapses, *args, **kwargs):
+        return asked(synapses._replace(weights=[th.randn_like(w) for w in synapses.weights]), *args, **kwargs)
+
+    monkeypatch.setattr(Synapses, "feedback_matrix", from_noise)
+    same = [th.equal(a, b) for a, b in zip(honest, changes(), strict=True)]
+    assert all(same) if feedback == "learned" else not all(same)
