@@ -340,7 +340,8 @@ class NGCCircuit(nn.Module):
         named = [(f"singular_vector_{layer}", self.synapses.weights[layer]) for layer in range(1, self.n_hidden + 1)]
         if self.feedback == "learned":
             named += [
-                (f"feedback_singular_vector_{layer}", self.synapses.feedback_matrix(layer, self.feedback_scale)) for layer in range(1, self.n_hidden + 1)
+                (f"feedback_singular_vector_{layer}", self.synapses.feedback_matrix(layer, self.feedback_scale))
+                for layer in range(1, self.n_hidden + 1)
             ]
         return named
 

@@ -93,9 +93,7 @@ def _sweep_both(motor: SettlingChain, value: SettlingChain, to_action: th.Tensor
     motor.sweep(exact)
 
 
-def _settle_both(
-    actor: NGCCircuit, critic: NGCCircuit, motor: SettlingChain, value: SettlingChain, states_move: bool
-) -> None:
+def _settle_both(actor: NGCCircuit, critic: NGCCircuit, motor: SettlingChain, value: SettlingChain, states_move: bool) -> None:
     value.start_settling()
     motor.start_settling()
     value_rates, motor_rates = _coupled_rates(critic), _coupled_rates(actor)
