@@ -129,10 +129,10 @@ def _collect(args: argparse.Namespace) -> int:
 
 
 def _collect_scripted(args: argparse.Namespace) -> "Demonstrations":
-    from sb3_actpc.demonstrations import MIXED_OPERATORS, collect_scripted
+    from sb3_actpc.demonstrations import MIXED_DEMONSTRATORS, collect_scripted
 
     proficiency = _proficiency(args.proficiency)
-    n_episodes = args.episodes or (50 * len(MIXED_OPERATORS) if proficiency == MIXED else 50)
+    n_episodes = args.episodes or (50 * len(MIXED_DEMONSTRATORS) if proficiency == MIXED else 50)
     words = {"env": args.env, "expert": "scripted", "proficiency": proficiency, "obs": args.obs, "episodes": n_episodes}
     metadata = {"command": _command({**words, "max_tries": args.max_tries, "seed": args.seed})}
     _report(f"scripted operators of proficiency {proficiency} in {args.env}")

@@ -5,14 +5,14 @@ All of it ends in the one form of :class:`Demonstrations`.
 
 from sb3_actpc.demonstrations.dataset import Demonstrations, shipped_demonstrations
 from sb3_actpc.demonstrations.fitting import fit_demonstrations, resolve, scaled_actions
-from sb3_actpc.demonstrations.operators import MIXED_OPERATORS, ScriptedOperator, collect_scripted
 from sb3_actpc.demonstrations.robomimic import read_robomimic, write_robomimic
 from sb3_actpc.demonstrations.robosuite_states import read_robosuite
+from sb3_actpc.demonstrations.scripted import MIXED_DEMONSTRATORS, ScriptedDemonstrator, collect_scripted
 
 __all__ = [
-    "MIXED_OPERATORS",
+    "MIXED_DEMONSTRATORS",
     "Demonstrations",
-    "ScriptedOperator",
+    "ScriptedDemonstrator",
     "collect_scripted",
     "fit_demonstrations",
     "read_robomimic",

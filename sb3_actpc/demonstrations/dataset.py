@@ -17,6 +17,7 @@ from gymnasium import spaces
 
 from sb3_actpc.demonstrations.minari import read_minari, write_minari
 from sb3_actpc.demonstrations.npz import read_npz, write_npz
+from sb3_actpc.demonstrations.recording import Report, env_name, record_episodes, silent, trajectory_columns
 from sb3_actpc.demonstrations.rows import field_error, flat_size, unchained_indices
 
 if TYPE_CHECKING:
@@ -147,6 +148,90 @@ class Demonstrations:
                 raise field_error(source, name, "rows of one size in every episode", str(error)) from None
         starts = np.cumsum([0, *(len(episode["rewards"]) for episode in episodes[:-1])])
         return cls(**columns, episode_starts=starts, env_id=env_id, metadata=dict(metadata or {}), source=source)
+
+    @classmethod
+    def record(
+        cls,
+        demonstrator: Any,
+        env: gym.Env[Any, Any] | str,
+        n_episodes: int = 20,
+        only_successes: bool | None = None,
+        deterministic: bool = True,
+        seed: int = 0,
+        max_tries: int | None = None,
+        metadata: Mapping[str, Any] | None = None,
+        report: Report = silent,
+    ) -> Demonstrations:
+        """Let someone who can do a task show it.
+
+        :param demonstrator: an object with SB3's ``predict`` (its ``VecNormalize`` is heeded), a function from an observation
+            to an action in the environment's units, or a list of such, who take turns
+        :param env: any Gymnasium environment with Box actions and Box observations, or a Dict of such; or its id
+        :param n_episodes: episodes wanted
+        :param only_successes: keep only episodes that end with a true ``info["is_success"]``; None: all but those that end
+            with a false one
+        :param deterministic: of ``predict``; False samples the actions of a stochastic policy (from SB3's generators)
+        :param seed: try number i is reset with the seed ``seed + i``
+        :param max_tries: episodes played at most, None for ``10 * n_episodes``
+        :param metadata: JSON values to keep with the demonstrations
+        :param report: takes one line of progress per kept episode
+        :return: the episodes. ``dense_rewards`` are ``info["dense_reward"]``, or the rewards where there is none
+        :raises ValueError: when too few of the tries succeed, or an argument is not allowed
+        """
+        if isinstance(env, str):
+            with gym.make(env) as made:
+                return cls.record(
+                    demonstrator, made, n_episodes, only_successes, deterministic, seed, max_tries, metadata, report
+                )
+        if not isinstance(env, gym.Env):
+            raise ValueError(f"env must be a Gymnasium environment or the id of one, found {env!r}")
+        demonstrators = demonstrator if isinstance(demonstrator, list | tuple) else [demonstrator]
+        episodes, made_by = record_episodes(
+            demonstrators, env, n_episodes, only_successes, deterministic, seed, max_tries, report
+        )
+        recorded = cls.from_episodes(episodes, env_name(env), {**made_by, **(metadata or {})})
+        recorded.check(env.observation_space, env.action_space)
+        return recorded
+
+    @classmethod
+    def from_trajectories(
+        cls,
+        trajectories: Sequence[Any],
+        env_id: str,
+        observation_space: spaces.Space[Any] | None = None,
+        final_reward: float | None = None,
+    ) -> Demonstrations:
+        """Take over trajectories of the ``imitation`` library, or objects like them.
+
+        :param trajectories: each with ``obs`` (n + 1 rows), ``acts`` (n rows), ``infos`` (or None), ``terminal``, and perhaps
+            ``rews``. A last info with ``TimeLimit.truncated`` is no termination; ``dense_reward`` in every info is kept
+        :param env_id: Gymnasium id of their environment
+        :param observation_space: the environment's, needed for dict observations
+        :param final_reward: what the last step of each is paid, and all others 0, where they have no ``rews``
+        :return: the demonstrations
+        :raises ValueError: when something needed is missing, or does not fit together
+        """
+        columns = [trajectory_columns(trajectory, observation_space, final_reward) for trajectory in trajectories]
+        return cls.from_episodes(columns, env_id, source="trajectories")
+
+    @classmethod
+    def concatenate(cls, parts: Sequence[Demonstrations]) -> Demonstrations:
+        """One after the other.
+
+        :param parts: of the same task; dense rewards stay where all have them
+        :return: all their episodes, with the metadata on which all agree
+        :raises ValueError: when there are none, or they are of several tasks or sizes
+        """
+        names = sorted({base_name(part.env_id) for part in parts})
+        if len(names) > 1:
+            raise ValueError(f"demonstrations of several tasks cannot be concatenated, found {', '.join(names)}")
+        episodes = [episode for part in parts for episode in part.episodes]
+        metadata = dict(parts[0].metadata) if parts else {}
+        agreed = {key: value for key, value in metadata.items() if all(part.metadata.get(key) == value for part in parts)}
+        agreed.pop("filter_keys", None)  # of single episodes
+        return cls.from_episodes(
+            episodes, parts[0].env_id if parts else "", agreed, " + ".join(part.source for part in parts if part.source)
+        )
 
     @property
     def episodes(self) -> Iterator[dict[str, np.ndarray]]:

@@ -27,7 +27,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from torch import nn
 
 from sb3_actpc.demonstrations.dataset import Demonstrations
-from sb3_actpc.demonstrations.recording import Report, join_episodes, record_successes, silent
+from sb3_actpc.demonstrations.recording import Report, silent
 from sb3_actpc.envs import dense_env_id
 
 EXPERT_ALGORITHMS: dict[str, type[BaseAlgorithm]] = {"ppo": PPO, "td3": TD3, "sac": SAC}
@@ -374,16 +374,5 @@ def collect_demonstrations(
         dense rewards (N,), all float32
     :raises ValueError: if fewer than ``n_episodes`` of ``max_tries`` episodes succeed, or ``n_episodes`` is below 1
     """
-    env = gym.make(env_id)
-    try:
-        episodes, n_tries = record_successes([expert], env, n_episodes, seed, max_tries, report)
-    finally:
-        env.close()
-    kept = {
-        "seed": seed,
-        "n_tries": n_tries,
-        "expert_steps": expert.n_steps,
-        "expert_mean_dense_return": expert.mean_return,
-        **(metadata or {}),
-    }
-    return join_episodes(episodes, env_id, kept, packages=("gymnasium", "mujoco"))
+    kept = {"expert_steps": expert.n_steps, "expert_mean_dense_return": expert.mean_return, **(metadata or {})}
+    return Demonstrations.record(expert.predict, env_id, n_episodes, True, True, seed, max_tries, kept, report)

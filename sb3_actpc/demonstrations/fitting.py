@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import re
 from typing import TYPE_CHECKING, Any
@@ -9,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from gymnasium import spaces
 
-from sb3_actpc.demonstrations.dataset import Demonstrations
+from sb3_actpc.demonstrations.dataset import Demonstrations, base_name
+from sb3_actpc.envs import SPARSE_MUJOCO_IDS, dense_env_id
 
 if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecEnv
@@ -49,6 +51,8 @@ def fit_demonstrations(
     """
     The demonstrations as an environment would have shown them: of its task, in its spaces, paid as it pays.
 
+    Those of the dense base task of a sparse one (such as Minari's ``mujoco/hopper/expert-v0``) fit too.
+
     :param source: a file, a Minari id, or the demonstrations
     :param env: the environment, whose goal version and rewards count; None where there is none yet
     :param observation_space: the environment's
@@ -66,8 +70,17 @@ def fit_demonstrations(
             demonstrations = env.env_method("goal_demonstrations", demonstrations, indices=[0])[0]
         spec = env.get_attr("spec", indices=0)[0] if env.has_attr("spec") else None
         env_id = None if spec is None else spec.id
+        demonstrations = _with_dense_rewards(demonstrations, env_id)
     demonstrations.check(observation_space, action_space, env_id)
     return demonstrations if env is None else demonstrations.rewarded_by(env)
+
+
+def _with_dense_rewards(demonstrations: Demonstrations, env_id: str | None) -> Demonstrations:
+    """Demonstrations of a sparse task's dense base as those of the sparse task, which then pays them anew."""
+    if env_id not in SPARSE_MUJOCO_IDS or base_name(dense_env_id(env_id)) != base_name(demonstrations.env_id):
+        return demonstrations
+    recorded_id = f"Sparse{demonstrations.env_id.rpartition(':')[2]}"
+    return dataclasses.replace(demonstrations, env_id=recorded_id, dense_rewards=demonstrations.rewards)
 
 
 def scaled_actions(demonstrations: Demonstrations, action_space: spaces.Box) -> np.ndarray:

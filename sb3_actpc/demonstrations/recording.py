@@ -1,124 +1,175 @@
-"""Playing a task with someone who can do it, and keeping the episodes that succeed."""
+"""Playing a task with whoever can do it: trained agents, scripted demonstrators, plain functions."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import sys
+from collections.abc import Callable, Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
-from typing import Any, Protocol
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from gymnasium import spaces
 
-from sb3_actpc.demonstrations.dataset import Demonstrations
+from sb3_actpc.demonstrations.rows import box_paths, join_observations
 
 Columns = dict[str, np.ndarray]
 Report = Callable[[str], None]
-
-COLUMNS = ("observations", "actions", "next_observations", "rewards", "terminations", "dense_rewards")
 
 
 def silent(_: str) -> None:
     """Drop a progress line."""
 
 
-class Demonstrator(Protocol):
-    """Whoever shows how a task is done."""
-
-    def start(self, seed: int) -> None:
-        """A new episode begins; the same seed gives the same episode."""
-
-    def predict(self, observation: np.ndarray) -> np.ndarray:
-        """Action (action_dim,) in the environment's units for an observation (obs_dim,)."""
-
-
-def record_successes(
-    demonstrators: Sequence[Demonstrator],
+def record_episodes(
+    demonstrators: Sequence[Any],
     env: gym.Env[Any, Any],
     n_episodes: int,
-    seed: int,
+    only_successes: bool | None = None,
+    deterministic: bool = True,
+    seed: int = 0,
     max_tries: int | None = None,
     report: Report = silent,
-) -> tuple[list[Columns], int]:
-    """Play until enough episodes have succeeded. The demonstrators take turns; one who fails tries again.
+) -> tuple[list[Columns], dict[str, Any]]:
+    """Play until enough episodes are kept. The demonstrators take turns; one who fails tries again.
 
-    :param demonstrators: episode i is by number ``i % len(demonstrators)``
-    :param env: environment whose ``info`` has ``is_success`` and ``dense_reward``
-    :param n_episodes: successful episodes wanted
+    :param demonstrators: episode i is by number ``i % len(demonstrators)``; each an object with SB3's ``predict`` (a model's
+        ``VecNormalize`` is heeded) or a function from an observation to an action. One with a method ``start(seed)`` is told
+        of every new episode
+    :param env: environment with Box actions and Box observations, or a Dict of such
+    :param n_episodes: episodes wanted
+    :param only_successes: keep only episodes whose last ``info`` has a true ``is_success`` (or ``success``); None: those that
+        do not say otherwise
+    :param deterministic: of ``predict``; False samples the actions of a stochastic policy
     :param seed: try number i is reset with the seed ``seed + i``
     :param max_tries: episodes played at most, None for ``10 * n_episodes``
     :param report: takes one line of progress per kept episode
-    :return: the columns of each successful episode (floats float32), and the number of tries
-    :raises ValueError: if too few of the tries succeed, or ``n_episodes`` is below 1
+    :return: the columns of each episode (floats float32; ``dense_rewards`` is ``info["dense_reward"]`` or the reward), and
+        how they were made
+    :raises ValueError: if too few of the tries succeed, or an argument is not allowed
     """
     if n_episodes < 1:
         raise ValueError(f"n_episodes={n_episodes} must be at least 1: give the number of demonstrated episodes")
+    if not isinstance(env.action_space, spaces.Box):
+        raise ValueError(f"demonstrations need a Box action space, found {env.action_space}")
     max_tries = 10 * n_episodes if max_tries is None else max_tries
+    actors = [_actor(demonstrator, deterministic) for demonstrator in demonstrators]
     episodes: list[Columns] = []
     n_tries = 0
     while len(episodes) < n_episodes and n_tries < max_tries:
-        demonstrator = demonstrators[len(episodes) % len(demonstrators)]
-        episode, success = play_episode(demonstrator, env, seed + n_tries)
+        turn = len(episodes) % len(actors)
+        start = getattr(demonstrators[turn], "start", None)
+        if start is not None:
+            start(seed + n_tries)
+        episode, info = _play(actors[turn], env, seed + n_tries)
         n_tries += 1
-        if success:
+        if _is_kept(info, only_successes):
             episodes.append(episode)
-            sparse, dense = episode["rewards"].sum(), episode["dense_rewards"].sum()
-            report(f"episode {len(episodes)}/{n_episodes} (try {n_tries}): sparse return {sparse:.1f}, dense {dense:.1f}")
+            returns = f"return {episode['rewards'].sum():.1f}, dense {episode['dense_rewards'].sum():.1f}"
+            report(f"episode {len(episodes)}/{n_episodes} (try {n_tries}): {returns}")
     if len(episodes) < n_episodes:
-        task = env.spec.id if env.spec is not None else type(env.unwrapped).__name__
         raise ValueError(
-            f"only {len(episodes)} of {n_tries} episodes succeeded in {task}, {n_episodes} are needed: train the expert "
-            "longer (--steps), raise --max-tries, or ask for fewer episodes (--episodes)"
+            f"only {len(episodes)} of {n_tries} episodes succeeded in {env_name(env)}, {n_episodes} are needed: take a better "
+            "demonstrator (train it longer: --steps), allow more tries (--max-tries), or ask for fewer episodes (--episodes)"
         )
-    return episodes, n_tries
+    return episodes, {"seed": seed, "n_tries": n_tries, "deterministic": deterministic, **_versions()}
 
 
-def play_episode(demonstrator: Demonstrator, env: gym.Env[Any, Any], seed: int) -> tuple[Columns, bool]:
+def env_name(env: gym.Env[Any, Any]) -> str:
+    """An environment's Gymnasium id, or the name of its class where it has none."""
+    return env.spec.id if env.spec is not None else type(env.unwrapped).__name__
+
+
+def trajectory_columns(
+    trajectory: Any, observation_space: spaces.Space[Any] | None = None, final_reward: float | None = None
+) -> Columns:
     """
-    :param demonstrator: acts
-    :param env: as in :func:`record_successes`
-    :param seed: of the reset and of the demonstrator
-    :return: one episode as columns, and whether it ended in success
+    :param trajectory: an object with ``obs`` (n + 1 rows), ``acts`` (n rows), ``terminal``, and perhaps ``infos`` and
+        ``rews``, as the ``imitation`` library's are
+    :param observation_space: needed for dict observations
+    :param final_reward: what its last step is paid, and all others 0, where it has no ``rews``
+    :return: its columns
+    :raises ValueError: when something needed is missing
     """
-    rows: dict[str, list[Any]] = {key: [] for key in COLUMNS}
+    observations = trajectory.obs.unwrap() if hasattr(trajectory.obs, "unwrap") else trajectory.obs
+    if isinstance(observations, Mapping) and observation_space is None:
+        raise ValueError("trajectories with dict observations need observation_space: give the environment's")
+    rows = join_observations(observations, [[]] if observation_space is None else box_paths(observation_space))
+    n_steps = len(trajectory.acts)
+    if len(rows) != n_steps + 1:
+        raise ValueError(f"a trajectory of {n_steps} actions must have {n_steps + 1} observations, found {len(rows)}")
+    infos = [info or {} for info in trajectory.infos] if trajectory.infos is not None else [{}] * n_steps
+    rewards = getattr(trajectory, "rews", None)
+    if rewards is None:
+        if final_reward is None:
+            raise ValueError("trajectories without rews need final_reward, the reward of each one's last step (1.0, say)")
+        rewards = np.append(np.zeros(n_steps - 1), final_reward)
+    columns = {
+        "observations": rows[:-1],
+        "actions": np.asarray(trajectory.acts).reshape(n_steps, -1),
+        "next_observations": rows[1:],
+        "rewards": np.asarray(rewards),
+        "terminations": np.zeros(n_steps, dtype=bool),
+    }
+    columns["terminations"][-1] = trajectory.terminal and not infos[-1].get("TimeLimit.truncated", False)
+    if all("dense_reward" in info for info in infos):
+        columns["dense_rewards"] = np.array([info["dense_reward"] for info in infos])
+    return columns
+
+
+def _actor(demonstrator: Any, deterministic: bool) -> Callable[[Any, bool], np.ndarray]:
+    """A function of the observation, and of whether an episode begins, to the action."""
+    predict = getattr(demonstrator, "predict", None)
+    if predict is None:
+        if not callable(demonstrator):
+            raise ValueError(f"{demonstrator!r} must have SB3's predict, or be a function from an observation to an action")
+        return lambda observation, is_start: demonstrator(observation)
+    normalization = getattr(demonstrator, "get_vec_normalize_env", lambda: None)()
+    state = None
+
+    def act(observation: Any, is_start: bool) -> np.ndarray:
+        nonlocal state
+        if normalization is not None:
+            observation = normalization.normalize_obs(observation)
+        state = None if is_start else state
+        action, state = predict(observation, state=state, episode_start=np.array([is_start]), deterministic=deterministic)
+        return action
+
+    return act
+
+
+def _play(act: Callable[[Any, bool], np.ndarray], env: gym.Env[Any, Any], seed: int) -> tuple[Columns, dict[str, Any]]:
+    """One episode as columns, and its last info."""
+    rows: list[tuple[Any, ...]] = []
     observation, info = env.reset(seed=seed)
-    demonstrator.start(seed)
     done = False
     while not done:
-        action = demonstrator.predict(observation)
+        action = act(observation, not rows)
         next_observation, reward, terminated, truncated, info = env.step(action)
-        values = (observation, action, next_observation, reward, terminated, info["dense_reward"])
-        for column, value in zip(rows.values(), values, strict=True):
-            column.append(value)
+        flat = (spaces.utils.flatten(env.observation_space, value) for value in (observation, next_observation))
+        rows.append((*flat, np.ravel(action), reward, terminated, info.get("dense_reward", reward)))
         observation, done = next_observation, terminated or truncated
-    columns = {key: np.asarray(column, dtype=np.float32) for key, column in rows.items()}
-    columns["terminations"] = np.asarray(rows["terminations"], dtype=bool)
-    return columns, bool(info["is_success"])
+    names = ("observations", "next_observations", "actions", "rewards", "terminations", "dense_rewards")
+    columns = {name: np.asarray(values, dtype=np.float32) for name, values in zip(names, zip(*rows, strict=True), strict=True)}
+    return {**columns, "terminations": columns["terminations"].astype(bool)}, info
 
 
-def join_episodes(
-    episodes: Sequence[Columns], env_id: str, metadata: dict[str, Any], source: str = "", packages: Sequence[str] = ()
-) -> Demonstrations:
-    """
-    :param episodes: columns of each episode, by the names of the fields of ``Demonstrations``
-    :param env_id: Gymnasium id
-    :param metadata: JSON values
-    :param source: file they come from, for error messages
-    :param packages: distributions whose versions go into the metadata
-    :return: the episodes end to end
-    """
-    lengths = [len(episode["rewards"]) for episode in episodes]
-    versions = {name: _version(name) for name in packages}
-    return Demonstrations(
-        **{key: np.concatenate([episode[key] for episode in episodes]) for key in episodes[0]},
-        episode_starts=np.cumsum([0, *lengths[:-1]]).astype(np.int64),
-        env_id=env_id,
-        metadata={**versions, **metadata},
-        source=source,
-    )
+def _is_kept(info: Mapping[str, Any], only_successes: bool | None) -> bool:
+    success = info.get("is_success", info.get("success"))
+    if success is None and only_successes:
+        raise ValueError(
+            "only_successes=True needs an environment whose info has is_success: give False to keep every episode"
+        )
+    return only_successes is False or success is None or bool(success)
 
 
-def _version(name: str) -> str:
-    try:
-        return version(name)
-    except PackageNotFoundError:
-        return "unknown"
+def _versions() -> dict[str, str]:
+    """Of the simulators in use."""
+    versions = {}
+    for name in ("gymnasium", "mujoco", "robosuite"):
+        if name in sys.modules:
+            try:
+                versions[name] = version(name)
+            except PackageNotFoundError:
+                versions[name] = "unknown"
+    return versions

@@ -23,7 +23,7 @@ from sb3_actpc.demonstrations.hdf5 import (
     read_array,
     read_json_attribute,
 )
-from sb3_actpc.demonstrations.recording import Columns, join_episodes
+from sb3_actpc.demonstrations.recording import Columns
 from sb3_actpc.envs.robosuite_layouts import ACTION_DIM, OBSERVATIONS, PROPRIOCEPTION, RobosuiteTask, robosuite_task
 from sb3_actpc.utils.files import atomic_write
 
@@ -59,13 +59,10 @@ def read_robomimic(
         check_recorded_task({**(arguments.get("env_kwargs") or {}), "env_name": arguments.get("env_name")}, task.name, source)
         names = demo_names(data) if filter_key is None else _filtered(data, filter_key, source)
         episodes = [_read_episode(data[name], task, obs, f"{source}: {name}") for name in names]
-    dense = [("dense_rewards" in episode) for episode in episodes]
-    if not all(dense):
-        episodes = [{key: value for key, value in episode.items() if key != "dense_rewards"} for episode in episodes]
     metadata = {"source": "robomimic", "env_version": str(arguments.get("env_version", "unknown")), "demos": names}
     if filter_key is not None:
         metadata["filter_key"] = filter_key
-    return join_episodes(episodes, env_id, metadata, source)
+    return Demonstrations.from_episodes(episodes, env_id, metadata, source)
 
 
 def write_robomimic(demonstrations: Demonstrations, path: str | os.PathLike[str]) -> None:

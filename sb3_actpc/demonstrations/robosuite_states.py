@@ -10,7 +10,7 @@ import numpy as np
 
 from sb3_actpc.demonstrations.dataset import Demonstrations
 from sb3_actpc.demonstrations.hdf5 import check_recorded_task, demo_names, open_hdf5, read_array, read_json_attribute
-from sb3_actpc.demonstrations.recording import Columns, join_episodes
+from sb3_actpc.demonstrations.recording import Columns
 from sb3_actpc.envs.robosuite_layouts import ACTION_DIM, RobosuiteTask, robosuite_task
 
 
@@ -42,7 +42,7 @@ def read_robosuite(path: str | os.PathLike[str], env_id: str, obs: str = "paper"
             env.close()
         version = str(data.attrs.get("repository_version", "unknown"))
     metadata = {"source": "robosuite", "repository_version": version, "demos": names}
-    return join_episodes(episodes, env_id, metadata, source)
+    return Demonstrations.from_episodes(episodes, env_id, metadata, source)
 
 
 def _replay(group: Any, env: Any, task: RobosuiteTask, obs: str, source: str) -> Columns:

@@ -17,7 +17,7 @@ from stable_baselines3.common.env_checker import check_env as sb3_check_env
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
-from sb3_actpc.demonstrations import ScriptedOperator
+from sb3_actpc.demonstrations import ScriptedDemonstrator
 from sb3_actpc.envs import ROBOSUITE_IDS
 from sb3_actpc.envs.robosuite_layouts import ROBOSUITE_TASKS, robosuite_task
 
@@ -198,12 +198,12 @@ def test_a_can_in_its_quarter_of_the_right_bin_ends_the_episode_with_reward_1(en
 
 @pytest.mark.parametrize("env_id", ROBOSUITE_IDS)
 def test_a_sure_operator_passes_every_stage_in_order(env_id: str, envs: dict[str, Any]) -> None:
-    env, operator = envs[env_id], ScriptedOperator(env_id)
+    env, operator = envs[env_id], ScriptedDemonstrator(env_id)
     operator.start(seed=0)
     observation, info = env.reset(seed=0)
     passed, terminated = [info["stage"]], False
     while not terminated:
-        observation, _, terminated, truncated, info = env.step(operator.predict(observation))
+        observation, _, terminated, truncated, info = env.step(operator(observation))
         assert not truncated
         if info["stage"] != passed[-1]:
             passed.append(info["stage"])

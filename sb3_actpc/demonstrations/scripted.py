@@ -1,7 +1,7 @@
-"""Scripted operators of the robosuite tasks: closed-loop demonstrators that see what the agent sees, and nothing else.
+"""Scripted demonstrators of the robosuite tasks: closed loops that see what the agent sees, and nothing else.
 
 ``proficiency`` sets how well one works, so that sets like robomimic's multi-human ones (Mandlekar et al., arXiv 2108.03298:
-six operators, two worse, two okay and two better, 50 demonstrations each) can be made.
+six people, two worse, two okay and two better, 50 demonstrations each) can be made.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import gymnasium as gym
 import numpy as np
 
 from sb3_actpc.demonstrations.dataset import Demonstrations
-from sb3_actpc.demonstrations.recording import Report, join_episodes, record_successes, silent
+from sb3_actpc.demonstrations.recording import Report, silent
 from sb3_actpc.envs.robosuite_layouts import (
     ACTION_DIM,
     CAN_BIN_HIGH,
@@ -37,7 +37,7 @@ CONJUGATE = np.array([-1.0, -1.0, -1.0, 1.0])
 CARRYING_HEIGHT = 1.05
 CAN_STANDING_HEIGHT = 0.86
 
-MIXED_OPERATORS: tuple[tuple[str, float], ...] = (
+MIXED_DEMONSTRATORS: tuple[tuple[str, float], ...] = (
     ("worse", 0.1),
     ("worse", 0.25),
     ("okay", 0.45),
@@ -45,12 +45,12 @@ MIXED_OPERATORS: tuple[tuple[str, float], ...] = (
     ("better", 0.85),
     ("better", 1.0),
 )
-"""Level and proficiency of each operator of a mixed set."""
+"""Level and proficiency of each demonstrator of a mixed set."""
 
 
 @dataclass(frozen=True)
 class View:
-    """What an operator reads from an observation: metres, radians, quaternions (x, y, z, w).
+    """What a demonstrator reads from an observation: metres, radians, quaternions (x, y, z, w).
 
     :param eef_position: (3,) of the gripper
     :param eef_quat: (4,)
@@ -73,7 +73,7 @@ class View:
 
 @dataclass(frozen=True)
 class Skill:
-    """How well an operator works, from its proficiency p in [0, 1].
+    """How well a demonstrator works, from its proficiency p in [0, 1].
 
     :param speed: largest translation action
     :param tremor: standard deviation of the correlated noise on the actions
@@ -109,13 +109,13 @@ class Skill:
         )
 
 
-class ScriptedOperator:
+class ScriptedDemonstrator:
     """Reaches over the object, descends, grasps, lifts, and for the can carries and lets go; starts anew when it has lost it.
 
     :param env_id: ``SparseLift-v0`` or ``SparsePickPlaceCan-v0``
     :param obs: the environment's ``obs``, ``"paper"`` or ``"robomimic"``
     :param proficiency: 1 is quick and sure, 0 slow, trembling, pausing, roundabout and apt to miss
-    :param seed: seed of the operator's habits and, with the episode's, of its noise
+    :param seed: seed of the demonstrator's habits and, with the episode's, of its noise
     :raises ValueError: when an argument is not allowed
     """
 
@@ -152,7 +152,7 @@ class ScriptedOperator:
         self._yaw: float | None = None
         self._enter("reach")
 
-    def predict(self, observation: np.ndarray) -> np.ndarray:
+    def __call__(self, observation: np.ndarray) -> np.ndarray:
         """
         :param observation: (obs_dim,)
         :return: action (7,) float32, in [-1, 1]
@@ -301,11 +301,11 @@ def collect_scripted(
     report: Report = silent,
     obs: str = "paper",
 ) -> Demonstrations:
-    """Record successful episodes of scripted operators.
+    """Record successful episodes of scripted demonstrators.
 
     :param env_id: ``SparseLift-v0`` or ``SparsePickPlaceCan-v0``
-    :param proficiency: in [0, 1], or ``"mixed"`` for the six of ``MIXED_OPERATORS``, who take turns
-    :param n_episodes: successful episodes wanted; for ``"mixed"`` a multiple of 6
+    :param proficiency: in [0, 1], or ``"mixed"`` for the six of ``MIXED_DEMONSTRATORS``, who take turns
+    :param n_episodes: successful episodes wanted
     :param seed: try number i is reset with the seed ``seed + i``
     :param max_tries: episodes played at most, None for ``10 * n_episodes``
     :param metadata: JSON values to keep with the demonstrations
@@ -316,32 +316,20 @@ def collect_scripted(
     :raises ValueError: when an argument is not allowed, or too few episodes succeed
     :raises ImportError: when robosuite is not installed
     """
-    operators, keys = _operators(env_id, proficiency, n_episodes, seed, obs)
-    env = gym.make(env_id, obs=obs)
-    try:
-        episodes, n_tries = record_successes(operators, env, n_episodes, seed, max_tries, report)
-    finally:
-        env.close()
-    kept: dict[str, Any] = {"expert": "scripted", "proficiency": proficiency, "seed": seed, "n_tries": n_tries}
-    if keys:
+    kept: dict[str, Any] = {"demonstrator": "scripted", "proficiency": proficiency}
+    if proficiency == "mixed":
+        demonstrators = [
+            ScriptedDemonstrator(env_id, obs, value, 100 * seed + i) for i, (_, value) in enumerate(MIXED_DEMONSTRATORS)
+        ]
+        levels = [level for level, _ in MIXED_DEMONSTRATORS]
+        keys = [[level, f"{level}_operator_{levels[: i + 1].count(level)}"] for i, level in enumerate(levels)]
         kept["filter_keys"] = [keys[i % len(keys)] for i in range(n_episodes)]
-    return join_episodes(episodes, env_id, {**kept, **(metadata or {})}, packages=("robosuite", "mujoco"))
-
-
-def _operators(
-    env_id: str, proficiency: float | str, n_episodes: int, seed: int, obs: str
-) -> tuple[list[ScriptedOperator], list[list[str]]]:
-    """The operators and, of a mixed set, the filter keys of each."""
-    if proficiency != "mixed":
-        return [ScriptedOperator(env_id, obs, proficiency, seed)], []  # type: ignore[arg-type]
-    if n_episodes % len(MIXED_OPERATORS):
-        raise ValueError(
-            f"n_episodes={n_episodes} of a mixed set must be a multiple of its {len(MIXED_OPERATORS)} operators: "
-            f"ask for {-(-n_episodes // len(MIXED_OPERATORS)) * len(MIXED_OPERATORS)}"
+    else:
+        demonstrators = [ScriptedDemonstrator(env_id, obs, proficiency, seed)]  # type: ignore[arg-type]
+    with gym.make(env_id, obs=obs) as env:
+        return Demonstrations.record(
+            demonstrators, env, n_episodes, True, True, seed, max_tries, {**kept, **(metadata or {})}, report
         )
-    levels = [level for level, _ in MIXED_OPERATORS]
-    operators = [ScriptedOperator(env_id, obs, value, 100 * seed + i) for i, (_, value) in enumerate(MIXED_OPERATORS)]
-    return operators, [[level, f"{level}_operator_{levels[: i + 1].count(level)}"] for i, level in enumerate(levels)]
 
 
 def multiply(first: np.ndarray, second: np.ndarray) -> np.ndarray:

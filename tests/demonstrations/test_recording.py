@@ -1,0 +1,252 @@
+"""Recording: whoever acts, wherever, an episode's rows are what the environment showed, and only what is asked for is kept."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+from stable_baselines3 import PPO
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+from sb3_actpc.demonstrations import Demonstrations, fit_demonstrations
+
+
+class Corridor(gym.Env[Any, Any]):
+    """Counts its steps; ends by itself after ``length`` steps with success in every second episode."""
+
+    def __init__(self, length: int = 4, reports: bool = True, is_dict: bool = False, dense: bool = False) -> None:
+        self.length, self.reports, self.is_dict, self.dense, self.episode = length, reports, is_dict, dense, -1
+        box = spaces.Box(-100, 100, (2,), np.float32)
+        # not in alphabetical order
+        self.observation_space = spaces.Dict([("state", box), ("goal", spaces.Box(-1, 1, (1,)))]) if is_dict else box
+        self.action_space = spaces.Box(-2, 2, (1,), np.float32)
+
+    def observe(self) -> Any:
+        state = np.array([self.episode, self.t], dtype=np.float32)
+        return {"state": state, "goal": np.full(1, 0.5, np.float32)} if self.is_dict else state
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.episode, self.t, self.last_seed = self.episode + 1, 0, seed
+        return self.observe(), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self.t += 1
+        info: dict[str, Any] = {"is_success": self.episode % 2 == 1} if self.reports else {}
+        if self.dense:
+            info["dense_reward"] = 10.0 * self.t
+        return self.observe(), float(self.t), self.t == self.length, False, info
+
+
+def forward(_: Any) -> np.ndarray:
+    return np.ones(1, dtype=np.float32)
+
+
+class Noting:
+    """SB3's predict, that notes what it is given; its state counts its own calls in an episode."""
+
+    def __init__(self) -> None:
+        self.calls: list[tuple[Any, Any, bool, bool]] = []
+        self.started: list[int] = []
+
+    def start(self, seed: int) -> None:
+        self.started.append(seed)
+
+    def predict(self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = False) -> Any:
+        self.calls.append((observation, state, bool(episode_start[0]), deterministic))
+        return forward(observation), (state or 0) + 1
+
+
+def test_rows_are_what_the_environment_showed() -> None:
+    shown = Demonstrations.record(forward, Corridor(), 2, only_successes=False)
+    assert shown.observations[:, 1].tolist() == [0, 1, 2, 3] * 2
+    assert shown.next_observations[:, 1].tolist() == [1, 2, 3, 4] * 2
+    assert shown.rewards.tolist() == [1, 2, 3, 4] * 2
+    assert shown.terminations.tolist() == [False, False, False, True] * 2
+    assert shown.episode_starts.tolist() == [0, 4]
+    assert shown.dense_rewards is not None and shown.dense_rewards.tolist() == shown.rewards.tolist()
+    assert shown.env_id == "Corridor"
+
+
+def test_a_time_limit_is_no_termination_and_dense_rewards_are_kept_apart() -> None:
+    shown = Demonstrations.record(forward, gym.wrappers.TimeLimit(Corridor(dense=True), 3), 1, only_successes=False)
+    assert len(shown) == 3 and not shown.terminations.any()
+    assert shown.dense_rewards is not None and shown.dense_rewards.tolist() == [10, 20, 30]
+    assert shown.rewards.tolist() == [1, 2, 3]
+
+
+@pytest.mark.parametrize(("only_successes", "episodes"), [(None, [1, 3]), (True, [1, 3]), (False, [0, 1])])
+def test_successes_only_unless_told_otherwise(only_successes: bool | None, episodes: list[int]) -> None:
+    shown = Demonstrations.record(forward, Corridor(), 2, only_successes)
+    assert sorted(set(shown.observations[:, 0])) == episodes
+    assert shown.metadata["n_tries"] == episodes[-1] + 1
+
+
+def test_an_environment_that_reports_no_success() -> None:
+    assert Demonstrations.record(forward, Corridor(reports=False), 3).n_episodes == 3
+    with pytest.raises(ValueError, match="only_successes=True needs an environment whose info has is_success"):
+        Demonstrations.record(forward, Corridor(reports=False), 3, only_successes=True)
+
+
+def test_too_few_successes_are_refused_with_the_count() -> None:
+    with pytest.raises(ValueError, match="only 1 of 3 episodes succeeded in Corridor, 2 are needed"):
+        Demonstrations.record(forward, Corridor(), 2, max_tries=3)
+
+
+def test_predict_is_given_its_own_state_and_told_of_every_new_episode() -> None:
+    agent = Noting()
+    Demonstrations.record(agent, Corridor(length=2), 2, only_successes=False, deterministic=False, seed=7)
+    assert [call[1:] for call in agent.calls] == [(None, True, False), (1, False, False)] * 2
+    assert agent.started == [7, 8]
+
+
+def test_several_demonstrators_take_turns_and_try_again_where_they_fail() -> None:
+    first, second = Noting(), Noting()
+    Demonstrations.record([first, second], Corridor(length=1), 2, seed=0)
+    assert first.started == [0, 1], "the first try fails"
+    assert second.started == [2, 3]
+
+
+def test_dict_observations_are_flattened_in_the_order_of_their_space() -> None:
+    env = Corridor(is_dict=True)
+    shown = Demonstrations.record(forward, env, 1)
+    expected = spaces.utils.flatten(env.observation_space, {"state": np.array([1, 2]), "goal": np.array([0.5])})
+    assert shown.observations[2].tolist() == list(expected)
+
+
+def test_a_model_sees_observations_as_its_vec_normalize_shows_them() -> None:
+    env = VecNormalize(DummyVecEnv([lambda: Corridor()]))
+    model = PPO("MlpPolicy", env, n_steps=8, batch_size=8, n_epochs=1, device="cpu", seed=0).learn(16)
+    shown = Demonstrations.record(model, Corridor(), 1)
+    expected = model.predict(env.normalize_obs(shown.observations), deterministic=True)[0]
+    np.testing.assert_allclose(shown.actions, expected, atol=1e-6)
+    assert not np.allclose(shown.actions, model.predict(shown.observations, deterministic=True)[0])
+
+
+def test_sampled_actions_differ_and_deterministic_ones_do_not() -> None:
+    model = PPO("MlpPolicy", "Pendulum-v1", n_steps=8, batch_size=8, device="cpu", seed=0)
+    first, second = (Demonstrations.record(model, "Pendulum-v1", 1, seed=3) for _ in range(2))
+    assert np.array_equal(first.actions, second.actions) and first.env_id == "Pendulum-v1"
+    sampled = Demonstrations.record(model, "Pendulum-v1", 1, deterministic=False, seed=3)
+    assert np.array_equal(first.observations[0], sampled.observations[0])
+    assert not np.allclose(first.actions, sampled.actions)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"demonstrator": 3}, "3 must have SB3's predict, or be a function"),
+        ({"n_episodes": 0}, "n_episodes=0 must be at least 1"),
+        ({"env": "CartPole-v1"}, "Box action space, found Discrete"),
+        ({"env": 3}, "env must be a Gymnasium environment or the id of one, found 3"),
+        ({"demonstrator": lambda _: np.array([5.0])}, "'actions': expected values in .*5.0"),
+    ],
+)
+def test_wrong_arguments_are_named(change: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        Demonstrations.record(**{"demonstrator": forward, "env": Corridor(), "n_episodes": 1, **change})
+
+
+class TestConcatenate:
+    def test_episodes_follow_each_other(self) -> None:
+        first = Demonstrations.record(forward, Corridor(), 2, seed=0)
+        second = Demonstrations.record(forward, Corridor(length=2), 1, seed=9)
+        both = Demonstrations.concatenate([first, second])
+        assert both.episode_bounds.tolist() == [[0, 4], [4, 8], [8, 10]]
+        assert np.array_equal(both.rewards, np.concatenate([first.rewards, second.rewards]))
+        assert "seed" not in both.metadata, "they differ in it"
+        assert both.metadata["deterministic"] is True
+
+    def test_other_tasks_sizes_and_nothing_are_refused(self) -> None:
+        one = Demonstrations.record(forward, Corridor(), 1)
+        pendulum = Demonstrations.record(forward, "Pendulum-v1", 1)
+        with pytest.raises(ValueError, match="several tasks cannot be concatenated, found Corridor, Pendulum"):
+            Demonstrations.concatenate([one, pendulum])
+        with pytest.raises(ValueError, match="'observations': expected rows of one size"):
+            Demonstrations.concatenate([one, Demonstrations.record(forward, Corridor(is_dict=True), 1)])
+        with pytest.raises(ValueError, match="at least one episode"):
+            Demonstrations.concatenate([])
+
+
+def test_repr_is_one_line_that_says_what_there_is() -> None:
+    text = repr(Demonstrations.record(forward, Corridor(dense=True), 2))
+    for part in ("Corridor", "2 episodes", "8 transitions", "observations of 2", "actions of 1", "return 10.0", "dense 100.0"):
+        assert part in text
+    assert len(text) < 200 and "\n" not in text
+
+
+@dataclass
+class Trajectory:
+    """As imitation.data.types.TrajectoryWithRew."""
+
+    obs: Any
+    acts: Any
+    infos: Any
+    terminal: bool
+    rews: Any = None
+
+
+class DictObs:
+    """As imitation.data.types.DictObs."""
+
+    def __init__(self, parts: dict[str, np.ndarray]) -> None:
+        self.parts = parts
+
+    def unwrap(self) -> dict[str, np.ndarray]:
+        return self.parts
+
+
+class TestTrajectories:
+    def test_of_the_imitation_library(self) -> None:
+        observations = np.arange(8.0).reshape(4, 2)
+        ended = Trajectory(observations, np.ones((3, 1)), None, True, np.array([0.0, 0.0, 1.0]))
+        cut = Trajectory(observations, np.ones((3, 1)), [{}, {}, {"TimeLimit.truncated": True}], True, np.zeros(3))
+        shown = Demonstrations.from_trajectories([ended, cut], "Named-v0")
+        assert shown.observations.tolist() == [[0, 1], [2, 3], [4, 5]] * 2
+        assert shown.next_observations.tolist() == [[2, 3], [4, 5], [6, 7]] * 2
+        assert shown.terminations.tolist() == [False, False, True, False, False, False]
+        assert shown.rewards.tolist() == [0, 0, 1, 0, 0, 0]
+        assert shown.dense_rewards is None
+
+    def test_a_fragment_does_not_terminate(self) -> None:
+        fragment = Trajectory(np.zeros((3, 2)), np.zeros((2, 1)), None, False, np.zeros(2))
+        assert not Demonstrations.from_trajectories([fragment], "Named-v0").terminations.any()
+
+    def test_without_rewards_the_last_step_is_paid_as_said(self) -> None:
+        plain = Trajectory(np.zeros((3, 2)), np.zeros((2, 1)), [{"dense_reward": 1.0}, {"dense_reward": 2.0}], True)
+        with pytest.raises(ValueError, match="without rews need final_reward"):
+            Demonstrations.from_trajectories([plain], "Named-v0")
+        shown = Demonstrations.from_trajectories([plain], "Named-v0", final_reward=1.0)
+        assert shown.rewards.tolist() == [0, 1]
+        assert shown.dense_rewards is not None and shown.dense_rewards.tolist() == [1, 2]
+
+    def test_dict_observations_need_a_space(self) -> None:
+        parts = DictObs({"goal": np.full((3, 1), 9.0), "state": np.arange(6.0).reshape(3, 2)})
+        trajectory = Trajectory(parts, np.zeros((2, 1)), None, True, np.zeros(2))
+        with pytest.raises(ValueError, match="need observation_space"):
+            Demonstrations.from_trajectories([trajectory], "Named-v0")
+        space = Corridor(is_dict=True).observation_space
+        shown = Demonstrations.from_trajectories([trajectory], "Named-v0", observation_space=space)
+        first = spaces.utils.flatten(space, {"goal": np.array([9.0]), "state": np.array([0.0, 1.0])})
+        assert shown.observations[0].tolist() == list(first)
+
+    def test_a_missing_observation_is_noticed(self) -> None:
+        with pytest.raises(ValueError, match="2 actions must have 3 observations, found 2"):
+            Demonstrations.from_trajectories([Trajectory(np.zeros((2, 2)), np.zeros((2, 1)), None, True, np.zeros(2))], "A-v0")
+
+
+def test_demonstrations_of_the_dense_base_task_fit_the_sparse_one() -> None:
+    """Paid as the sparse task pays what was travelled, whatever the recording's rewards."""
+    rng = np.random.default_rng(0)
+    with gym.make("Hopper-v5") as dense:
+        shown = Demonstrations.record(lambda _: rng.uniform(-1, 1, 3).astype(np.float32), dense, 2)
+    env = DummyVecEnv([lambda: gym.make("SparseHopper-v5", condition="forward", threshold=0.05)])
+    fitted = fit_demonstrations(shown, env, env.observation_space, env.action_space)
+    with gym.make("SparseHopper-v5", condition="forward", threshold=0.05) as sparse:
+        sparse.reset(seed=0)
+        paid = [sparse.step(action)[1] for action in shown.actions[: shown.episode_bounds[0, 1]]]
+    assert fitted.rewards[: len(paid)].tolist() == paid and 0 < sum(paid) < len(paid)
+    assert np.array_equal(fitted.dense_rewards, shown.rewards)
+    env.close()
