@@ -216,14 +216,11 @@ def _read_hdf5(args: argparse.Namespace) -> "Demonstrations":
 
 def _download(args: argparse.Namespace) -> int:
     """Fetch, check, convert."""
-    from sb3_actpc.demonstrations import read_robomimic
     from sb3_actpc.demonstrations.download import download_robomimic, robomimic_url
 
     url = args.url or robomimic_url(args.env, args.kind)
     output = args.output or Path(f"{args.env.split('-')[0].lower().replace('sparse', 'sparse_')}_{args.kind}.npz")
-    fetched = output.with_suffix(".hdf5")
-    download_robomimic(args.env, fetched, url, _report)
-    demonstrations = read_robomimic(fetched, args.env, args.obs)
+    demonstrations = download_robomimic(args.env, output.with_suffix(".hdf5"), url, args.obs, _report)
     demonstrations.save(output)
     _report_size(demonstrations)
     _report(f"wrote {output} ({output.stat().st_size / 1e6:.2f} MB)")

@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-import http.client
 import os
-import urllib.error
-import urllib.request
-from collections.abc import Callable
 from pathlib import Path
 
 from sb3_actpc.demonstrations.dataset import Demonstrations
 from sb3_actpc.demonstrations.hdf5 import import_h5py
+from sb3_actpc.demonstrations.recording import Report, silent
 from sb3_actpc.demonstrations.robomimic import read_robomimic
 from sb3_actpc.envs.robosuite_layouts import robosuite_task
-from sb3_actpc.utils.files import atomic_write
 
 REPOSITORY = "https://huggingface.co/datasets/robomimic/robomimic_datasets/resolve/main"
 KINDS = {"mh": "300 by six humans of three levels", "ph": "200 by one proficient human"}
-CHUNK = 1 << 20
 TIMEOUT_SECONDS = 30.0
 
 
@@ -35,47 +30,41 @@ def robomimic_url(env_id: str, kind: str = "mh") -> str:
 
 
 def download_robomimic(
-    env_id: str, path: str | os.PathLike[str], url: str, report: Callable[[str], None] = lambda line: None
+    env_id: str, path: str | os.PathLike[str], url: str, obs: str = "paper", report: Report = silent
 ) -> Demonstrations:
-    """Download a robomimic file, unless it is there already, and check what it holds.
+    """Download a robomimic file, unless it is there already, and read it.
 
     The file appears under its name only when it is whole.
 
     :param env_id: the task it must be of
     :param path: where to put the file
     :param url: its address (http or https)
+    :param obs: the observations to build
     :param report: takes lines of progress
-    :return: its demonstrations, with ``obs="robomimic"``
+    :return: its demonstrations
     :raises OSError: when it cannot be fetched
     :raises ValueError: when what arrived is not such a file
     :raises ImportError: when h5py is not installed
     """
+    import pooch
+
     import_h5py()  # before the long part
     path = Path(path)
     if not url.startswith(("http://", "https://")):
         raise ValueError(f"url={url!r} must begin with http:// or https://")
     if path.is_file():
         report(f"{path} is there already")
-    else:
-        _fetch(url, path, report)
-    return read_robomimic(path, env_id, obs="robomimic")
-
-
-def _fetch(url: str, path: Path, report: Callable[[str], None]) -> None:
+        return read_robomimic(path, env_id, obs)
     report(f"fetching {url}")
+    pooch.get_logger().setLevel("WARNING")
     try:
-        with urllib.request.urlopen(url, timeout=TIMEOUT_SECONDS) as response, atomic_write(path) as file:
-            expected = response.headers.get("Content-Length")
-            n_bytes = 0
-            while chunk := response.read(CHUNK):
-                file.write(chunk)
-                n_bytes += len(chunk)
-            if expected is not None and n_bytes != int(expected):
-                raise OSError(f"only {n_bytes} of {expected} bytes arrived")
-    except (OSError, http.client.HTTPException) as error:  # URLError is an OSError
-        reason = error.reason if isinstance(error, urllib.error.URLError) else error
+        downloader = pooch.HTTPDownloader(timeout=TIMEOUT_SECONDS)
+        pooch.retrieve(url, known_hash=None, fname=path.name, path=path.parent, downloader=downloader)
+    except (OSError, ValueError) as error:
+        reason = " ".join(str(error).split())
         raise OSError(
-            f"could not fetch {url} ({reason}): where there is a network, download it, then "
-            f"`sb3-actpc demos convert FILE --env ...` makes demonstrations of it"
+            f"could not fetch {url}: where there is a network, download that address, then make demonstrations of the file "
+            f"here with `sb3-actpc demos convert FILE --env {env_id}` ({reason})"
         ) from None
     report(f"wrote {path} ({path.stat().st_size / 1e6:.1f} MB)")
+    return read_robomimic(path, env_id, obs)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
+import sys
 import zipfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -649,6 +650,17 @@ class TestMinari:
         with pytest.raises(FileNotFoundError, match="tiny/absent-v0"):
             Demonstrations.from_minari("tiny/absent-v0")
 
+    def test_an_id_stands_for_its_dataset_in_the_environments_order(self, tiny_reach: str) -> None:
+        demonstrations = make_demonstrations()
+        demonstrations.to_minari("tiny/by-id-v0")
+        assert_equal(resolve("tiny/by-id-v0"), demonstrations)
+        order = spaces.Dict([("goal", TinyReach.observation_space["goal"]), ("state", TinyReach.observation_space["state"])])
+        assert np.array_equal(resolve("tiny/by-id-v0", order).observations, np.roll(demonstrations.observations, 1, axis=1))
+
+    def test_an_id_that_is_not_on_this_machine_says_how_to_fetch_it(self) -> None:
+        with pytest.raises(FileNotFoundError, match="minari download tiny/absent-v3"):
+            resolve("tiny/absent-v3")
+
     def test_discrete_actions_are_refused(self, minari: Any) -> None:
         episode = buffer_of(make_demonstrations(), spaces.Box(-9, 9, (OBS_DIM,)), spaces.Box(-1, 1, (ACTION_DIM,)))
         dataset = minari.create_dataset_from_buffers(
@@ -670,6 +682,18 @@ class TestMinari:
         with pytest.raises(ValueError, match="'actions'"):
             make_demonstrations(actions=np.full((N, ACTION_DIM), 3.0)).to_minari("tiny/unfit-v0")
         assert not (tmp_path / "tiny").exists()
+
+
+def test_a_minari_id_without_minari_says_how_to_install_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "minari", None)
+    with pytest.raises(ImportError, match="sb3-actpc.minari."):
+        resolve("mujoco/hopper/expert-v0")
+
+
+def test_a_file_whose_name_looks_like_a_minari_id_is_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    make_demonstrations().save("mine-v0")
+    assert_equal(resolve("mine-v0"), make_demonstrations())
 
 
 def test_metadata_is_readable_without_the_package(saved: Path) -> None:
