@@ -686,7 +686,7 @@ class TestMinari:
 
 def test_a_minari_id_without_minari_says_how_to_install_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "minari", None)
-    with pytest.raises(ImportError, match="sb3-actpc.minari."):
+    with pytest.raises(ImportError, match=r"sb3-actpc\[minari\]"):
         resolve("mujoco/hopper/expert-v0")
 
 
