@@ -1,6 +1,6 @@
 """What a checkpoint of a full HalfCheetah buffer costs, against ``numpy.save`` with fsync of the same arrays.
 
-    python tests/checkpoint_cost.py
+    python benchmarks/checkpoint_cost.py
 
 Measures in turns, since the disk's speed changes: the plain files, a first checkpoint (everything is written), and the next
 one after so many further transitions (what has not changed is shared). Prints the medians of the times and of the ratios,

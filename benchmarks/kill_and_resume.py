@@ -1,6 +1,6 @@
 """Kill a training run (SIGKILL) at random moments, resume it each time, and compare its end with the run never stopped.
 
-    python tests/kill_and_resume.py --kills 30
+    python benchmarks/kill_and_resume.py --kills 30
 
 Prints one line per kill and ends with exit code 0 when both runs are equal bit for bit: weights, optimisers, replay buffer,
 normalisers, generators, simulators, evaluations and logs (times of the clock left out).
@@ -55,13 +55,12 @@ def train(folder: Path, n_steps: int, started: Connection) -> None:
     )  # fmt: skip
     checkpoints = CheckpointCallback(folder / "checkpoints", SAVE_FREQ, report=print)
     resumes = bool(list_bundles(folder / "checkpoints"))
-    if resumes:
-        restore(model, folder / "checkpoints", print)
+    restored = restore(model, folder / "checkpoints", print) if resumes else None
     model.set_logger(configure(str(folder), ["csv"]))
     print(f"  learning from step {model.num_timesteps}", flush=True)
     started.send(model.num_timesteps)
-    if resumes:
-        continue_learning(model, [checkpoints, evaluation], log_interval=1)
+    if restored is not None:
+        continue_learning(restored, [checkpoints, evaluation], log_interval=1)
     else:
         model.learn(n_steps, [checkpoints, evaluation], log_interval=1)
 

@@ -1,6 +1,6 @@
 """Memory of a training process after its replay buffer is full.
 
-    python tests/memory_growth.py --steps 100000
+    python benchmarks/memory_growth.py --steps 100000
 
 Prints the resident memory when the buffer has been full for a while and after so many further steps; exit code 1 when it grew
 by 1% or more.

@@ -25,7 +25,7 @@ from sb3_actpc.actpc.features import Batch, CircuitInputs
 from sb3_actpc.actpc.policies import ActPCActor, ActPCPolicy, CnnPolicy, Critics, MlpPolicy, MultiInputPolicy
 from sb3_actpc.actpc.reward_signals import make_normalizer, summed_squared_errors
 from sb3_actpc.actpc.self_imitation import Episodes, map_observations, sample_union
-from sb3_actpc.checkpoints import between_updates, load_checkpoint, load_weights, save_weights
+from sb3_actpc.checkpoints import Restored, between_updates, load_checkpoint, load_weights, save_weights
 from sb3_actpc.demonstrations import fit_demonstrations
 from sb3_actpc.demonstrations.dataset import Demonstrations
 from sb3_actpc.ngc import HebbianChanges, NGCCircuit, settle_coupled
@@ -688,7 +688,7 @@ class ActPC(OffPolicyAlgorithm):
         self.diagnostics.values = dict(state["diagnostics"])
 
     @classmethod
-    def load_checkpoint(cls: type[SelfActPC], path: str | PathLike[str], env: GymEnv | str, **keywords: Any) -> SelfActPC:
+    def load_checkpoint(cls: type[SelfActPC], path: str | PathLike[str], env: GymEnv | str, **keywords: Any) -> Restored:
         """
         Go on from a checkpoint: see :func:`sb3_actpc.checkpoints.load_checkpoint` and ``continue_learning`` there.
 

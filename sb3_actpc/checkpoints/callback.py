@@ -4,30 +4,21 @@ from __future__ import annotations
 
 import os
 import tempfile
-import warnings
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
-from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EventCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import MaybeCallback
 
-from sb3_actpc.actpc.self_imitation import map_observations
-from sb3_actpc.checkpoints.bundle import Report, find_bundle, list_bundles, write_bundle
+from sb3_actpc.checkpoints.bundle import Report, find_bundle, list_bundles, warn, write_bundle
 from sb3_actpc.checkpoints.interrupts import StopSignals, TrainingStopped
 from sb3_actpc.checkpoints.settings import constructor_settings
 from sb3_actpc.checkpoints.simulators import env_name
-from sb3_actpc.checkpoints.state import capture_model, describe_model, restore_learning, restore_model, take_resumed
+from sb3_actpc.checkpoints.state import Restored, capture_model, describe_model, restore_learning, restore_model
 from sb3_actpc.utils.checks import check_finite
-
-SelfAlgorithm = TypeVar("SelfAlgorithm", bound=OffPolicyAlgorithm)
-
-
-def _warn(line: str) -> None:
-    warnings.warn(line, stacklevel=3)
 
 
 class CheckpointCallback(BaseCallback):
@@ -35,9 +26,9 @@ class CheckpointCallback(BaseCallback):
     Saves everything that the training of any SB3 off-policy algorithm depends on, every ``save_freq`` steps and when the
     process is told to stop (SIGTERM, SIGINT); the latter raises :class:`~sb3_actpc.checkpoints.TrainingStopped`.
 
-    A checkpoint is taken between two rollouts (``train_freq`` steps), or between two updates of a ``train()`` or a
-    pre-training (see :func:`between_updates`) that a signal interrupts. The handlers that were there before come back when
-    ``learn`` ends; after an error, call :meth:`close`.
+    A checkpoint is taken between two rollouts (``train_freq`` steps), or between two updates of a pre-training (see
+    :func:`between_updates`) that a signal interrupts. The handlers that were there before come back when ``learn`` ends; after
+    an error, call :meth:`close`.
 
     To go on, see :func:`restore` and :func:`continue_learning`.
 
@@ -47,6 +38,8 @@ class CheckpointCallback(BaseCallback):
     :param handle_signals: save and stop on SIGTERM and SIGINT
     :param at_end: also save when ``learn`` ends
     :param report: given a line when something cannot be saved or restored; by default a warning
+    :param restored: what :func:`restore` returned, where this ``learn`` goes on from a checkpoint; :func:`continue_learning`
+        says so itself
     :param verbose: 1 to report each checkpoint
     :raises ValueError: when a number is less than 1
     """
@@ -58,7 +51,8 @@ class CheckpointCallback(BaseCallback):
         keep: int = 3,
         handle_signals: bool = True,
         at_end: bool = True,
-        report: Report | None = None,
+        report: Report = warn,
+        restored: Restored | None = None,
         verbose: int = 0,
     ) -> None:
         super().__init__(verbose)
@@ -67,26 +61,20 @@ class CheckpointCallback(BaseCallback):
                 raise ValueError(f"{name}={value!r} must be at least 1")
         self.folder, self.save_freq, self.keep = Path(folder), save_freq, keep
         self.handle_signals, self.at_end = handle_signals, at_end
-        self.report = _warn if report is None else report
+        self.report, self.restored = report, restored
         self.signals = StopSignals()
         self._others: list[BaseCallback] = []
         self._env_id = ""
         self._last_saved = 0
-        self._samples: int | None = None  # drawn in the present train(), None outside of it
-        self._planned, self._updates_before = 0, 0
 
     def close(self) -> None:
-        """Put the old signal handlers back and leave the replay buffer alone again; ``learn`` does so when it ends."""
+        """Put the old signal handlers back; ``learn`` does so when it ends."""
         self.signals.restore()
-        self._samples = None
-        if hasattr(self, "model"):
-            unwatch(self._algorithm.replay_buffer)
 
-    def save(self, gradient_steps_left: int = 0) -> Path:
+    def save(self) -> Path:
         """
         Write a checkpoint now.
 
-        :param gradient_steps_left: updates that the present ``train()`` had still to do
         :return: its folder
         :raises ValueError: when a weight is not finite
         :raises OSError: when it cannot be written; those there before stay
@@ -95,7 +83,7 @@ class CheckpointCallback(BaseCallback):
         manifest = describe_model(model, self._env_id or env_name(self.training_env))
         manifest["settings"] = constructor_settings(model)
         with write_bundle(self.folder, model.num_timesteps, self.keep, manifest) as writer:
-            capture_model(model, self._others, writer, gradient_steps_left)
+            capture_model(model, self._others, writer)
         self._last_saved = model.num_timesteps
         path = list_bundles(self.folder)[-1]
         if self.verbose:
@@ -119,25 +107,19 @@ class CheckpointCallback(BaseCallback):
     def _on_training_start(self) -> None:
         self._follow(self.locals.get("callback"))
         self._last_saved = self.num_timesteps
-        if self.handle_signals:
-            watch(self._algorithm.replay_buffer, self._on_sample)
 
     def _on_rollout_start(self) -> None:
-        self._samples = None
         self._resume_or_stop()
         if self.num_timesteps - self._last_saved >= self.save_freq:
             self._save_or_report()
 
     def _on_step(self) -> bool:
-        step = self.num_timesteps
+        step, seen = self.num_timesteps, self.locals["new_obs"]
         check_finite("agent", "actions", np.asarray(self.locals["actions"]), step)
-        map_observations(lambda array: check_finite("environment", "observations", array, step), self.locals["new_obs"])
+        for observations in seen.values() if isinstance(seen, dict) else [seen]:
+            check_finite("environment", "observations", observations, step)
         check_finite("environment", "rewards", self.locals["rewards"], step)
         return True
-
-    def _on_rollout_end(self) -> None:
-        steps = self._algorithm.gradient_steps
-        self._begin_updates(steps if steps >= 0 else self.locals["num_collected_steps"] * self.training_env.num_envs)
 
     def _on_training_end(self) -> None:
         self._resume()  # where no step was left
@@ -150,49 +132,17 @@ class CheckpointCallback(BaseCallback):
         self._env_id = env_name(self.training_env)
         self._others = [one for one in callback_tree(callback) if one is not self]
 
-    # ------------------------------------------------------------------ resuming
-
     def _resume(self) -> None:
-        resumed = take_resumed(self._algorithm)
-        if resumed is not None:
-            self._finish_updates(restore_learning(self._algorithm, self._others, resumed, self.report))
-
-    def _finish_updates(self, left: int) -> None:
-        """What the interrupted ``train()`` had still to do, and what SB3 does between it and the start of the rollout."""
-        if not left:
-            return
-        model = self._algorithm
-        self._begin_updates(left)
-        model.train(gradient_steps=left, batch_size=model.batch_size)
-        self._samples = None
-        model.policy.set_training_mode(False)
-        if model.use_sde:
-            model.actor.reset_noise(model.n_envs)  # type: ignore[operator]
-
-    # ------------------------------------------------------------------ stopping
+        restored, self.restored = self.restored, None
+        if restored is not None:
+            restore_learning(restored, self._others, self.report)
 
     def _resume_or_stop(self) -> None:
         self._resume()
-        if self.signals.received:
-            self._stop(0)
-
-    def _begin_updates(self, planned: int) -> None:
-        self._samples, self._planned, self._updates_before = 0, planned, self._algorithm._n_updates
-
-    def _on_sample(self) -> None:
-        """The replay buffer is about to be sampled: the update before has ended."""
-        if self._samples is None:
+        if self.signals.received is None:
             return
-        if self.signals.received:
-            # some algorithms count an update when it begins, others when all are done
-            self._algorithm._n_updates = self._updates_before + self._samples
-            self._stop(self._planned - self._samples)
-        self._samples += 1
-
-    def _stop(self, gradient_steps_left: int) -> None:
-        assert self.signals.received is not None
         try:
-            path = self.save(gradient_steps_left)
+            path = self.save()
         finally:
             self.close()
         raise TrainingStopped(self.signals.received, self._algorithm.num_timesteps, str(path))
@@ -227,26 +177,25 @@ def between_updates(callback: BaseCallback) -> Callable[[], None]:
 # ---------------------------------------------------------------------- going on
 
 
-def restore(model: OffPolicyAlgorithm, path: str | os.PathLike[str], report: Report = _warn) -> OffPolicyAlgorithm:
+def restore(model: OffPolicyAlgorithm, path: str | os.PathLike[str], report: Report = warn) -> Restored:
     """
     Put a checkpoint back into an agent made with the settings of the stopped run; :func:`continue_learning` goes on with it.
 
     :param model: the agent, with an environment made as the stopped run's
     :param path: a checkpoint, or the folder of several: the newest whole one is taken
     :param report: given a line for each damaged checkpoint, and when episodes must start again
-    :return: the agent
+    :return: the agent (``model``), and what is put back when it learns
     :raises FileNotFoundError: when there is no checkpoint
     :raises ValueError: when it is damaged, does not fit or was written in another version of the format
     """
-    restore_model(model, find_bundle(path, report), report)
-    return model
+    return restore_model(model, find_bundle(path, report), report)
 
 
-def continue_learning(model: SelfAlgorithm, callback: MaybeCallback = None, **options: Any) -> SelfAlgorithm:
+def continue_learning(restored: Restored, callback: MaybeCallback = None, **options: Any) -> OffPolicyAlgorithm:
     """
     Learn until the step that the stopped run was to reach.
 
-    :param model: what :func:`restore` or ``load_checkpoint`` returned
+    :param restored: what :func:`restore` or ``load_checkpoint`` returned
     :param callback: those of the stopped run, made anew, a :class:`CheckpointCallback` among them
     :param options: further keywords of ``learn``, such as ``log_interval``
     :return: the agent
@@ -256,6 +205,8 @@ def continue_learning(model: SelfAlgorithm, callback: MaybeCallback = None, **op
     savers = [one for one in everything if isinstance(one, CheckpointCallback)]
     if not savers:
         raise ValueError(f"callback={callback!r} has no CheckpointCallback: add one, it puts back what learn() itself sets up")
+    savers[0].restored = restored
+    model = restored.model
     left = model._total_timesteps - model.num_timesteps
     try:
         return model.learn(max(0, left), callback=callback, reset_num_timesteps=False, **options)
@@ -290,45 +241,3 @@ def check_writable(folder: Path) -> None:
         raise ValueError(
             f"folder={str(folder)!r}: no checkpoint can be written there ({error.strerror or error}): choose another folder"
         ) from error
-
-
-# ---------------------------------------------------------------------- the replay buffer, watched
-
-
-def watch(buffer: ReplayBuffer | None, on_sample: Callable[[], None]) -> None:
-    """
-    Call ``on_sample`` whenever the buffer is about to be sampled, which every SB3 algorithm does once an update.
-
-    The buffer gets a subclass of its class; when it is pickled, its own.
-
-    :param buffer: the agent's
-    :param on_sample: without arguments
-    """
-    if buffer is None or hasattr(buffer, "_unwatched_class"):
-        return
-    original: Any = type(buffer)
-
-    class Watched(original):
-        _unwatched_class = original
-
-        def sample(self, *args: Any, **kwargs: Any) -> Any:
-            on_sample()
-            return super().sample(*args, **kwargs)
-
-        def __reduce_ex__(self, protocol: Any) -> Any:
-            return (_blank, (original,), *super().__reduce_ex__(protocol)[2:])
-
-    Watched.__name__, Watched.__qualname__, Watched.__module__ = original.__name__, original.__qualname__, original.__module__
-    buffer.__class__ = Watched
-
-
-def _blank(kind: type) -> Any:
-    """An object whose attributes are set by whoever copies or unpickles it."""
-    return object.__new__(kind)
-
-
-def unwatch(buffer: ReplayBuffer | None) -> None:
-    """:param buffer: gets its own class back"""
-    original = getattr(buffer, "_unwatched_class", None)
-    if buffer is not None and original is not None:
-        buffer.__class__ = original

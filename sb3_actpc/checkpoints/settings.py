@@ -1,17 +1,17 @@
-"""Constructor settings as plain values: classes by their names, looked up in a fixed table when they are read."""
+"""Constructor settings as plain values. Classes go by their names; reading one runs no code and imports nothing."""
 
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Mapping
 from enum import Enum
 from typing import Any
 
 import numpy as np
 import torch as th
-from stable_baselines3.common import buffers as sb3_buffers
-from stable_baselines3.common import torch_layers
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import (
     ActionNoise,
     NormalActionNoise,
@@ -20,33 +20,19 @@ from stable_baselines3.common.noise import (
 )
 from stable_baselines3.common.type_aliases import TrainFreq
 from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
-from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
-from sb3_actpc.actpc import buffers
 from sb3_actpc.utils.constructors import constructor_keywords
 
-_ACTIVATIONS = ("ReLU", "LeakyReLU", "Tanh", "ELU", "GELU", "SiLU", "Mish", "Sigmoid", "Softplus", "Identity", "ReLU6")
-_OPTIMIZERS = ("Adam", "AdamW", "SGD", "RMSprop", "Adamax", "NAdam", "RAdam", "Adagrad")
-_BUFFERS = ("CombinedReplayBuffer", "CombinedNStepReplayBuffer", "CombinedDictReplayBuffer", "CombinedHerReplayBuffer")
-CLASSES: dict[str, type] = {
-    **{f"torch.nn.{name}": getattr(th.nn, name) for name in _ACTIVATIONS},
-    **{f"torch.optim.{name}": getattr(th.optim, name) for name in _OPTIMIZERS},
-    **{f"sb3.{name}": getattr(torch_layers, name) for name in ("FlattenExtractor", "CombinedExtractor", "NatureCNN")},
-    **{f"sb3.{name}": getattr(sb3_buffers, name) for name in ("ReplayBuffer", "DictReplayBuffer", "NStepReplayBuffer")},
-    "sb3.HerReplayBuffer": HerReplayBuffer,
-    **{f"sb3_actpc.{name}": getattr(buffers, name) for name in _BUFFERS},
-}
-_NAMES = {kind: name for name, kind in CLASSES.items()}
+# a class can be named when it is of one of these packages and of one of these kinds
+_PACKAGES = ("torch", "stable_baselines3", "sb3_contrib", "sb3_actpc")
+_KINDS: tuple[type, ...] = (th.nn.Module, th.optim.Optimizer, ReplayBuffer)
 _SCHEDULES: dict[str, tuple[Any, tuple[str, ...]]] = {
     "linear": (LinearSchedule, ("start", "end", "end_fraction")),
     "constant": (ConstantSchedule, ("val",)),
 }
 _NOISES: dict[str, tuple[Any, dict[str, str]]] = {
     "normal": (NormalActionNoise, {"mean": "_mu", "sigma": "_sigma"}),
-    "ornstein-uhlenbeck": (
-        OrnsteinUhlenbeckActionNoise,
-        {"mean": "_mu", "sigma": "_sigma", "theta": "_theta", "dt": "_dt"},
-    ),
+    "ornstein-uhlenbeck": (OrnsteinUhlenbeckActionNoise, {"mean": "_mu", "sigma": "_sigma", "theta": "_theta", "dt": "_dt"}),
 }
 # chosen anew by whoever loads, or stored otherwise
 _NOT_STORED = {"env", "policy", "device", "verbose", "tensorboard_log"}
@@ -116,8 +102,10 @@ def _name_value(value: Any) -> Any:
 
 
 def _name_object(value: Any) -> dict[str, Any]:
-    if isinstance(value, type) and value in _NAMES:
-        return {"class": _NAMES[value]}
+    if isinstance(value, type):
+        name = f"{value.__module__}.{value.__qualname__}"
+        if find_class(name) is value:
+            return {"class": name}
     if isinstance(value, FloatSchedule):
         return _name_object(value.value_schedule)
     if isinstance(value, VectorizedActionNoise):
@@ -136,7 +124,7 @@ def read_value(node: Any) -> Any:
     """
     :param node: what :func:`constructor_settings` stored for one keyword
     :return: the value
-    :raises ValueError: for a class, a schedule or a noise that is not in the tables
+    :raises ValueError: for a class, a schedule or a noise that is not allowed
     """
     if isinstance(node, list):
         return [read_value(part) for part in node]
@@ -152,16 +140,28 @@ def read_value(node: Any) -> Any:
     return _read_object(kind, content)
 
 
+def find_class(name: str) -> type | None:
+    """
+    :param name: module and name of a class
+    :return: the class, if it is among the allowed ones and its module has been imported before; otherwise None
+    """
+    module, _, attribute = name.rpartition(".")
+    found = getattr(sys.modules.get(module), attribute, None) if module.partition(".")[0] in _PACKAGES else None
+    return found if isinstance(found, type) and issubclass(found, _KINDS) else None
+
+
 def _read_object(kind: str, content: Any) -> Any:
-    tables: dict[str, Mapping[str, Any]] = {"class": CLASSES, "schedule": _SCHEDULES, "noise": _NOISES}
-    table = tables[kind]
-    name = content if kind == "class" else content[0]
-    if not isinstance(name, str) or name not in table:
-        raise ValueError(f"the {kind} {name!r} is not one of {sorted(table)}: it is not loaded")
     if kind == "class":
-        return table[name]
-    if kind == "schedule":
-        return table[name][0](*map(float, content[1:]))
+        found = find_class(str(content))
+        if found is None:
+            raise ValueError(f"the class {content!r} is not one of those of {', '.join(_PACKAGES)}: it is not loaded")
+        return found
+    name, *values = content
+    table: Mapping[str, Any] = _SCHEDULES if kind == "schedule" else _NOISES
+    if name not in table:
+        raise ValueError(f"the {kind} {name!r} is not one of {sorted(table)}: it is not loaded")
     make, parameters = table[name]
-    values = {key: np.asarray(content[1][key], dtype=np.float64) for key in parameters}
-    return make(**{key: value if value.ndim else float(value) for key, value in values.items()})
+    if kind == "schedule":
+        return make(*map(float, values))
+    arrays = {key: np.asarray(values[0][key], dtype=np.float64) for key in parameters}
+    return make(**{key: array if array.ndim else float(array) for key, array in arrays.items()})

@@ -6,17 +6,15 @@ import importlib.metadata
 import inspect
 import random
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-from weakref import WeakKeyDictionary
 
 import numpy as np
 import safetensors.numpy
 import safetensors.torch
 import torch as th
-from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import CSVOutputFormat
@@ -53,38 +51,30 @@ _RECORDED_PACKAGES = ("sb3-actpc", "stable-baselines3", "torch", "gymnasium", "m
 
 
 @dataclass
-class Resumed:
-    """What can only be put back once ``learn`` has begun.
+class Restored:
+    """
+    An agent that a checkpoint was put back into, and what can only be put back once ``learn`` has begun.
 
+    :param model: the agent
     :param state: the checkpoint's plain values
     :param decoder: gives them back
     """
 
+    model: OffPolicyAlgorithm
     state: dict[str, Any]
     decoder: Decoder
-
-
-_RESUMED: WeakKeyDictionary[BaseAlgorithm, Resumed] = WeakKeyDictionary()
-
-
-def take_resumed(model: BaseAlgorithm) -> Resumed | None:
-    """What :func:`restore_model` left for the start of ``learn``, once; None where there is nothing."""
-    return _RESUMED.pop(model, None)
 
 
 # ------------------------------------------------------------------ writing
 
 
-def capture_model(
-    model: OffPolicyAlgorithm, callbacks: Sequence[BaseCallback], writer: BundleWriter, gradient_steps_left: int = 0
-) -> None:
+def capture_model(model: OffPolicyAlgorithm, callbacks: Sequence[BaseCallback], writer: BundleWriter) -> None:
     """
     Write everything that the rest of the training depends on.
 
-    :param model: the agent, between two steps of the environment
+    :param model: the agent, between two rollouts, or between two updates before the first
     :param callbacks: whose state is kept
     :param writer: takes the files
-    :param gradient_steps_left: updates that the interrupted ``train()`` had still to do
     :raises ValueError: when a weight is not finite
     :raises OSError: when the files cannot be written
     """
@@ -99,10 +89,9 @@ def capture_model(
         "noise": encoder.encode(model.action_noise, "noise"),
         "env": capture_vec_env(model.env, encoder, "env"),
         "buffer": _capture_buffer(model.replay_buffer, encoder, writer),
-        "own": encoder.encode(_own_state(model), "own"),
+        "own": encoder.encode(own_state(model), "own"),
         "callbacks": [[name, _capture_callback(callback, encoder, name)] for name, callback in named(callbacks)],
         "logger": _capture_logger(model, encoder),
-        "gradient_steps_left": gradient_steps_left,
     }
     tensors = {name: tensor.cpu().contiguous().clone() for name, tensor in encoder.tensors.items()}
     writer.add_bytes("tensors.safetensors", safetensors.torch.save(tensors))
@@ -191,10 +180,9 @@ def _noise_matrices(model: OffPolicyAlgorithm) -> Any:
     return getattr(getattr(model, "actor", None), "action_dist", None) if model.use_sde else None
 
 
-def _own_state(model: OffPolicyAlgorithm) -> Any:
-    """What an algorithm keeps beside SB3's, from its method ``checkpoint_state``; None without one."""
-    method: Callable[[], Any] | None = getattr(model, "checkpoint_state", None)
-    return None if method is None else method()
+def own_state(thing: Any) -> Any:
+    """What an agent, a buffer or a callback keeps beside SB3's, from its method ``checkpoint_state``; None without one."""
+    return thing.checkpoint_state() if hasattr(thing, "checkpoint_state") else None
 
 
 # ------------------------------------------------------------------ buffers
@@ -221,43 +209,34 @@ def buffer_arrays(buffer: ReplayBuffer) -> dict[str, np.ndarray]:
 
 
 def _capture_buffer(buffer: ReplayBuffer, encoder: Encoder, writer: BundleWriter) -> dict[str, Any]:
-    rows = stored_rows(buffer)
-    arrays = buffer_arrays(buffer)
-    files = {
-        name: writer.add_array(f"buffer_{index:02d}_{_file_name(name)}", array[:rows])
-        for index, (name, array) in enumerate(arrays.items())
-    }
-    own: Callable[[], Any] | None = getattr(buffer, "checkpoint_state", None)
+    rows, files = stored_rows(buffer), {}
+    for name, array in buffer_arrays(buffer).items():
+        files[name] = f"buffer_{len(files):02d}.npy"
+        writer.add_array(files[name], array[:rows])
     infos = buffer.infos[:rows].tolist() if isinstance(buffer, HerReplayBuffer) and buffer.copy_info_dict else None
     return {
         "rows": rows,
         "files": files,
         "cursors": {name: encoder.encode(vars(buffer)[name], name) for name in _BUFFER_CURSORS if name in vars(buffer)},
-        "own": encoder.encode(None if own is None else own(), "buffer"),
+        "own": encoder.encode(own_state(buffer), "buffer"),
         "infos": encoder.encode(infos, "infos"),
     }
 
 
-def _file_name(name: str) -> str:
-    return "".join(letter if letter.isalnum() else "_" for letter in name)
-
-
 def _restore_buffer(buffer: ReplayBuffer, record: dict[str, Any], bundle: Bundle, decoder: Decoder) -> None:
-    was_used = buffer.full or buffer.pos > 0
     rows = record["rows"]
+    was_used = buffer.full or buffer.pos > 0
     for name, array in buffer_arrays(buffer).items():
-        bundle.read_array_into(record["files"][name], array[:rows])
-        if was_used:
+        array[:rows] = bundle.read_array(record["files"][name])
+        if was_used:  # a new one's pages need not be touched
             array[rows:] = 0
     for name, node in record["cursors"].items():
         setattr(buffer, name, decoder.decode(node))
     own = decoder.decode(record["own"])
     if own is not None:
         buffer.restore_checkpoint_state(own)  # type: ignore[attr-defined]
-    infos = decoder.decode(record["infos"])
-    if infos is not None and isinstance(buffer, HerReplayBuffer):
-        for row, entries in enumerate(infos):
-            buffer.infos[row] = entries
+    for row, entries in enumerate(decoder.decode(record["infos"]) or []):
+        buffer.infos[row] = entries  # type: ignore[attr-defined]
 
 
 def _check_buffer(buffer: ReplayBuffer, record: dict[str, Any], bundle: Bundle) -> None:
@@ -265,19 +244,18 @@ def _check_buffer(buffer: ReplayBuffer, record: dict[str, Any], bundle: Bundle) 
     if arrays.keys() != record["files"].keys():
         raise ValueError(f"{bundle.path}: its replay buffer holds {sorted(record['files'])}, this one {sorted(arrays)}")
     for name, array in arrays.items():
-        shape, dtype = bundle.array_header(record["files"][name][0])
-        if (shape[1:], dtype) != (array.shape[1:], array.dtype):
+        stored = bundle.read_array(record["files"][name])
+        if (stored.shape[1:], stored.dtype) != (array.shape[1:], array.dtype):
             raise ValueError(
-                f"{bundle.path}: its replay buffer's {name} have shape {shape[1:]} and type {dtype}, this one's "
+                f"{bundle.path}: its replay buffer's {name} have shape {stored.shape[1:]} and type {stored.dtype}, this one's "
                 f"{array.shape[1:]} and {array.dtype}"
             )
 
 
 def _cut_running_episodes(buffer: ReplayBuffer) -> None:
     """The episodes begun will not be finished: as ``cut_running_episodes`` of this package's buffers does it."""
-    cut: Callable[[], None] | None = getattr(buffer, "cut_running_episodes", None)
-    if cut is not None:
-        cut()
+    if hasattr(buffer, "cut_running_episodes"):
+        buffer.cut_running_episodes()
     elif isinstance(buffer, HerReplayBuffer):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -293,9 +271,8 @@ def _cut_running_episodes(buffer: ReplayBuffer) -> None:
 
 
 def _capture_callback(callback: BaseCallback, encoder: Encoder, where: str) -> dict[str, Any]:
-    own: Callable[[], Any] | None = getattr(callback, "checkpoint_state", None)
-    if own is not None:
-        return {"own": encoder.encode(own(), where)}
+    if hasattr(callback, "checkpoint_state"):
+        return {"own": encoder.encode(own_state(callback), where)}
     attributes, envs = {}, {}
     chosen = inspect.signature(type(callback).__init__).parameters.keys() | _CALLBACK_SKIPPED
     for name, value in vars(callback).items():
@@ -321,7 +298,7 @@ def _restore_callback(callback: BaseCallback, record: dict[str, Any], decoder: D
         restore_vec_env(vars(callback)[name], env_record, decoder)
 
 
-def _csv_formats(model: BaseAlgorithm) -> list[CSVOutputFormat]:
+def _csv_formats(model: OffPolicyAlgorithm) -> list[CSVOutputFormat]:
     return [output for output in model.logger.output_formats if isinstance(output, CSVOutputFormat)]
 
 
@@ -360,15 +337,14 @@ def _restore_logger(model: OffPolicyAlgorithm, record: dict[str, Any], decoder: 
 # ------------------------------------------------------------------ reading
 
 
-def restore_model(model: OffPolicyAlgorithm, bundle: Bundle, report: Report) -> None:
+def restore_model(model: OffPolicyAlgorithm, bundle: Bundle, report: Report) -> Restored:
     """
     Put everything back into an agent that was made with the same settings. Nothing is changed when the two do not fit.
-
-    The rest is put back by :func:`restore_learning` once ``learn(..., reset_num_timesteps=False)`` has begun.
 
     :param model: the agent, with its environment
     :param bundle: a checkpoint that was verified
     :param report: given a line for each environment whose episode starts again
+    :return: the agent, and what :func:`restore_learning` puts back once ``learn(..., reset_num_timesteps=False)`` has begun
     :raises ValueError: when the checkpoint is of another algorithm, task, network or buffer
     """
     assert model.env is not None and model.replay_buffer is not None
@@ -391,20 +367,18 @@ def restore_model(model: OffPolicyAlgorithm, bundle: Bundle, report: Report) -> 
     _restore_random(model, state, decoder)
     if lost:
         _start_episodes_again(model, lost, report)
-    _RESUMED[model] = Resumed(state, decoder)
+    return Restored(model, state, decoder)
 
 
-def restore_learning(model: OffPolicyAlgorithm, callbacks: Sequence[BaseCallback], resumed: Resumed, report: Report) -> int:
+def restore_learning(restored: Restored, callbacks: Sequence[BaseCallback], report: Report) -> None:
     """
     Put back what the beginning of ``learn`` has changed or made: callbacks, logger, action noise, generators.
 
-    :param model: the agent, at the start of its first rollout
+    :param restored: an agent at the start of its first rollout
     :param callbacks: of this ``learn``
-    :param resumed: what :func:`take_resumed` returned
     :param report: given a line for each callback without a match
-    :return: updates that the interrupted ``train()`` had still to do
     """
-    state, decoder = resumed.state, resumed.decoder
+    model, state, decoder = restored.model, restored.state, restored.decoder
     present = dict(named(callbacks))
     for name, record in state["callbacks"]:
         if name in present:
@@ -418,7 +392,6 @@ def restore_learning(model: OffPolicyAlgorithm, callbacks: Sequence[BaseCallback
     for name, node in state["torch"]["noise"].items():
         setattr(matrices, name, decoder.decode(node).to(model.device))
     _restore_random(model, state, decoder)
-    return int(state["gradient_steps_left"])
 
 
 def _check_fit(mine: dict[str, Any], bundle: Bundle) -> None:

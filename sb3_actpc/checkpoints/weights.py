@@ -16,9 +16,9 @@ from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_actpc.checkpoints.bundle import Report, _warn, find_bundle
+from sb3_actpc.checkpoints.bundle import Report, find_bundle, warn
 from sb3_actpc.checkpoints.settings import constructor_settings, read_settings
-from sb3_actpc.checkpoints.state import check_weights, restore_model
+from sb3_actpc.checkpoints.state import Restored, check_weights, restore_model
 from sb3_actpc.utils.files import atomic_write
 
 SelfAlgorithm = TypeVar("SelfAlgorithm", bound=OffPolicyAlgorithm)
@@ -30,13 +30,13 @@ _NORMALIZER = "vec_normalize/"
 
 
 def load_checkpoint(
-    algorithm: type[SelfAlgorithm],
+    algorithm: type[OffPolicyAlgorithm],
     path: str | os.PathLike[str],
     env: GymEnv | str,
     device: th.device | str = "auto",
-    report: Report = _warn,
+    report: Report = warn,
     **overrides: Any,
-) -> SelfAlgorithm:
+) -> Restored:
     """
     Make an agent with the settings of a checkpoint and put everything back into it; no code is run from the file.
 
@@ -46,7 +46,7 @@ def load_checkpoint(
     :param device: where the agent lives
     :param report: given a line for each damaged checkpoint, and when episodes must start again
     :param overrides: constructor keywords: those that could not be stored by name, and what may differ (``verbose``, ...)
-    :return: the agent, for :func:`~sb3_actpc.checkpoints.continue_learning`
+    :return: the agent (``model``), for :func:`~sb3_actpc.checkpoints.continue_learning`
     :raises FileNotFoundError: when there is no checkpoint
     :raises ValueError: when it is damaged, does not fit or was written in another version of the format
     """
@@ -54,9 +54,7 @@ def load_checkpoint(
     if bundle.manifest["agent"]["algorithm"] != algorithm.__name__:
         raise ValueError(f"{bundle.path} is a checkpoint of {bundle.manifest['agent']['algorithm']}, not {algorithm.__name__}")
     keywords = read_settings(bundle.manifest["settings"], overrides)
-    model = algorithm(env=env, device=device, **keywords)
-    restore_model(model, bundle, report)
-    return model
+    return restore_model(algorithm(env=env, device=device, **keywords), bundle, report)
 
 
 def save_weights(model: OffPolicyAlgorithm, path: str | os.PathLike[str]) -> Path:

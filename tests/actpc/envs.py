@@ -1,7 +1,9 @@
-"""Tiny environments with known answers."""
+"""Tiny environments with known answers, and demonstrations for them."""
 
 import gymnasium as gym
 import numpy as np
+
+from sb3_actpc import Demonstrations
 
 
 class CountingEnv(gym.Env):
@@ -33,3 +35,19 @@ class CountingEnv(gym.Env):
         cut = self.cut[self.episode % len(self.cut)]
         reward = self.returns[self.episode % len(self.returns)] if over else 0.0
         return self._observation(), reward, over and not cut, over and cut, {}
+
+
+def demonstrations(n_episodes: int = 3, length: int = 20, env_id: str = "CountingEnv", seed: int = 0) -> Demonstrations:
+    """Made up: random observations, actions that are a function of them, a reward of 1 at each episode's end."""
+    rng = np.random.default_rng(seed)
+    n = n_episodes * length
+    observations = rng.normal(size=(n, 3))
+    return Demonstrations(
+        observations=observations,
+        actions=2 * np.tanh(observations[:, :2] - observations[:, 1:]),
+        next_observations=observations + 0.1 * rng.normal(size=(n, 3)),
+        rewards=(np.arange(n) % length == length - 1).astype(float),
+        terminations=np.zeros(n, dtype=bool),
+        episode_starts=np.arange(0, n, length),
+        env_id=env_id,
+    )

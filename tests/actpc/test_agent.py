@@ -14,8 +14,8 @@ from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
-from sb3_actpc import ActPC, Demonstrations
-from tests.actpc.envs import CountingEnv
+from sb3_actpc import ActPC
+from tests.actpc.envs import CountingEnv, demonstrations
 
 SMALL = {
     "policy_kwargs": {"net_arch": [16, 16]},
@@ -25,21 +25,6 @@ SMALL = {
     "seed": 0,
     "device": "cpu",
 }
-
-
-def demonstrations(n_episodes=3, length=20, env_id="CountingEnv", seed=0) -> Demonstrations:
-    rng = np.random.default_rng(seed)
-    n = n_episodes * length
-    observations = rng.normal(size=(n, 3))
-    return Demonstrations(
-        observations=observations,
-        actions=2 * np.tanh(observations[:, :2] - observations[:, 1:]),
-        next_observations=observations + 0.1 * rng.normal(size=(n, 3)),
-        rewards=(np.arange(n) % length == length - 1).astype(float),
-        terminations=np.zeros(n, dtype=bool),
-        episode_starts=np.arange(0, n, length),
-        env_id=env_id,
-    )
 
 
 def make(env=None, n_envs=1, **keywords) -> ActPC:

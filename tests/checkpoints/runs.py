@@ -6,16 +6,20 @@ import csv
 import multiprocessing
 import shutil
 from collections.abc import Callable
+from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.save_util import recursive_getattr
+from stable_baselines3.common.vec_env import VecNormalize
 
+from sb3_actpc import ActPC
 from sb3_actpc.checkpoints import CheckpointCallback, TrainingStopped, continue_learning, restore
 from sb3_actpc.checkpoints.state import buffer_arrays
 
@@ -23,6 +27,15 @@ WALL_TIME = {"time/fps", "time/time_elapsed", "seconds", "evaluation_seconds"}
 # a forked process has imported everything already
 START_METHOD = "fork" if "fork" in multiprocessing.get_all_start_methods() else "spawn"
 MakeModel = Callable[[], OffPolicyAlgorithm]
+SMALL: dict[str, Any] = {"policy_kwargs": {"net_arch": [16, 16]}, "learning_starts": 10, "batch_size": 16, "seed": 3}
+ACTPC: dict[str, Any] = {**SMALL, "settling": "scheduled", "prior_updates": 5, "buffer_size": 200, "device": "cpu"}
+
+
+def make_actpc(env: Any, n_envs: int = 1, normalize: bool = False, **keywords: Any) -> ActPC:
+    vec_env: Any = make_vec_env(env, n_envs=n_envs)
+    if normalize:
+        vec_env = VecNormalize(vec_env, gamma=0.9)
+    return ActPC(keywords.pop("policy", "MlpPolicy"), vec_env, **deepcopy({**ACTPC, **keywords}))
 
 
 class StopAt(BaseCallback):
@@ -40,19 +53,6 @@ class StopAt(BaseCallback):
         return True
 
 
-class StopInUpdate(CheckpointCallback):
-    """Pretends that SIGTERM came in an update of the first ``train()`` after a step."""
-
-    def __init__(self, folder: Path, step: int, update: int, **options: Any) -> None:
-        super().__init__(folder, **options)
-        self.step, self.update = step, update
-
-    def _on_sample(self) -> None:
-        if self.num_timesteps >= self.step and self._samples == self.update:
-            self.signals.received = "SIGTERM"
-        super()._on_sample()
-
-
 def learn_straight(make: MakeModel, folder: Path, n_steps: int, *more: BaseCallback) -> OffPolicyAlgorithm:
     """The run that is never stopped, and never saved either."""
     model = make()
@@ -66,19 +66,14 @@ def learn_in_two(
     n_steps: int,
     stop_at: int,
     more: Callable[[], list[BaseCallback]] = list,
-    stop_in_update: int | None = None,
     **options: Any,
 ) -> OffPolicyAlgorithm:
     """The run that is stopped at a step and resumed by a new agent."""
     first = make()
     first.set_logger(configure(str(folder), ["csv"]))
-    if stop_in_update is None:
-        checkpoints = CheckpointCallback(folder / "checkpoints", **options)
-        callbacks = [*more(), StopAt(stop_at, checkpoints), checkpoints]
-    else:
-        callbacks = [*more(), StopInUpdate(folder / "checkpoints", stop_at, stop_in_update, **options)]
+    checkpoints = CheckpointCallback(folder / "checkpoints", **options)
     try:
-        first.learn(n_steps, callback=callbacks, log_interval=1)
+        first.learn(n_steps, callback=[*more(), StopAt(stop_at, checkpoints), checkpoints], log_interval=1)
     except TrainingStopped as stopped:
         assert stopped.num_timesteps >= stop_at
     else:
@@ -89,9 +84,8 @@ def learn_in_two(
     th.randn(7)
     second.action_space.sample()
     second.set_logger(configure(str(folder), ["csv"]))
-    restore(second, folder / "checkpoints")
-    checkpoints = CheckpointCallback(folder / "checkpoints", **options)
-    return continue_learning(second, [*more(), checkpoints], log_interval=1)
+    restored = restore(second, folder / "checkpoints")
+    return continue_learning(restored, [*more(), CheckpointCallback(folder / "checkpoints", **options)], log_interval=1)
 
 
 def assert_same(one: OffPolicyAlgorithm, other: OffPolicyAlgorithm) -> None:

@@ -25,9 +25,8 @@ from sb3_actpc import ActPC
 from sb3_actpc.actpc.policies import CIRCUIT_KEYWORDS, ActPCPolicy
 from sb3_actpc.cli import main
 from sb3_actpc.demonstrations.dataset import Demonstrations
-from tests.actpc.envs import CountingEnv
-from tests.actpc.test_agent import demonstrations
-from tests.checkpoints.test_exact_resume import ACTPC
+from tests.actpc.envs import CountingEnv, demonstrations
+from tests.checkpoints.runs import ACTPC
 
 HUGE = 10**30
 # these mean "go on for so long" or "from so late on": nothing is wrong with a large one

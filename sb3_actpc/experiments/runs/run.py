@@ -18,7 +18,7 @@ from stable_baselines3.common.noise import ActionNoise, NormalActionNoise, Ornst
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_actpc.checkpoints import CheckpointCallback, list_bundles, restore
+from sb3_actpc.checkpoints import CheckpointCallback, Restored, list_bundles, restore
 from sb3_actpc.demonstrations.dataset import Demonstrations
 from sb3_actpc.experiments.runs.config import RunConfig, RunPlan, load_algorithm, parse_schedule, resolve_run
 from sb3_actpc.experiments.runs.environments import check_env_id, make_eval_envs, make_train_env
@@ -211,9 +211,10 @@ def _train(
     model = build_model(plan, config, train_env)
     folder = run_folder(config) if resumed is None else resumed
     has_checkpoint = resumed is not None and bool(list_bundles(folder / CHECKPOINTS))
+    restored = None
     if has_checkpoint:  # before any file of the run is touched
         assert isinstance(model, OffPolicyAlgorithm)
-        restore(model, folder / CHECKPOINTS, report)
+        restored = restore(model, folder / CHECKPOINTS, report)
     folder.mkdir(parents=True, exist_ok=True)
     if resumed is None:
         write_config(folder, config, plan, reference)
@@ -227,7 +228,7 @@ def _train(
     if not has_checkpoint:
         episodes.begin()
         evaluation.begin(model)
-    callbacks = [*_checkpoints(folder, plan, report), evaluation, episodes, *more]
+    callbacks = [*_checkpoints(folder, plan, report, restored), evaluation, episodes, *more]
     try:
         _learn(model, plan.n_timesteps, callbacks, config.progress, goes_on=has_checkpoint)
     finally:
@@ -245,11 +246,14 @@ def close_model(model: Any) -> None:
     getattr(model, "close", lambda: None)()
 
 
-def _checkpoints(folder: Path, plan: RunPlan, report: Callable[[str], None]) -> list[BaseCallback]:
+def _checkpoints(
+    folder: Path, plan: RunPlan, report: Callable[[str], None], restored: Restored | None
+) -> list[BaseCallback]:
     """The one that saves checkpoints, where they are wanted."""
     if not plan.checkpoint_freq:
         return []
-    return [CheckpointCallback(folder / CHECKPOINTS, plan.checkpoint_freq, at_end=False, report=report)]
+    options: dict[str, Any] = {"at_end": False, "report": report, "restored": restored}
+    return [CheckpointCallback(folder / CHECKPOINTS, plan.checkpoint_freq, **options)]
 
 
 def _learn(model: BaseAlgorithm, n_timesteps: int, callbacks: list[BaseCallback], progress: bool, goes_on: bool) -> None:
