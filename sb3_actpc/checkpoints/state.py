@@ -209,7 +209,8 @@ def buffer_arrays(buffer: ReplayBuffer) -> dict[str, np.ndarray]:
 
 
 def _capture_buffer(buffer: ReplayBuffer, encoder: Encoder, writer: BundleWriter) -> dict[str, Any]:
-    rows, files = stored_rows(buffer), {}
+    rows = stored_rows(buffer)
+    files: dict[str, str] = {}
     for name, array in buffer_arrays(buffer).items():
         files[name] = f"buffer_{len(files):02d}.npy"
         writer.add_array(files[name], array[:rows])
