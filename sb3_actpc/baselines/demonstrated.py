@@ -1,10 +1,11 @@
-"""What the off-policy baselines share: demonstrations in every batch."""
+"""What baselines share: demonstrations that fit the task, and, off policy, a share of them in every batch."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
 
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv
@@ -15,10 +16,32 @@ from sb3_actpc.baselines.demonstration_buffers import (
     WithDemonstrations,
     demonstration_buffer_class,
 )
-from sb3_actpc.demonstrations import Demonstrations, fit_demonstrations
+from sb3_actpc.demonstrations import Demonstrations, findable, fit_demonstrations
 
 
-class DemonstratedAlgorithm(OffPolicyAlgorithm):
+class LearnsFromDemonstrations(BaseAlgorithm):
+    """The demonstrations of an algorithm: what the user asked for, and what of it fits the environment."""
+
+    demonstrations: Demonstrations | str | Path | None
+    n_demonstrations: int | None
+    n_demonstration_transitions: int | None
+
+    def _set_demonstrations(
+        self,
+        demonstrations: Demonstrations | str | Path | None,
+        n_demonstrations: int | None,
+        n_demonstration_transitions: int | None,
+    ) -> None:
+        self.demonstrations = None if demonstrations is None else findable(demonstrations)
+        self.n_demonstrations, self.n_demonstration_transitions = n_demonstrations, n_demonstration_transitions
+
+    def _fitted_demonstrations(self) -> Demonstrations:
+        assert self.demonstrations is not None
+        limits = self.n_demonstrations, self.n_demonstration_transitions
+        return fit_demonstrations(self.demonstrations, self.env, self.observation_space, self.action_space, *limits)
+
+
+class DemonstratedAlgorithm(LearnsFromDemonstrations, OffPolicyAlgorithm):
     """
     An off-policy algorithm whose replay buffer is one of :mod:`sb3_actpc.baselines.demonstration_buffers`.
 
@@ -26,22 +49,7 @@ class DemonstratedAlgorithm(OffPolicyAlgorithm):
     demonstrations; :meth:`set_env` makes the whole buffer.
     """
 
-    demonstrations: Demonstrations | Path | None
-    n_demonstrations: int | None
-    n_demonstration_transitions: int | None
     demonstration_fraction: float
-
-    def _set_demonstrations(
-        self,
-        demonstrations: Demonstrations | str | Path | None,
-        n_demonstrations: int | None,
-        n_demonstration_transitions: int | None,
-        demonstration_fraction: float,
-    ) -> None:
-        # a path is kept absolute, so that the saved agent finds its demonstrations from any folder
-        self.demonstrations = Path(demonstrations).absolute() if isinstance(demonstrations, (str, Path)) else demonstrations
-        self.n_demonstrations, self.n_demonstration_transitions = n_demonstrations, n_demonstration_transitions
-        self.demonstration_fraction = demonstration_fraction
 
     def _setup_model(self) -> None:
         asked = self.replay_buffer_class
@@ -76,17 +84,6 @@ class DemonstratedAlgorithm(OffPolicyAlgorithm):
             demonstrations=demonstrations,
             demonstration_fraction=self.demonstration_fraction,
             **kwargs,
-        )
-
-    def _fitted_demonstrations(self) -> Demonstrations:
-        assert self.demonstrations is not None
-        return fit_demonstrations(
-            self.demonstrations,
-            self.env,
-            self.observation_space,
-            self.action_space,
-            self.n_demonstrations,
-            self.n_demonstration_transitions,
         )
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:

@@ -19,7 +19,7 @@ from stable_baselines3.common.torch_layers import create_mlp
 from stable_baselines3.common.type_aliases import GymEnv
 from torch import nn
 
-from sb3_actpc.demonstrations import fit_demonstrations
+from sb3_actpc.baselines.demonstrated import LearnsFromDemonstrations
 from sb3_actpc.demonstrations.dataset import Demonstrations
 from sb3_actpc.utils.checks import check_kinds, check_range
 
@@ -44,7 +44,7 @@ class Guidance(NamedTuple):
     returns: th.Tensor
 
 
-class LOGO(TRPO):
+class LOGO(LearnsFromDemonstrations, TRPO):
     """
     Learning online with guidance offline (Rengarajan et al., arXiv 2202.04628), on sb3-contrib's TRPO.
 
@@ -119,9 +119,7 @@ class LOGO(TRPO):
             _init_setup_model=False,
             **options,
         )
-        # a path is kept absolute, so that the saved agent finds its demonstrations from any folder
-        self.demonstrations = Path(demonstrations).absolute() if isinstance(demonstrations, (str, Path)) else demonstrations
-        self.n_demonstrations, self.n_demonstration_transitions = n_demonstrations, n_demonstration_transitions
+        self._set_demonstrations(demonstrations, n_demonstrations, n_demonstration_transitions)
         self.guidance_delta, self.guidance_iterations = guidance_delta, guidance_iterations
         self.guidance_decay, self.guidance_delta_min = guidance_decay, guidance_delta_min
         self.discriminator_learning_rate, self.discriminator_updates = discriminator_learning_rate, discriminator_updates
@@ -151,9 +149,7 @@ class LOGO(TRPO):
             self._load_demonstrations()
 
     def _load_demonstrations(self) -> None:
-        assert self.demonstrations is not None
-        limits = self.n_demonstrations, self.n_demonstration_transitions
-        shown = fit_demonstrations(self.demonstrations, self.env, self.observation_space, self.action_space, *limits)
+        shown = self._fitted_demonstrations()
         self._shown = th.as_tensor(np.concatenate([shown.observations, shown.actions], axis=1), device=self.device)
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:

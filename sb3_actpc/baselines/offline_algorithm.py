@@ -9,19 +9,18 @@ from typing import Any, ClassVar, TypeVar
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 
-from sb3_actpc.demonstrations import fit_demonstrations
+from sb3_actpc.baselines.demonstrated import LearnsFromDemonstrations
 from sb3_actpc.demonstrations.dataset import Demonstrations
 from sb3_actpc.utils.checks import check_kinds, check_range
 
 SelfOffline = TypeVar("SelfOffline", bound="OfflineAlgorithm")
 
 
-class OfflineAlgorithm(BaseAlgorithm):
+class OfflineAlgorithm(LearnsFromDemonstrations):
     """
     An algorithm that learns from demonstrations alone.
 
@@ -81,9 +80,7 @@ class OfflineAlgorithm(BaseAlgorithm):
             support_multi_env=True,
             supported_action_spaces=(spaces.Box,),
         )
-        # a path is kept absolute, so that the saved agent finds its demonstrations from any folder
-        self.demonstrations = Path(demonstrations).absolute() if isinstance(demonstrations, (str, Path)) else demonstrations
-        self.n_demonstrations, self.n_demonstration_transitions = n_demonstrations, n_demonstration_transitions
+        self._set_demonstrations(demonstrations, n_demonstrations, n_demonstration_transitions)
         self.batch_size = batch_size
         if _init_setup_model:
             self._setup_model()
@@ -110,8 +107,7 @@ class OfflineAlgorithm(BaseAlgorithm):
             raise ValueError(f"demonstrations=None: {type(self).__name__} learns from nothing else, pass a file")
         if self.get_vec_normalize_env() is not None:
             raise ValueError(f"{type(self).__name__} normalises observations itself: leave VecNormalize out")
-        limits = self.n_demonstrations, self.n_demonstration_transitions
-        self._take(fit_demonstrations(self.demonstrations, self.env, self.observation_space, self.action_space, *limits))
+        self._take(self._fitted_demonstrations())
         self._is_shown = True
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:

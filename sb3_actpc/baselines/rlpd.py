@@ -140,6 +140,7 @@ class RLPD(DemonstratedAlgorithm, SAC):
             _init_setup_model=False,
             **options,
         )
-        self._set_demonstrations(demonstrations, n_demonstrations, n_demonstration_transitions, demonstration_fraction)
+        self._set_demonstrations(demonstrations, n_demonstrations, n_demonstration_transitions)
+        self.demonstration_fraction = demonstration_fraction
         if _init_setup_model:
             self._setup_model()

@@ -60,7 +60,8 @@ class TD3Demo(DemonstratedAlgorithm, TD3):
         check_kinds(locals(), mappings="actor_kwargs critic_kwargs")
         check_range(locals(), "demonstration_fraction", 0, 1)
         super().__init__(policy, env, _init_setup_model=False, **options)  # type: ignore[arg-type]
-        self._set_demonstrations(demonstrations, n_demonstrations, n_demonstration_transitions, demonstration_fraction)
+        self._set_demonstrations(demonstrations, n_demonstrations, n_demonstration_transitions)
+        self.demonstration_fraction = demonstration_fraction
         self.actor_kwargs, self.critic_kwargs = actor_kwargs, critic_kwargs
         if _init_setup_model:
             self._setup_model()

@@ -153,8 +153,8 @@ class Decoder:
         if isinstance(node, list):
             old = existing if isinstance(existing, list) else []
             return [self.decode(part, old[index] if index < len(old) else None) for index, part in enumerate(node)]
-        kind = next(iter(node), None)
-        method = getattr(self, f"_{kind}", None)
+        kind = str(next(iter(node), ""))
+        method = getattr(self, f"_{kind}", None) if not kind.startswith("_") else None
         if method is None:
             raise ValueError(f"a value of the unknown kind {kind!r} is stored: the file was written by another version")
         return method(node, existing)
@@ -236,8 +236,7 @@ class Decoder:
         if type(existing).__qualname__ != node["object"]:
             found = type(existing).__qualname__
             raise ValueError(f"expected a {node['object']}, found a {found}: make it as it was made before")
-        for name, value in self.decode(node["attributes"], vars(existing)).items():
-            setattr(existing, name, value)
+        vars(existing).update(self.decode(node["attributes"], vars(existing)))
         return existing
 
 

@@ -12,11 +12,10 @@ import safetensors
 import safetensors.torch
 import torch as th
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.type_aliases import GymEnv
-from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_actpc.checkpoints.bundle import Report, find_bundle, warn
+from sb3_actpc.checkpoints.encoding import Decoder, Encoder
 from sb3_actpc.checkpoints.settings import constructor_settings, read_settings
 from sb3_actpc.checkpoints.state import Restored, check_weights, restore_model
 from sb3_actpc.utils.files import atomic_write
@@ -24,9 +23,8 @@ from sb3_actpc.utils.files import atomic_write
 SelfAlgorithm = TypeVar("SelfAlgorithm", bound=OffPolicyAlgorithm)
 
 FORMAT = "sb3_actpc weights"
-VERSION = 1
+VERSION = 2
 _SUFFIX = ".safetensors"
-_NORMALIZER = "vec_normalize/"
 
 
 def load_checkpoint(
@@ -77,6 +75,7 @@ def save_weights(model: OffPolicyAlgorithm, path: str | os.PathLike[str]) -> Pat
         raise ValueError(f"{what} cannot be written by name: only classes of torch, SB3 and sb3_actpc can; use save() instead")
     settings["unnamed"] = []
     settings["keywords"].pop("demonstrations", None)
+    encoder = Encoder()
     header = {
         "format": FORMAT,
         "version": VERSION,
@@ -84,9 +83,10 @@ def save_weights(model: OffPolicyAlgorithm, path: str | os.PathLike[str]) -> Pat
         "observation_space": str(model.observation_space),
         "action_space": str(model.action_space),
         "settings": settings,
+        "normalizers": encoder.encode(_normalizers(model), "normalizers"),
     }
     tensors = {name: tensor.detach().cpu().contiguous().clone() for name, tensor in model.policy.state_dict().items()}
-    tensors.update(_normalizer_tensors(model.get_vec_normalize_env()))
+    tensors |= {name: th.as_tensor(np.array(array)) for name, array in encoder.arrays.items()}
     path = Path(path)
     path = path if path.suffix == _SUFFIX else path.with_name(path.name + _SUFFIX)
     with atomic_write(path) as file:
@@ -127,9 +127,14 @@ def load_weights(
     for name in ("observation_space", "action_space"):
         if str(getattr(model, name)) != header[name]:
             raise ValueError(f"{path} was trained with {name}={header[name]}, the environment has {getattr(model, name)}")
-    _restore_normalizer(model.get_vec_normalize_env(), tensors, path)
+    stored, present = header["normalizers"], _normalizers(model)
+    if [one is None for one in stored] != [one is None for one in present]:
+        saved = "with" if stored else "without"
+        raise ValueError(f"{path} was saved {saved} VecNormalize's statistics: wrap the environment as it was in training")
+    arrays = {name: tensors.pop(name).numpy() for name in list(tensors) if name.startswith("normalizers.")}
+    Decoder(arrays, {}).decode(stored, present)
     try:
-        model.policy.load_state_dict({name: value for name, value in tensors.items() if not name.startswith(_NORMALIZER)})
+        model.policy.load_state_dict(tensors)
     except RuntimeError as error:
         raise ValueError(f"{path} does not fit its own settings: {' '.join(str(error).split())}") from error
     return model
@@ -147,41 +152,15 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, th.Tensor]]:
         raise ValueError(f"{path}: not a file of save_weights ({' '.join(str(error).split())})") from error
     if not isinstance(header, dict) or header.get("format") != FORMAT:
         raise ValueError(f"{path}: not a file of save_weights")
-    if header["version"] > VERSION:
+    if header["version"] != VERSION:
         raise ValueError(
-            f"{path} has format version {header['version']}, this sb3_actpc reads up to {VERSION}: install a newer one"
+            f"{path} has format version {header['version']}, this sb3_actpc reads {VERSION}: load it with the version that "
+            "wrote it"
         )
     return header, tensors
 
 
-def _normalizer_statistics(env: VecNormalize) -> dict[str, RunningMeanStd]:
-    """Name -> statistics, of the observations (or each of their keys) and of the returns."""
-    named: dict[str, RunningMeanStd] = {"returns": env.ret_rms}
-    if env.norm_obs and isinstance(env.obs_rms, dict):
-        named.update({f"observations.{key}": value for key, value in env.obs_rms.items()})
-    elif env.norm_obs:
-        named["observations"] = env.obs_rms
-    return named
-
-
-def _normalizer_tensors(env: VecNormalize | None) -> dict[str, th.Tensor]:
-    if env is None:
-        return {}
-    return {
-        f"{_NORMALIZER}{name}/{part}": th.as_tensor(np.array(getattr(statistics, part), dtype=np.float64))
-        for name, statistics in _normalizer_statistics(env).items()
-        for part in ("mean", "var", "count")
-    }
-
-
-def _restore_normalizer(env: VecNormalize | None, tensors: dict[str, th.Tensor], path: Path) -> None:
-    stored = {name.removeprefix(_NORMALIZER) for name in tensors if name.startswith(_NORMALIZER)}
-    present = {} if env is None else _normalizer_statistics(env)
-    if stored != {f"{name}/{part}" for name in present for part in ("mean", "var", "count")}:
-        wanted = "wrap the environment in VecNormalize" if env is None else "wrap the environment as it was in training"
-        raise ValueError(
-            f"{path} holds the VecNormalize statistics {sorted(stored)}, the environment {sorted(present)}: {wanted}"
-        )
-    for name, statistics in present.items():
-        values = {part: tensors[f"{_NORMALIZER}{name}/{part}"].numpy() for part in ("mean", "var", "count")}
-        statistics.mean, statistics.var, statistics.count = values["mean"], values["var"], float(values["count"])
+def _normalizers(model: OffPolicyAlgorithm) -> list[Any]:
+    """VecNormalize's running statistics of observations (None where it leaves them alone) and returns; empty without one."""
+    env = model.get_vec_normalize_env()
+    return [] if env is None else [env.obs_rms if env.norm_obs else None, env.ret_rms]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import re
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -38,6 +39,15 @@ def resolve(
     if isinstance(source, (str, os.PathLike)):
         return Demonstrations.load(source)
     raise ValueError(f"demonstrations must be a file path, a Minari id or a Demonstrations object, found {source!r}")
+
+
+def findable(source: str | os.PathLike[str] | Demonstrations) -> str | Path | Demonstrations:
+    """
+    :param source: as :func:`resolve`'s
+    :return: the same, a path made absolute, so that a saved agent finds its demonstrations from any folder
+    """
+    is_id = isinstance(source, str) and MINARI_ID.fullmatch(source) and not os.path.exists(source)
+    return source if is_id or isinstance(source, Demonstrations) else Path(source).absolute()
 
 
 def fit_demonstrations(

@@ -14,7 +14,7 @@ from sb3_actpc.envs import ROBOSUITE_IDS
 from sb3_actpc.experiments.runs import RunConfig, train_run
 from sb3_actpc.experiments.runs.environments import make_train_env
 from tests.checkpoints.runs import assert_same, learn_in_two, learn_straight
-from tests.demonstrations.test_robosuite_demonstrations import made_up
+from tests.demonstrations.made_up import made_up
 
 pytest.importorskip("robosuite", reason="robosuite is an extra")
 

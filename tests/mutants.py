@@ -1,0 +1,567 @@
+"""Plant one-line mistakes, one at a time, and see that the tests which are about them fail.
+
+    python tests/mutants.py               # all of them, two at a time
+    python tests/mutants.py discount      # those whose name contains a text
+
+Each mutant is planted in a copy of the package, where the named tests then run. It is killed when a test fails; one that lives
+shows a claim that no test makes. Exit code 1 when one lives, when its tests did not run, or when the line that it changes is
+not there exactly once (which the normal tests check too).
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shlex
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import NamedTuple
+
+ROOT = Path(__file__).resolve().parents[1]
+COPIED = ("sb3_actpc", "tests", "hyperparams", "benchmarks", "examples", "pyproject.toml")
+TESTS_FAILED = 1  # pytest's exit code
+TIMEOUT = 600  # seconds: a mutant may make something endless, which counts as a failed test
+
+
+class Mutant(NamedTuple):
+    """
+    :param name: what is wrong then
+    :param file: of the package
+    :param old: text that occurs exactly once in it
+    :param new: what takes its place
+    :param tests: pytest's arguments: the tests that must kill it
+    """
+
+    name: str
+    file: str
+    old: str
+    new: str
+    tests: str
+
+
+CIRCUIT, DYNAMICS, PLASTICITY = "ngc/circuit.py", "ngc/dynamics.py", "ngc/plasticity.py"
+AGENT, POLICIES, FEATURES = (f"actpc/{name}.py" for name in ("actpc", "policies", "features"))
+SIGNALS, SHOWN = "actpc/reward_signals.py", "actpc/demonstration_replay.py"
+BUFFERS, IMITATION = "actpc/buffers.py", "actpc/self_imitation.py"
+LEARNS, STORES = "tests/actpc/test_agent.py", "tests/actpc/test_buffers.py"
+COUPLED, SPARSE = "ngc/coupled.py", "envs/sparse_mujoco.py"
+STATISTICS, R_STABILITY = "experiments/report/statistics.py", "experiments/report/r_stability.py"
+SETTLING, LEARNING, SCHEDULED = (f"tests/ngc/test_{name}.py" for name in ("settling", "plasticity", "scheduled"))
+TASKS = "tests/envs/test_sparse_mujoco.py"
+SCORES, STABLE = (f"tests/experiments/report/test_{name}.py" for name in ("statistics", "r_stability"))
+
+MUTANTS = [
+    # ------------------------------------------------------------------ circuits
+    Mutant("changes are subtracted", CIRCUIT, "th._foreach_neg(changes.tensors())", "changes.tensors()", LEARNING),
+    Mutant(
+        "error synapses change in the other direction",
+        CIRCUIT,
+        "parameter.grad = weights.grad[:, weights",
+        "parameter.grad = -weights.grad[:, weights",
+        f"{LEARNING} -k align",
+    ),
+    Mutant("error synapses learn at the weights' rate", CIRCUIT, "scale = self.feedback_rate", "scale = 1.0", LEARNING),
+    Mutant("biases decay", CIRCUIT, "if parameter.dim() > 1]", "if parameter.dim() > 0]", f"{LEARNING} -k decay"),
+    Mutant("late errors count less", CIRCUIT, "else e / share for", "else e * share for", f"{SETTLING} -k arriv"),
+    Mutant(
+        "one step of settling too many",
+        CIRCUIT,
+        "range(self.n_settling_steps if self.n_hidden else 0)",
+        "range(self.n_settling_steps + 1 if self.n_hidden else 0)",
+        f"{SETTLING} -k 'one_step or arriv'",
+    ),
+    Mutant(
+        "projection without the last bias",
+        CIRCUIT,
+        "output = predict(x, self.synapses.weights[-1], biases[-1])",
+        "output = predict(x, self.synapses.weights[-1], 0 * biases[-1])",
+        f"{SETTLING} -k project",
+    ),
+    Mutant(
+        "changes are sums over the batch", PLASTICITY, "inverse_batch = 1.0 / len(errors[0])", "inverse_batch = 1.0", SETTLING
+    ),
+    Mutant(
+        "the memory's weight is left out of its change",
+        PLASTICITY,
+        "[memory_weight * (error.t() @ memory)",
+        "[(error.t() @ memory)",
+        f"{SETTLING} {SCHEDULED} {LEARNING} -k 'hebbian or backprop or memory'",
+    ),
+    Mutant(
+        "columns are stretched to the bound",
+        PLASTICITY,
+        "norms.clamp_min(bound)",
+        "norms",
+        f"{LEARNING} -k column_norm",
+    ),
+    Mutant(
+        "steps near the soft bound are not shortened",
+        PLASTICITY,
+        "step.mul_((1.0 - old.abs() / bound).clamp_(0.0, 1.0))",
+        "step.mul_(1.0)",
+        f"{LEARNING} -k soft_bound",
+    ),
+    Mutant(
+        "the output's error has the other sign",
+        DYNAMICS,
+        "th.sub(self.target, self.output",
+        "th.sub(self.output, self.target",
+        SETTLING,
+    ),
+    Mutant(
+        "the leak pushes away from rest",
+        DYNAMICS,
+        "signal.sub_(self.latents[layer], alpha=settings.leak)",
+        "signal.add_(self.latents[layer], alpha=settings.leak)",
+        f"{SETTLING} -k 'one_step or rest'",
+    ),
+    Mutant(
+        "no derivative on the way back",
+        DYNAMICS,
+        "if exact or not settings.derivative_free:",
+        "if exact:",
+        f"{SETTLING} -k 'one_step or derivative'",
+    ),
+    Mutant(
+        "errors of the state dynamics have the other sign of the prediction",
+        DYNAMICS,
+        "self.synapses.weights[layer - 1].t(), alpha=-1.0)",
+        "self.synapses.weights[layer - 1].t())",
+        SETTLING,
+    ),
+    Mutant(
+        "the sweep goes from the input up",
+        DYNAMICS,
+        "in range(self.n_hidden, 0, -1):",
+        "in range(1, self.n_hidden + 1):",
+        SCHEDULED,
+    ),
+    Mutant("energy without the half", DYNAMICS, "return 0.5 * th.stack", "return 1.0 * th.stack", SETTLING),
+    Mutant(
+        "the critic pushes the actor down",
+        COUPLED,
+        "scale / value.output.shape[1]",
+        "-scale / value.output.shape[1]",
+        SCHEDULED,
+    ),
+    Mutant(
+        "the pair ignores the nudge",
+        COUPLED,
+        '== "scheduled" else nudge',
+        '== "scheduled" else 1.0',
+        f"{SCHEDULED} -k coupled",
+    ),
+    Mutant("the nudge is not divided out", COUPLED, "error.div_(scale)", "error.div_(1.0)", f"{SCHEDULED} -k coupled"),
+    Mutant(
+        "the memory's projection is transposed",
+        "ngc/memory.py",
+        "self.projection.t()",
+        "self.projection",
+        "tests/ngc/test_memory.py",
+    ),
+    Mutant(
+        "rates beyond the stable range",
+        "ngc/stability.py",
+        "SAFETY * error_dynamics_limit(",
+        "2 * error_dynamics_limit(",
+        LEARNING,
+    ),
+    # ------------------------------------------------------------------ agent
+    Mutant(
+        "the bootstrap is discounted twice",
+        AGENT,
+        "* batch.discounts * values",
+        "* batch.discounts**2 * values",
+        f"{LEARNS} -k critic_target",
+    ),
+    Mutant("terminal steps bootstrap", AGENT, "(1.0 - batch.dones) * batch", "batch", f"{LEARNS} -k critic_target"),
+    Mutant("the largest of the critics bootstraps", AGENT, "reduce(th.minimum", "reduce(th.maximum", f"{LEARNS} -k smallest"),
+    Mutant(
+        "the epistemic signal is a punishment",
+        AGENT,
+        "epistemic = self.epistemic_normalizer(",
+        "epistemic = -self.epistemic_normalizer(",
+        f"{LEARNS} -k 'signals or part'",
+    ),
+    Mutant(
+        "the instrumental signal is a reward",
+        AGENT,
+        "= -self.instrumental_normalizer(",
+        "= self.instrumental_normalizer(",
+        f"{LEARNS} -k 'signals or part'",
+    ),
+    Mutant(
+        "the target actor never moves",
+        AGENT,
+        "zip([self.actor_target, *self.critic_target], [self.actor.circuit, *self.critic], strict",
+        "zip(self.critic_target, self.critic, strict",
+        f"{LEARNS} -k target",
+    ),
+    Mutant(
+        "hard copies every 2C",
+        AGENT,
+        "now // interval > (now - self.n_envs) // interval",
+        "now // (2 * interval) > (now - self.n_envs) // (2 * interval)",
+        f"{LEARNS} -k target",
+    ),
+    Mutant(
+        "refresh never draws the agent's own episodes",
+        AGENT,
+        "else [self.expert.episodes, *own]",
+        "else [self.expert.episodes]",
+        f"{LEARNS} -k 'refresh or own or imitat'",
+    ),
+    Mutant(
+        "the generator learns o_t",
+        AGENT,
+        "batch.next_features[rows], None if batch.memory",
+        "batch.features[rows], None if batch.memory",
+        f"{LEARNS} -k 'generator or one_step'",
+    ),
+    Mutant(
+        "the prior learns o_t",
+        AGENT,
+        "self.prior.settle(batch.features, batch.next_features",
+        "self.prior.settle(batch.features, batch.features",
+        f"{LEARNS} -k prior",
+    ),
+    Mutant(
+        "the prior goes on learning",
+        AGENT,
+        "        self.pretrained = True",
+        "        self.pretrained = False",
+        f"{LEARNS} -k prior",
+    ),
+    Mutant("the agent ignores the nudge", AGENT, "memory, self.nudge)", "memory)", f"{LEARNS} -k nudge"),
+    Mutant(
+        "pressure from the first update on",
+        AGENT,
+        "self._n_updates > self.critic_warmup",
+        "self._n_updates > 0",
+        f"{LEARNS} -k warmup",
+    ),
+    Mutant(
+        "the weight of refresh is ignored", AGENT, "changes.scale_(self.refresh_weight)", "changes", f"{LEARNS} -k refresh"
+    ),
+    Mutant(
+        "the weight of the pressure is ignored",
+        AGENT,
+        "| th.Tensor = self.actor_pressure",
+        "| th.Tensor = 1.0",
+        f"{LEARNS} -k 'refresh or pressure'",
+    ),
+    Mutant(
+        "the noise on the target's action is not bounded",
+        AGENT,
+        "noise.clamp(-self.target_noise_clip, self.target_noise_clip)",
+        "noise",
+        f"{LEARNS} -k smoothing",
+    ),
+    Mutant(
+        "the acting actor bootstraps",
+        AGENT,
+        "self.actor_target.project(",
+        "self.actor.circuit.project(",
+        f"{LEARNS} -k target",
+    ),
+    Mutant(
+        "the learning critics bootstrap",
+        AGENT,
+        "for critic in self.critic_target)",
+        "for critic in self.critic)",
+        f"{LEARNS} -k 'target or smallest'",
+    ),
+    Mutant(
+        "the next action remembers only m_t",
+        AGENT,
+        "batch.bootstrap_features, batch.next_memory",
+        "batch.bootstrap_features, batch.memory",
+        f"{LEARNS} -k 'target or memory'",
+    ),
+    Mutant(
+        "half of the demonstrations' share",
+        AGENT,
+        "round(self.demonstration_fraction *",
+        "round(0.5 * self.demonstration_fraction *",
+        f"{LEARNS} -k share",
+    ),
+    Mutant(
+        "without demonstrations nothing is paid",
+        AGENT,
+        "return (1.0 if self.alpha_ext is None",
+        "return (0.0 if self.alpha_ext is None",
+        f"{LEARNS} -k without_demonstrations",
+    ),
+    Mutant(
+        "acting remembers o_t itself",
+        POLICIES,
+        "past = th.as_tensor(history, device=self.device)",
+        "past = th.cat([th.as_tensor(history[:, 1:], device=self.device), features[:, None]], dim=1)",
+        f"{LEARNS} -k memory",
+    ),
+    Mutant(
+        "acting remembers the episode before",
+        POLICIES,
+        "history[np.asarray(episode_start, dtype=bool)] = 0.0",
+        "history[np.asarray(episode_start, dtype=bool)] += 0.0",
+        f"{LEARNS} -k memory",
+    ),
+    Mutant(
+        "m_t+1 lacks o_t",
+        FEATURES,
+        "following = th.cat([past[:, 1:], features[:, None]], dim=1)",
+        "following = past",
+        f"{LEARNS} -k memory",
+    ),
+    Mutant(
+        "what was before the episode is remembered",
+        FEATURES,
+        ".view(*mask.shape, -1) * mask[:, :, None]",
+        ".view(*mask.shape, -1)",
+        f"{LEARNS} -k memory",
+    ),
+    Mutant("the running maximum starts at 0", SIGNALS, "self.maximum = 1.0", "self.maximum = 1e-9", f"{LEARNS} -k maximum"),
+    Mutant(
+        "all layers' errors where the output's are asked for",
+        SIGNALS,
+        "else state.errors[-1:]",
+        "else state.errors",
+        f"{LEARNS} -k output_errors",
+    ),
+    Mutant(
+        "the low quantile in the place of the high",
+        SIGNALS,
+        "(above - (1.0 - self.quantile))",
+        "(above - self.quantile)",
+        f"{LEARNS} -k 'normali or quantile'",
+    ),
+    Mutant(
+        "demonstrations' instrumental signals are rewards",
+        SHOWN,
+        "self.instrumental[rows] = -instrumental",
+        "self.instrumental[rows] = instrumental",
+        f"{LEARNS} -k demonstr",
+    ),
+    # ------------------------------------------------------------------ buffers
+    Mutant(
+        "the newest transition is not in the batch",
+        BUFFERS,
+        "np.full(len(newest), self.newest)",
+        "np.full(len(newest), self.newest - 1)",
+        f"{STORES} -k newest",
+    ),
+    Mutant(
+        "the memory reaches into the episode before",
+        BUFFERS,
+        "(self.dones[earlier, envs[:, None]] == 0)",
+        "(self.dones[earlier - 1, envs[:, None]] == 0)",
+        f"{STORES} {LEARNS} -k 'past or memory'",
+    ),
+    Mutant(
+        "the first observation is forgotten",
+        BUFFERS,
+        "exists = steps_back <= age[:, None]",
+        "exists = steps_back < age[:, None]",
+        f"{STORES} {LEARNS} -k 'past or memory'",
+    ),
+    Mutant("returns run past the newest transition", BUFFERS, " | (window == self.newest)", "", f"{STORES} -k n_step"),
+    Mutant(
+        "a time limit is an end",
+        BUFFERS,
+        "self.dones[last, envs] * (1 - self.timeouts[last, envs])",
+        "self.dones[last, envs]",
+        STORES,
+    ),
+    Mutant(
+        "returns of several steps are not discounted", BUFFERS, "* mask * discounts).sum", "* mask).sum", f"{STORES} -k n_step"
+    ),
+    Mutant(
+        "a ring's rows without their past are drawn",
+        BUFFERS,
+        "np.random.randint(skipped, self",
+        "np.random.randint(0, self",
+        f"{STORES} {LEARNS} -k 'past or memory'",
+    ),
+    Mutant(
+        "an equally good episode does not enter",
+        IMITATION,
+        "episode_return < self.best_return",
+        "episode_return <= self.best_return",
+        f"{STORES} -k enters",
+    ),
+    Mutant(
+        "an unpaid episode enters", IMITATION, "episode_return <= 0.0 or", "episode_return < 0.0 or", f"{STORES} -k enters"
+    ),
+    Mutant(
+        "imitation forgets an episode's first step",
+        IMITATION,
+        "(earlier >= self.starts[indices][:, None])",
+        "(earlier > self.starts[indices][:, None])",
+        f"{STORES} -k history",
+    ),
+    Mutant(
+        "only the first part of the union is drawn",
+        IMITATION,
+        "np.random.randint(0, offsets[-1], size=n)",
+        "np.random.randint(0, offsets[0], size=n)",
+        f"{STORES} -k union",
+    ),
+    # ------------------------------------------------------------------ tasks
+    Mutant(
+        "displacement is measured from the origin",
+        SPARSE,
+        "is_far = bool(self.data.qpos[0] - self._start_x > self.distance)",
+        "is_far = bool(self.data.qpos[0] > self.distance)",
+        f"{TASKS} -k displacement",
+    ),
+    Mutant(
+        "the HalfCheetah's threshold", SPARSE, "default_distance = 20.0", "default_distance = 19.0", f"{TASKS} -k displacement"
+    ),
+    Mutant(
+        "the Reacher's threshold",
+        SPARSE,
+        "default_threshold: ClassVar[float] = 0.06",
+        "default_threshold: ClassVar[float] = 0.07",
+        f"{TASKS} -k 6_cm",
+    ),
+    Mutant(
+        "motion backward is paid",
+        SPARSE,
+        'info["x_velocity"] > self',
+        'abs(info["x_velocity"]) > self',
+        f"{TASKS} -k 'forward or motion'",
+    ),
+    Mutant(
+        "success is forgotten when the robot goes back",
+        SPARSE,
+        "self._has_passed = self._has_passed or is_far",
+        "self._has_passed = is_far",
+        f"{TASKS} -k 'displacement or success'",
+    ),
+    Mutant(
+        "a fallen robot's last step is healthy",
+        SPARSE,
+        "healthy = healthy * ~demonstrations.terminations",
+        "healthy = healthy * 1.0",
+        f"{TASKS} -k demonstrat",
+    ),
+    Mutant(
+        "the goal Reacher's fingertip is on the other side",
+        "envs/goal_mujoco.py",
+        "observation[..., _REACHER_DIFFERENCE] + target",
+        "observation[..., _REACHER_DIFFERENCE] - target",
+        "tests/baselines/test_her.py -k goal",
+    ),
+    # ------------------------------------------------------------------ statistics
+    Mutant(
+        "R-stability's window ends one episode late",
+        R_STABILITY,
+        "smoothed = (sums[WINDOW:-1] - sums[: -WINDOW - 1]) / WINDOW",
+        "smoothed = (sums[WINDOW + 1 :] - sums[1:-WINDOW]) / WINDOW",
+        STABLE,
+    ),
+    Mutant("R-stability's best is of all episodes", R_STABILITY, "best = last[WINDOW:].max()", "best = last.max()", STABLE),
+    Mutant("the final mean is the first", R_STABILITY, "values[-WINDOW:].mean()", "values[:WINDOW].mean()", STABLE),
+    Mutant(
+        "a fifth is trimmed, not a quarter",
+        STATISTICS,
+        "np.concatenate(scores), 0.25)",
+        "np.concatenate(scores), 0.2)",
+        SCORES,
+    ),
+    Mutant("ties lose", STATISTICS, "0.5 * (difference == 0)", "0.0 * (difference == 0)", SCORES),
+    Mutant("a biased deviation over seeds", STATISTICS, "values.std(axis=0, ddof=1)", "values.std(axis=0)", SCORES),
+    Mutant(
+        "an interval of 90 %",
+        STATISTICS,
+        "np.quantile(values, [(1.0 - CONFIDENCE) / 2.0, (1.0 + CONFIDENCE) / 2.0])",
+        "np.quantile(values, [1.0 - CONFIDENCE, CONFIDENCE])",
+        SCORES,
+    ),
+    Mutant(
+        "profiles count runs below",
+        STATISTICS,
+        "(np.concatenate(scores)[None, :] > thr",
+        "(np.concatenate(scores)[None, :] < thr",
+        SCORES,
+    ),
+]
+
+
+def occurrences(mutant: Mutant) -> int:
+    """
+    :param mutant: one of ``MUTANTS``
+    :return: how often the text that it changes is in the source
+    """
+    return (ROOT / "sb3_actpc" / mutant.file).read_text(encoding="utf-8").count(mutant.old)
+
+
+def plant(mutant: Mutant, folder: Path) -> None:
+    """
+    :param mutant: one of ``MUTANTS``
+    :param folder: empty; gets a copy of the package with the mutant in it, and of the tests
+    """
+    for name in COPIED:
+        if (ROOT / name).is_dir():
+            shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__", "results"))
+        else:
+            shutil.copy(ROOT / name, folder / name)
+    file = folder / "sb3_actpc" / mutant.file
+    file.write_text(file.read_text(encoding="utf-8").replace(mutant.old, mutant.new), encoding="utf-8")
+
+
+def outcome(mutant: Mutant) -> str:
+    """
+    :param mutant: one of ``MUTANTS``
+    :return: "killed", or what is wrong
+    """
+    if occurrences(mutant) != 1:
+        return f"NOT PLANTED: {mutant.old!r} is {occurrences(mutant)} times in {mutant.file}"
+    command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", *shlex.split(mutant.tests)]
+    with tempfile.TemporaryDirectory() as folder:
+        plant(mutant, Path(folder))
+        environment = {**os.environ, "PYTHONPATH": folder, "OMP_NUM_THREADS": "1", "PYTHONDONTWRITEBYTECODE": "1"}
+        try:
+            done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=TIMEOUT)
+        except subprocess.TimeoutExpired:
+            return "killed"
+    if done.returncode == TESTS_FAILED:
+        return "killed"
+    return "LIVES" if done.returncode == 0 else f"NOT TESTED: {done.stdout.strip().splitlines()[-1:]}"
+
+
+def outcomes(mutants: list[Mutant], jobs: int) -> Iterator[tuple[Mutant, str]]:
+    """
+    :param mutants: to try
+    :param jobs: how many at a time
+    :return: each with its :func:`outcome`, in their order
+    """
+    with ThreadPoolExecutor(jobs) as workers:
+        yield from zip(mutants, workers.map(outcome, mutants), strict=True)
+
+
+def main() -> int:
+    """:return: exit code"""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("part", nargs="?", default="", help="of the names of those to try (default: all)")
+    parser.add_argument("--jobs", type=int, default=2, help="mutants at a time (default: %(default)s)")
+    args = parser.parse_args()
+    started, alive = time.monotonic(), []
+    chosen = [mutant for mutant in MUTANTS if args.part in mutant.name]
+    for mutant, result in outcomes(chosen, args.jobs):
+        print(f"{time.monotonic() - started:6.0f} s  {mutant.name}: {result}", flush=True)
+        alive += [] if result == "killed" else [mutant.name]
+    print(f"{len(chosen) - len(alive)} of {len(chosen)} mutants killed")
+    for name in alive:
+        print(f"not killed: {name}")
+    return 1 if alive or not chosen else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
