@@ -18,32 +18,56 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         description="Write report.md, report.html, results.csv and figures about the finished runs of a comparison. Trains "
         "nothing; can be given while the comparison goes on.",
     )
-    parser.add_argument("folder", metavar="DIR", help="folder of sb3-actpc compare")
+    parser.add_argument("folder", metavar="DIR", nargs="?", help="folder of sb3-actpc compare, or of an export")
+    parser.add_argument(
+        "--export",
+        metavar="TARGET",
+        help="write instead what is worth keeping: results.csv, curves.csv.gz, settings.json and a figure for each task",
+    )
+    parser.add_argument(
+        "--tables",
+        metavar="FILE",
+        nargs="+",
+        help="write the tables between the markers of Markdown files, from the exports that the markers name",
+    )
 
 
 def run(args: argparse.Namespace) -> int:
-    """Write the report.
+    """Write the report, the export or the tables.
 
     :param args: parsed arguments
     :return: exit code: 0, or 1 when an ablation has changed not one action, which is an error of the agent's
+    :raises ValueError: when there is nothing to do, or a marker is wrong
     :raises FileNotFoundError: when the folder holds no runs
     :raises OSError: when a file cannot be written
     """
-    from sb3_actpc.experiments.report.ablations import without_effect
     from sb3_actpc.experiments.report.build import write_report
-    from sb3_actpc.experiments.report.results import group_runs, load_runs
+    from sb3_actpc.experiments.report.export import export
+    from sb3_actpc.experiments.report.published import write_tables
 
-    folder = Path(args.folder)
-    for path in write_report(folder):
+    if args.folder is None and not args.tables:
+        raise ValueError("nothing to report on: give the folder of a comparison, or --tables FILE.md")
+    if args.export is not None and args.folder is None:
+        raise ValueError("nothing to export: give the folder of a comparison")
+    files = []
+    if args.folder is not None:
+        folder = Path(args.folder)
+        files += write_report(folder) if args.export is None else export(folder, Path(args.export))
+    files += [path for path in map(Path, args.tables or ()) if write_tables(path)]
+    for path in files:
         print(path)
-    groups = group_runs(load_runs(folder))
-    idle = {
-        task: without_effect([group for group in groups if group.task == task]) for task in {group.task for group in groups}
-    }
-    for task, names in sorted(idle.items()):
-        if names:
-            print(
-                f"sb3-actpc: error: {task}: not one action changed in {', '.join(names)}: the part does nothing",
-                file=sys.stderr,
-            )
-    return 1 if any(idle.values()) else 0
+    return _idle_parts(folder) if args.folder is not None and args.export is None else 0
+
+
+def _idle_parts(folder: Path) -> int:
+    """Name the ablations that changed nothing; exit code 1 where there is one."""
+    from sb3_actpc.experiments.report.ablations import without_effect
+    from sb3_actpc.experiments.report.results import load_results
+
+    results = load_results(folder)
+    idle = {task: names for task in results.finished["task"].unique() if (names := without_effect(results, task))}
+    for task, names in idle.items():
+        print(
+            f"sb3-actpc: error: {task}: not one action changed in {', '.join(names)}: the part does nothing", file=sys.stderr
+        )
+    return 1 if idle else 0

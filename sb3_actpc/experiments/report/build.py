@@ -2,23 +2,26 @@
 
 from __future__ import annotations
 
-import csv
-import math
-from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Mapping
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 
 from sb3_actpc.experiments.comparison.execution import FINISHED
-from sb3_actpc.experiments.report import figures
-from sb3_actpc.experiments.report.ablations import ablation_blocks
-from sb3_actpc.experiments.report.cells import interval, mean_and_deviation, number
-from sb3_actpc.experiments.report.document import Block, Heading, Paragraph, Picture, Table, to_html, to_markdown
+from sb3_actpc.experiments.report.ablations import ablation_sections
+from sb3_actpc.experiments.report.figures import (
+    MEASURE_NAMES,
+    demonstrators_returns,
+    draw_aggregates,
+    draw_curves,
+    draw_diagnostics,
+)
+from sb3_actpc.experiments.report.page import Section, write_pages
 from sb3_actpc.experiments.report.r_stability import N_EPISODES, WINDOW
-from sb3_actpc.experiments.report.references import PaperResult, ReferenceScore, measure_of, paper_results_of, reference_score
-from sb3_actpc.experiments.report.results import Group, RunResult, group_runs, load_runs
+from sb3_actpc.experiments.report.references import measure_of, paper_results, reference_score
+from sb3_actpc.experiments.report.results import Results, load_results, write_runs
 from sb3_actpc.experiments.report.statistics import (
     Scores,
     interquartile_mean,
@@ -26,219 +29,190 @@ from sb3_actpc.experiments.report.statistics import (
     probability_of_improvement,
     probability_of_improvement_interval,
 )
-from sb3_actpc.utils.files import atomic_write
+from sb3_actpc.experiments.report.tables import UNDEFINED, interval, mean_and_deviation, number
 
 REFRESH_ALONE = "refresh_alone"
-# one figure of the table per task: heading, key of a run's measures, format
-_COLUMNS = (
-    ("average return", "average_dense", ".1f"),
-    ("R-stability", "r_stability_dense", ".3f"),
-    ("average sparse return", "average_sparse", ".1f"),
-    ("R-stability, sparse", "r_stability_sparse", ".3f"),
-    ("success", "average_success", ".2f"),
-    ("S-Dist", "r_stability_success", ".3f"),
-    ("evaluation: return", "evaluation_dense", ".1f"),
-    ("success", "evaluation_success", ".2f"),
-)
+LAST, TRAINING, STABILITY, PAPER = "last evaluation", f"last {WINDOW} training episodes", "R-stability", "paper"
+# columns of the table per task: heading and name -> column of the results, format
+_COLUMNS = {
+    (LAST, "return"): ("dense_return", ".1f"),
+    (LAST, "sparse return"): ("sparse_return", ".1f"),
+    (LAST, "success"): ("success_rate", ".2f"),
+    (TRAINING, "return"): ("dense_return_training", ".1f"),
+    (TRAINING, "sparse return"): ("sparse_return_training", ".1f"),
+    (TRAINING, "success"): ("success_rate_training", ".2f"),
+    (STABILITY, "return"): ("dense_return_r_stability", ".3f"),
+    (STABILITY, "sparse return"): ("sparse_return_r_stability", ".3f"),
+    (STABILITY, "success (S-Dist)"): ("success_rate_r_stability", ".3f"),
+}
 _NOTE = (
-    f"Average return, sparse return and success are means of the last {WINDOW} training episodes, exploration noise and all; "
-    f"R-stability (lower is steadier, 0 is perfect) needs the last {N_EPISODES}; with fewer episodes, or where the best of "
-    f"the last {WINDOW} is 0, which the formula divides by, they are undefined; offline methods have no training episodes. "
-    "S-Dist is the R-stability of success. The "
-    "evaluation is the last one, of the deterministic policy on episodes of its own. Returns are those of the dense task, "
-    "which no agent is trained on. Mean ± standard deviation over seeds. The paper's figures (arXiv 2209.09174) are means of "
-    "five runs of its own: tasks, demonstrations and steps differ from these."
+    "The last evaluation is of the deterministic policy on episodes of its own. The training episodes are played with "
+    f"exploration noise; their means need {WINDOW} episodes. R-stability (lower is steadier, 0 is perfect) needs "
+    f"{N_EPISODES}, and divides by the best of the last {WINDOW}: where there are fewer, or that is 0, {UNDEFINED} stands; a "
+    "column in which nothing else would stand is left out. Offline methods have no training episodes. Returns are those of "
+    "the dense task, which no agent is trained on. Mean ± standard deviation over seeds, (n of N) where not all are defined. "
+    "† marks runs from a source tree with uncommitted changes. The paper's figures (arXiv 2209.09174) are means of five runs "
+    "of its own: tasks, demonstrations and steps differ from these."
 )
 
 
 def write_report(folder: Path) -> list[Path]:
     """Write ``report.md``, ``report.html`` (one file, which opens without a network), ``results.csv`` and figures.
 
-    :param folder: of a comparison
+    :param folder: of a comparison, or of an export
     :return: the files
     :raises FileNotFoundError: when there are no runs
     :raises OSError: when a file cannot be written
     """
-    runs = load_runs(folder)
-    groups = group_runs(runs)
-    tasks = list(dict.fromkeys(group.task for group in groups))
-    blocks: list[Block] = [Heading(f"Comparison {folder.name}", 1), Paragraph(_overview(runs))]
+    results = load_results(folder)
+    tasks = list(results.finished["task"].unique())
+    sections = [Section(f"Comparison {folder.name}", _overview(results.runs), level=1)]
     for task in tasks:
-        blocks += _task_blocks([group for group in groups if group.task == task], task, folder)
-    if groups:
-        blocks.append(Paragraph(_NOTE))
-    blocks += _aggregate_blocks(groups, folder)
+        sections.append(_task_section(results, task, folder))
+    if tasks:
+        sections.append(Section(text=_NOTE))
+    sections += _aggregate_sections(results, folder)
     for task in tasks:
-        blocks += ablation_blocks([group for group in groups if group.task == task], task, folder)
-    blocks += _diagnostic_blocks(groups, folder)
-    blocks += _open_run_blocks(runs)
-    _write_csv(runs, folder / "results.csv")
-    for name, text in (("report.md", to_markdown(blocks)), ("report.html", to_html(blocks, folder))):
-        with atomic_write(folder / name, "w") as file:
-            file.write(text)
-    pictures = [folder / block.file for block in blocks if isinstance(block, Picture)]
-    return [folder / "report.md", folder / "report.html", folder / "results.csv", *pictures]
+        sections += ablation_sections(results, task, folder)
+    for task in tasks:
+        sections += _diagnostic_section(results, task, folder)
+    sections += _open_run_section(results.runs)
+    files = [*write_pages(sections, folder), write_runs(results, folder)]
+    return [*files, *(folder / section.picture for section in sections if section.picture)]
 
 
-def _overview(runs: Sequence[RunResult]) -> str:
-    counts = Counter(run.status for run in runs)
-    versions = sorted({str(run.config["versions"]["sb3-actpc"]) for run in runs if "versions" in run.config})
-    commits = sorted({str(run.config.get("git_commit") or "an installed package")[:10] for run in runs if run.config})
-    steps = sorted({run.config["n_timesteps"] for run in runs if run.config})
+def _overview(runs: pd.DataFrame) -> str:
+    counts = runs["status"].value_counts().sort_index()
+    begun = runs[runs["version"] != ""]
+    commits = begun["commit"].where(begun["commit"] != "", "an installed package")
     return (
-        f"{len(runs)} runs: {', '.join(f'{count} {status}' for status, count in sorted(counts.items()))}. Environment steps: "
-        f"{', '.join(f'{count:,}' for count in steps) or 'none'}. sb3_actpc {', '.join(versions) or 'unknown'}, commit "
-        f"{', '.join(commits) or 'unknown'}."
+        f"{len(runs)} runs: {', '.join(f'{count} {status}' for status, count in counts.items())}. Environment steps: "
+        f"{', '.join(f'{count:,}' for count in sorted(begun['planned_steps'].unique())) or 'none'}. sb3_actpc "
+        f"{', '.join(sorted(begun['version'].unique())) or 'unknown'}, commit "
+        f"{', '.join(sorted(commits.unique())) or 'unknown'}; "
+        f"{begun['dirty'].sum()} runs from a source tree with uncommitted changes."
     )
 
 
 # ------------------------------------------------------------------ a task
 
 
-def _task_blocks(groups: Sequence[Group], task: str, folder: Path) -> list[Block]:
+def _task_section(results: Results, task: str, folder: Path) -> Section:
     picture = f"curves_{task}.png"
-    figures.draw_curves(groups, task, _drawn_reference(groups, task), folder / picture)
-    blocks: list[Block] = [Heading(task), _task_table(groups, task)]
-    if any(group.algo == "actpc" for group in groups) and REFRESH_ALONE not in {group.variant for group in groups}:
-        blocks.append(Paragraph(f"Refresh alone was not run on this task: --algos {REFRESH_ALONE} does it."))
-    name = figures.MEASURE_NAMES[measure_of(task)]
-    return [*blocks, Picture(picture, f"{task}: {name} over episodes, steps and time, mean and 95 % interval over seeds")]
+    draw_curves(results, task, folder / picture)
+    text, groups = "", results.groups(task).values()
+    variants = {name for runs in groups for name in runs["variant"]}
+    if any((runs["algorithm"] == "actpc").any() for runs in groups) and REFRESH_ALONE not in variants:
+        text = f"Refresh alone was not run on this task: --algos {REFRESH_ALONE} does it."
+    name = MEASURE_NAMES[measure_of(task)]
+    caption = f"{task}: {name} over episodes, steps and time, mean and 95 % interval over seeds"
+    return Section(task, text, task_table(results, task), picture, caption)
 
 
-def _task_table(groups: Sequence[Group], task: str) -> Table:
-    paper = {result.algo or result.algorithm: result for result in paper_results_of(task)}
-    score, stability = _paper_header(paper.values())
-    header = ["", "seeds", "steps", *(name for name, _, _ in _COLUMNS), f"paper: {score}", f"paper: {stability}"]
+def task_table(results: Results, task: str) -> pd.DataFrame:
+    """
+    :param results: with finished runs on the task
+    :param task: Gymnasium id
+    :return: of texts, with columns of two levels: a row for each group of runs, then the demonstrators, random actions and
+        those of the paper's algorithms that were not run; without the columns that no group has a value in
+    """
+    paper = paper_results(task)
+    score, stability = ("success in %", "S-Dist") if paper["is_success"].any() else ("average return", "R-stability")
+    own = pd.concat(results.groups(task).values())
+    own_columns = [key for key, (column, _) in _COLUMNS.items() if own[column].notna().any()]
+    columns = [("", "variant"), ("", "seeds"), ("", "steps"), *own_columns, (PAPER, score), (PAPER, stability)]
+
+    def papers(row: pd.Series) -> dict[tuple[str, str], str]:
+        known = "" if np.isnan(row.r_stability) else f"{row.r_stability:.3f} ± {row.r_stability_std:.3f}"
+        return {(PAPER, score): f"{row.score:.1f} ± {row.score_std:.1f}", (PAPER, stability): known}
+
+    by_algo = {row.algo: row for _, row in paper.iterrows()}
     rows, shown = [], set()
-    for group in groups:
-        values = [mean_and_deviation(group.values(key), form) for _, key, form in _COLUMNS]
-        is_papers = group.variant in (group.algo, "actpc_paper")  # not that of a variant with other settings
-        shown |= {group.algo} if is_papers else set()
-        steps = f"{group.runs[0].config['n_timesteps']:,}"
-        rows.append(
-            [group.variant, str(len(group.runs)), steps, *values, *_paper_cells(paper.get(group.algo) if is_papers else None)]
-        )
-    rows += _reference_rows(groups, task)
-    empty = [""] * (len(_COLUMNS) + 2)
-    rows += [[f"{one.algorithm} (paper only)", *empty, *_paper_cells(one)] for key, one in paper.items() if key not in shown]
-    return Table(header, rows)
+    for label, runs in results.groups(task).items():
+        first = runs.iloc[0]
+        name = f"{label} †" if runs["dirty"].any() else label
+        row = {("", "variant"): name, ("", "seeds"): str(len(runs)), ("", "steps"): f"{first['planned_steps']:,}"}
+        for key in own_columns:
+            column, form = _COLUMNS[key]
+            row[key] = mean_and_deviation(runs[column].to_numpy(), form)
+        if first["variant"] in (first["algorithm"], "actpc_paper"):  # not a variant with other settings
+            shown.add(first["algorithm"])
+            row |= papers(by_algo[first["algorithm"]]) if first["algorithm"] in by_algo else {}
+        rows.append(row)
+    rows += _reference_rows(results, task)
+    rows += [
+        {("", "variant"): f"{row.algorithm} (paper only)", **papers(row)} for algo, row in by_algo.items() if algo not in shown
+    ]
+    table = pd.DataFrame(rows, columns=pd.MultiIndex.from_tuples(columns)).fillna("")
+    return table.loc[:, (table != "").any()]
 
 
-def _paper_header(results: Iterable[PaperResult]) -> tuple[str, str]:
-    is_success = any(result.is_success for result in results)
-    return ("success in %", "S-Dist") if is_success else ("average return", "R-stability")
-
-
-def _paper_cells(result: PaperResult | None) -> list[str]:
-    if result is None:
-        return ["", ""]
-    stability = "" if result.r_stability is None else f"{result.r_stability} ± {result.r_stability_std}"
-    return [f"{result.score} ± {result.score_std}", stability]
-
-
-def _demonstrators_returns(groups: Sequence[Group]) -> list[float]:
-    """Mean dense returns, rounded, of the demonstrations that the runs were given: one, unless they differ."""
-    returns = np.concatenate([group.values("demonstrators_return") for group in groups])
-    return sorted(set(returns[~np.isnan(returns)].round(1)))
-
-
-def _drawn_reference(groups: Sequence[Group], task: str) -> ReferenceScore | None:
-    """The scores that are drawn as lines: the demonstrators' are those of the runs, which may not be the shipped ones."""
-    reference, known = reference_score(task), _demonstrators_returns(groups)
-    if reference is None or reference.measure != "dense_return" or len(known) != 1:
-        return reference
-    return replace(reference, demonstrators=known[0])
-
-
-def _reference_rows(groups: Sequence[Group], task: str) -> list[list[str]]:
+def _reference_rows(results: Results, task: str) -> list[dict[tuple[str, str], str]]:
     """The demonstrators' and the random actions' scores, in the columns of the evaluation's."""
-    known = _demonstrators_returns(groups)
-    rows = {"demonstrators": {"evaluation_dense": " or ".join(f"{value:.1f}" for value in known)}} if known else {}
-    reference = reference_score(task)
+    given, reference = demonstrators_returns(results, task), reference_score(task)
+    name, score = ("", "variant"), (LAST, "return")
+    rows = [{name: "demonstrators", score: " or ".join(f"{value:.1f}" for value in given)}] if given else []
     if reference is not None and reference.measure == "dense_return":
-        rows["random actions"] = {"evaluation_dense": f"{reference.random:.1f}"}
+        rows.append({name: "random actions", score: f"{reference.random:.1f}"})
     elif reference is not None:
-        rows["shipped demonstrators"] = {"evaluation_success": f"{reference.demonstrators:.2f}"}
-        rows["random actions"] = {"evaluation_success": f"{reference.random:.2f}"}
-    return [[name, "", "", *(cells.get(key, "") for _, key, _ in _COLUMNS), "", ""] for name, cells in rows.items()]
+        rows.append({name: "shipped demonstrators", (LAST, "success"): f"{reference.demonstrators:.2f}"})
+        rows.append({name: "random actions", (LAST, "success"): f"{reference.random:.2f}"})
+    return rows
 
 
 # ------------------------------------------------------------------ across tasks
 
 
-def _aggregate_blocks(groups: Sequence[Group], folder: Path) -> list[Block]:
+def _aggregate_sections(results: Results, folder: Path) -> list[Section]:
     """Statistics over all tasks with reference scores, of the variants that were run on each of them."""
-    scored = [group for group in groups if reference_score(group.task) is not None]
-    tasks = list(dict.fromkeys(group.task for group in scored))
-    by_variant: dict[str, dict[str, np.ndarray]] = {}
-    for group in scored:
-        by_variant.setdefault(group.variant, {})[group.task] = group.values("normalized")
-    whole = {name: [parts[task] for task in tasks] for name, parts in by_variant.items() if len(parts) == len(tasks)}
+    scored = results.finished.dropna(subset="normalized")
+    tasks = list(scored["task"].unique())
+    by_label = {label: dict(tuple(runs.groupby("task")["normalized"])) for label, runs in scored.groupby("label")}
+    whole = {
+        str(label): [parts[task].to_numpy() for task in tasks] for label, parts in by_label.items() if len(parts) == len(tasks)
+    }
     if not whole:
         return []
     means = {name: (interquartile_mean(scores), interquartile_mean_interval(scores)) for name, scores in whole.items()}
-    figures.draw_aggregates(means, whole, folder / "aggregates.png")
-    left_out = sorted(set(by_variant) - set(whole))
+    draw_aggregates(means, whole, folder / "aggregates.png")
+    left_out = sorted(set(map(str, by_label)) - set(whole))
     missing = f" Left out, because not run on every one: {', '.join(left_out)}." if left_out else ""
+    text = (
+        "The dense return (of robosuite's tasks, the success) of the last evaluation, normalised so that random actions are 0 "
+        f"and the shipped demonstrators 1, over {', '.join(tasks)}. Intervals: 95 %, stratified bootstrap, left open for "
+        f"single runs.{missing}"
+    )
     rows = [
-        [name, str(sum(map(len, whole[name]))), number(value, ".3f"), interval(bounds, ".3f")]
+        (name, str(sum(map(len, whole[name]))), number(value, ".3f"), interval(bounds, ".3f"))
         for name, (value, bounds) in means.items()
     ]
-    blocks: list[Block] = [
-        Heading("Across tasks"),
-        Paragraph(
-            f"The dense return (of robosuite's tasks, the success) of the last evaluation, normalised so that random actions "
-            f"are 0 and the shipped demonstrators 1, over "
-            f"{', '.join(tasks)}. Intervals: 95 %, stratified bootstrap, left open for single runs.{missing}"
-        ),
-        Table(["", "runs", "interquartile mean", "95 % interval"], rows),
-        Picture("aggregates.png", "interquartile means and performance profiles"),
-    ]
-    return [*blocks, *_improvement_blocks(whole)]
+    table = pd.DataFrame(rows, columns=["variant", "runs", "interquartile mean", "95 % interval"])
+    caption = "interquartile means and performance profiles"
+    return [Section("Across tasks", text, table, "aggregates.png", caption), *_improvement_section(whole)]
 
 
-def _improvement_blocks(scores: Mapping[str, Scores]) -> list[Block]:
-    names = list(scores)
+def _improvement_section(scores: Mapping[str, Scores]) -> list[Section]:
     rows = []
-    for index, name in enumerate(names):
-        for other in names[index + 1 :]:
-            value = probability_of_improvement(scores[name], scores[other])
-            bounds = probability_of_improvement_interval(scores[name], scores[other])
-            rows.append([f"{name} over {other}", number(value, ".2f"), interval(bounds, ".2f")])
-    if not rows:
-        return []
-    return [Heading("Probability of improvement", 3), Table(["", "probability", "95 % interval"], rows)]
+    for name, other in combinations(scores, 2):
+        value = probability_of_improvement(scores[name], scores[other])
+        bounds = probability_of_improvement_interval(scores[name], scores[other])
+        rows.append((f"{name} over {other}", number(value, ".2f"), interval(bounds, ".2f")))
+    table = pd.DataFrame(rows, columns=["pair", "probability", "95 % interval"])
+    return [Section("Probability of improvement", table=table, level=3)] if rows else []
 
 
 # ------------------------------------------------------------------ inside the agent, and what is missing
 
 
-def _diagnostic_blocks(groups: Sequence[Group], folder: Path) -> list[Block]:
-    own = [group for group in groups if group.algo == "actpc"]
-    blocks: list[Block] = [Heading("Inside ActPC")] if own else []
-    for task in dict.fromkeys(group.task for group in own):
-        picture = f"diagnostics_{task}.png"
-        figures.draw_diagnostics([group for group in own if group.task == task], task, folder / picture)
-        blocks.append(Picture(picture, f"{task}: signals, energies, action-values, self-imitation memory"))
-    return blocks
-
-
-def _open_run_blocks(runs: Sequence[RunResult]) -> list[Block]:
-    rows = []
-    for run in runs:
-        if run.status != FINISHED:
-            rows.append([run.task, run.variant, str(run.seed), run.status, f"{run.timesteps:,}", run.error])
-    if not rows:
+def _diagnostic_section(results: Results, task: str, folder: Path) -> list[Section]:
+    own = {label: runs for label, runs in results.groups(task).items() if (runs["algorithm"] == "actpc").all()}
+    picture = f"diagnostics_{task}.png"
+    if not own or not draw_diagnostics(results, own, task, folder / picture):
         return []
-    return [Heading("Runs that are not in the tables"), Table(["task", "variant", "seed", "state", "step", "error"], rows)]
+    caption = f"{task}: signals, energies, action-values, self-imitation memory"
+    return [Section(f"Inside ActPC: {task}", picture=picture, caption=caption)]
 
 
-def _write_csv(runs: Sequence[RunResult], path: Path) -> None:
-    measures = list(runs[0].measures)
-    with atomic_write(path, "w") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(["task", "variant", "algo", "seed", "status", "timesteps", "episodes", "settings", *measures])
-        for run in runs:
-            own = [run.task, run.variant, run.config.get("algo", ""), run.seed, run.status, run.timesteps]
-            values = ["" if math.isnan(run.measures[name]) else run.measures[name] for name in measures]
-            writer.writerow([*own, len(run.episode_values("episode")), run.content if run.config else "", *values])
+def _open_run_section(runs: pd.DataFrame) -> list[Section]:
+    rows = runs.loc[runs["status"] != FINISHED, ["task", "variant", "seed", "status", "steps", "error"]]
+    return [] if rows.empty else [Section("Runs that are not in the tables", table=rows.astype(str))]

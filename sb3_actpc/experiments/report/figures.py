@@ -1,17 +1,17 @@
-"""The figures of a report: curves with 95 % intervals, profiles, bars."""
+"""The figures of a report: curves with 95 % intervals, profiles, bars. Every legend stands beside the axes or below them."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from functools import reduce
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from sb3_actpc.experiments.report.r_stability import WINDOW, smooth
-from sb3_actpc.experiments.report.references import ReferenceScore, measure_of
-from sb3_actpc.experiments.report.results import Group
+from sb3_actpc.experiments.report.references import measure_of, reference_score
+from sb3_actpc.experiments.report.results import MEASURES, Results, side_by_side
 from sb3_actpc.experiments.report.statistics import (
     Interval,
     Scores,
@@ -22,6 +22,7 @@ from sb3_actpc.experiments.report.statistics import (
 from sb3_actpc.utils.files import atomic_write
 
 _COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#999999", "#7f3c8d", "#a5aa99")
+_STYLES = ("-", "--", ":", "-.")
 # what ActPC logs about itself: panel -> columns of diagnostics.csv
 DIAGNOSTIC_PANELS = {
     "signals": ("train/epistemic_signal", "train/instrumental_signal"),
@@ -29,36 +30,35 @@ DIAGNOSTIC_PANELS = {
     "action-value": ("train/action_value",),
     "self-imitation memory (transitions)": ("train/self_imitation_size",),
 }
-_STYLES = ("-", "--", ":", "-.")
 MEASURE_NAMES = {"dense_return": "dense return", "success_rate": "success"}
-_IN_EPISODES = {"dense_return": "dense_return", "success_rate": "success"}  # column of progress.csv -> of episodes.csv
 N_POINTS = 200  # of a curve over time
 
 Curve = tuple[np.ndarray, np.ndarray]  # x (n,), and y of every seed (n_seeds, n)
 
 
-def episode_curve(group: Group, measure: str = "dense_return") -> Curve:
-    """Dense returns (or successes) in training, smoothed over 100 episodes, of as many episodes as all seeds have."""
-    column = _IN_EPISODES[measure]
-    values = group.column(lambda run: smooth(run.episode_values(column)))
-    return np.arange(1, values.shape[1] + 1), values
+def episode_curve(results: Results, runs: pd.Index, measure: str = "dense_return") -> Curve:
+    """A measure in training, smoothed over 100 episodes, of as many episodes as all seeds have."""
+    values = side_by_side(results.episodes, runs, "episode", MEASURES[measure])
+    return values.index.to_numpy(), smooth(values.to_numpy()).T
 
 
-def step_curve(group: Group, measure: str = "dense_return") -> Curve:
+def step_curve(results: Results, runs: pd.Index, measure: str = "dense_return") -> Curve:
     """A measure of the evaluations over environment steps, where all seeds have one."""
-    steps = reduce(np.intersect1d, [run.progress["timesteps"] for run in group.runs])
-    return steps, np.stack([run.progress[measure][np.isin(run.progress["timesteps"], steps)] for run in group.runs])
+    values = side_by_side(results.evaluations, runs, "timesteps", measure)
+    return values.index.to_numpy(), values.to_numpy().T
 
 
-def time_curve(group: Group, measure: str = "dense_return") -> Curve:
+def time_curve(results: Results, runs: pd.Index, measure: str = "dense_return") -> Curve:
     """
     A measure of the evaluations over the seconds of training (evaluations left out), from the last seed's first evaluation
     until the first seed ends.
     """
-    seconds = [run.progress["seconds"] - run.progress["evaluation_seconds"] for run in group.runs]
-    grid = np.linspace(max(one[0] for one in seconds), min(one[-1] for one in seconds), N_POINTS)
-    values = [np.interp(grid, one, run.progress[measure]) for one, run in zip(seconds, group.runs, strict=True)]
-    return grid, np.stack(values)
+    rows = results.evaluations[results.evaluations["run"].isin(runs)]
+    seeds = [
+        ((one["seconds"] - one["evaluation_seconds"]).to_numpy(), one[measure].to_numpy()) for _, one in rows.groupby("run")
+    ]
+    grid = np.linspace(max(seconds[0] for seconds, _ in seeds), min(seconds[-1] for seconds, _ in seeds), N_POINTS)
+    return grid, np.stack([np.interp(grid, *seed) for seed in seeds])
 
 
 def axis_limits(heights: Sequence[float]) -> tuple[float, float]:
@@ -74,36 +74,61 @@ def axis_limits(heights: Sequence[float]) -> tuple[float, float]:
     return low - margin, high + margin
 
 
-def draw_curves(groups: Sequence[Group], task: str, reference: ReferenceScore | None, path: Path) -> None:
-    """Returns (or success, by the task's measure) over episodes, over steps and over time.
+def draw_curves(results: Results, task: str, path: Path) -> None:
+    """Returns (or success, by the task's measure) over episodes where they are kept, over steps and over time.
 
-    :param groups: of one task
-    :param task: its name
-    :param reference: its measure is drawn, and its scores as lines; None for dense returns without lines
+    :param results: with finished runs on the task
+    :param task: Gymnasium id
     :param path: PNG file to write
     """
-    figure = _figure(15.0, 4.5)
-    measure = measure_of(task)
-    name = MEASURE_NAMES[measure]
-    panels = (
-        (episode_curve, "episodes", f"{name} in training, mean of {WINDOW} episodes"),
-        (step_curve, "environment steps", f"{name} in evaluation"),
-        (time_curve, "seconds of training", f"{name} in evaluation"),
-    )
-    for axes, (curve, x_label, y_label) in zip(figure.subplots(1, 3), panels, strict=True):
-        heights = [] if reference is None else [reference.demonstrators, reference.random]
-        for index, group in enumerate(groups):
-            x, values = curve(group, measure)
+    groups, measure = results.groups(task), measure_of(task)
+    lines = reference_lines(results, task)
+    panels: list[tuple[Any, str, str]] = [
+        (step_curve, "environment steps", "evaluation"),
+        (time_curve, "seconds of training", "evaluation"),
+    ]
+    if len(results.episodes):
+        panels.insert(0, (episode_curve, "episodes", f"training, mean of {WINDOW} episodes"))
+    figure = _figure(5.0 * len(panels), 4.2)
+    for axes, (curve, x_label, where) in zip(figure.subplots(1, len(panels)), panels, strict=True):
+        heights = [*lines.values()]
+        for index, (label, runs) in enumerate(groups.items()):
+            x, values = curve(results, runs.index, measure)
             if len(x):
-                _band(axes, x, values, group.variant, index)
+                _band(axes, x, values, label, index)
                 heights += [float(values.min()), float(values.max())]
-        if reference is not None:
-            axes.axhline(reference.demonstrators, color="black", linestyle="--", linewidth=1, label="demonstrators")
-            axes.axhline(reference.random, color="black", linestyle=":", linewidth=1, label="random")
-        axes.set(xlabel=x_label, ylabel=y_label, ylim=axis_limits([0.0, 1.0] if measure == "success_rate" else heights))
-    axes.legend(fontsize="small", loc="upper left", bbox_to_anchor=(1.0, 1.0))
+        for style, (label, height) in zip(("--", ":"), lines.items(), strict=False):
+            axes.axhline(height, color="black", linestyle=style, linewidth=1, label=label)
+        limits = axis_limits([0.0, 1.0] if measure == "success_rate" else heights)
+        axes.set(xlabel=x_label, ylabel=f"{MEASURE_NAMES[measure]} in {where}", ylim=limits)
     figure.suptitle(task)
+    _legend(figure)
     _save(figure, path)
+
+
+def reference_lines(results: Results, task: str) -> dict[str, float]:
+    """
+    :param results: with runs on the task
+    :param task: Gymnasium id
+    :return: the scores of demonstrators and random actions in the task's measure; of dense returns the demonstrators' are
+        those that the runs were given, which may not be the shipped ones; empty where none are known
+    """
+    reference = reference_score(task)
+    if reference is None:
+        return {}
+    given = demonstrators_returns(results, task)
+    own = reference.measure == "dense_return" and len(given) == 1
+    return {"demonstrators": given[0] if own else reference.demonstrators, "random actions": reference.random}
+
+
+def demonstrators_returns(results: Results, task: str) -> list[float]:
+    """
+    :param results: with runs on the task
+    :param task: Gymnasium id
+    :return: mean dense returns, rounded, of the demonstrations that the finished runs were given: one, unless they differ
+    """
+    finished = results.finished
+    return sorted(finished.loc[finished["task"] == task, "demonstrators_return"].dropna().round(1).unique())
 
 
 def draw_aggregates(intervals: Mapping[str, tuple[float, Interval]], scores: Mapping[str, Scores], path: Path) -> None:
@@ -113,71 +138,77 @@ def draw_aggregates(intervals: Mapping[str, tuple[float, Interval]], scores: Map
     :param scores: variant -> normalised scores of each task
     :param path: PNG file to write
     """
-    figure = _figure(12.0, 4.5)
+    figure = _figure(12.0, max(4.0, 1.0 + 0.35 * len(scores)))
     bars, profiles = figure.subplots(1, 2)
     _bars(bars, {name: (value, *interval) for name, (value, interval) in intervals.items()})
     bars.set(xlabel="interquartile mean of the normalised score")
     everything = np.concatenate([part for parts in scores.values() for part in parts])
     thresholds = np.linspace(min(0.0, everything.min()) - 0.05, max(1.0, everything.max()) + 0.05, 60)
     for index, (name, parts) in enumerate(scores.items()):
-        color = _COLORS[index % len(_COLORS)]
-        profiles.plot(thresholds, performance_profile(parts, thresholds), color=color, label=name)
+        look = _look(index)
+        profiles.plot(thresholds, performance_profile(parts, thresholds), label=name, **look)
         low, high = performance_profile_interval(parts, thresholds)
-        profiles.fill_between(thresholds, low, high, color=color, alpha=0.15, linewidth=0)
+        profiles.fill_between(thresholds, low, high, color=look["color"], alpha=0.15, linewidth=0)
     profiles.set(xlabel="normalised score τ", ylabel="share of runs with a score above τ", ylim=(-0.02, 1.02))
-    profiles.legend(fontsize="small")
+    _legend(figure)
     _save(figure, path)
 
 
-def draw_ablation(groups: Sequence[Group], labels: Sequence[str], measure: str, title: str, path: Path) -> None:
+def draw_ablation(values: Mapping[str, np.ndarray], measure: str, title: str, path: Path) -> None:
     """A bar for every ablation.
 
-    :param groups: of one task, the base first
-    :param labels: of each
+    :param values: label -> (n_seeds,) the last evaluation of each seed, the base first
     :param measure: column of ``progress.csv``
     :param title: of the figure
     :param path: PNG file to write
     """
-    figure = _figure(8.0, 1.2 + 0.4 * len(groups))
+    figure = _figure(9.0, 1.2 + 0.4 * len(values))
     axes = figure.subplots()
-    bars = {}
-    for group, label in zip(groups, labels, strict=True):
-        mean, low, high = (float(one) for one in mean_interval(group.last(measure)))
-        bars[label] = (mean, low, high)
-    _bars(axes, bars)
-    axes.axvline(next(iter(bars.values()))[0], color="black", linestyle="--", linewidth=1)
+    bars = {label: tuple(map(float, mean_interval(seeds))) for label, seeds in values.items()}
+    _bars(axes, bars)  # type: ignore[arg-type]
+    base, (height, *_) = next(iter(bars.items()))
+    axes.axvline(height, color="black", linestyle="--", linewidth=1, label=f"mean of {base}")
     axes.set(title=title, xlabel=f"{MEASURE_NAMES[measure]} of the last evaluation, mean and 95 % interval over seeds")
+    _legend(figure)
     _save(figure, path)
 
 
-def draw_diagnostics(groups: Sequence[Group], task: str, path: Path) -> None:
-    """What ActPC logged about itself, a line for every run.
+def draw_diagnostics(results: Results, groups: Mapping[str, pd.DataFrame], task: str, path: Path) -> bool:
+    """What ActPC logged about itself: a panel for each kind of quantity, a colour for each variant, a line for every run.
 
-    :param groups: of one task, with diagnostics
+    :param results: with diagnostics
+    :param groups: label -> runs, of one task
     :param task: its name
     :param path: PNG file to write
+    :return: whether there was anything to draw; without it no file is written
     """
-    figure = _figure(16.0, 4.0)
-    for axes, (title, columns) in zip(figure.subplots(1, len(DIAGNOSTIC_PANELS)), DIAGNOSTIC_PANELS.items(), strict=True):
-        for index, group in enumerate(groups):
+    logged = {title: [one for one in columns if one in results.diagnostics] for title, columns in DIAGNOSTIC_PANELS.items()}
+    everyone = pd.concat(groups.values()).index
+    rows = results.diagnostics[results.diagnostics["run"].isin(everyone)]
+    panels = {title: [one for one in columns if rows[one].notna().any()] for title, columns in logged.items()}
+    panels = {title: columns for title, columns in panels.items() if columns}
+    if not panels:
+        return False
+    figure = _figure(4.2 * len(panels) + 1.5, 4.2)
+    for axes, (title, columns) in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels.items(), strict=True):
+        for index, (label, runs) in enumerate(groups.items()):
             for style, column in zip(_STYLES, columns, strict=False):
-                _draw_logged(axes, group, column, _COLORS[index % len(_COLORS)], style)
+                for run in runs.index:
+                    one = rows.loc[rows["run"] == run, ["time/total_timesteps", column]].dropna().to_numpy()
+                    axes.plot(*one.T, color=_look(index)["color"], linestyle=style, linewidth=1, label=label)
         axes.set(title=title, xlabel="environment steps", yscale="log" if title == "energies" else "linear")
-        if axes.has_data():
-            axes.legend(fontsize="x-small")
+        if len(columns) > 1:  # what the styles mean, under the panel; the colours are in the figure's legend
+            named = zip(_STYLES, columns, strict=False)
+            handles = [axes.plot([], [], color="gray", linestyle=style, label=_short(column))[0] for style, column in named]
+            axes.legend(handles=handles, fontsize="small", loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2)
     figure.suptitle(task)
+    _legend(figure, groups)
     _save(figure, path)
+    return True
 
 
-def _draw_logged(axes: Any, group: Group, column: str, color: str, style: str) -> None:
-    label = f"{group.variant}: {column.removeprefix('train/')}"
-    for run in group.runs:
-        steps, values = run.diagnostics.get("time/total_timesteps"), run.diagnostics.get(column)
-        if steps is None or values is None:
-            continue
-        known = ~np.isnan(values)
-        axes.plot(steps[known], values[known], color=color, linestyle=style, linewidth=1, label=label)
-        label = "_"  # the other seeds have no entry of their own
+def _short(column: str) -> str:
+    return column.removeprefix("train/").replace("_", " ").removesuffix(" energy").removesuffix(" signal")
 
 
 def _figure(width: float, height: float) -> Any:
@@ -189,13 +220,15 @@ def _figure(width: float, height: float) -> Any:
     return figure
 
 
+def _look(index: int) -> dict[str, str]:
+    return {"color": _COLORS[index % len(_COLORS)], "linestyle": _STYLES[index // len(_COLORS) % len(_STYLES)]}
+
+
 def _band(axes: Any, x: np.ndarray, values: np.ndarray, label: str, index: int) -> None:
     mean, low, high = mean_interval(values)
-    color = _COLORS[index % len(_COLORS)]
-    style = _STYLES[index // len(_COLORS) % len(_STYLES)]
-    axes.plot(x, mean, color=color, linestyle=style, label=label, marker="o" if len(set(x)) == 1 else None)
+    axes.plot(x, mean, label=label, marker="o" if len(set(x)) == 1 else None, **_look(index))
     if len(values) > 1:
-        axes.fill_between(x, low, high, color=color, alpha=0.15, linewidth=0)
+        axes.fill_between(x, low, high, color=_look(index)["color"], alpha=0.15, linewidth=0)
 
 
 def _bars(axes: Any, bars: Mapping[str, tuple[float, float, float]]) -> None:
@@ -206,6 +239,17 @@ def _bars(axes: Any, bars: Mapping[str, tuple[float, float, float]]) -> None:
             axes.plot([low, high], [index, index], color="black", linewidth=2)
     axes.set_yticks(range(len(bars)), list(bars))
     axes.set_ylim(len(bars) - 0.5, -0.5)
+
+
+def _legend(figure: Any, names: Mapping[str, Any] | None = None) -> None:
+    """One legend to the right of all axes, each label once; only ``names`` where they are given."""
+    kept: dict[str, Any] = {}
+    for axes in figure.axes:
+        for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
+            if names is None or label in names:
+                kept.setdefault(label, handle)
+    if kept:
+        figure.legend(kept.values(), kept.keys(), fontsize="small", loc="outside right upper")
 
 
 def _save(figure: Any, path: Path) -> None:

@@ -15,51 +15,34 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import pandas as pd
 
 WINDOW = 100  # K_e, and the episodes of the rolling average
 N_EPISODES = 2 * WINDOW
-TOO_SHORT = f"undefined: fewer than {N_EPISODES} episodes"
-BEST_IS_ZERO = f"undefined: the best of the last {WINDOW} is 0"
 
 
 def r_stability(returns: np.ndarray) -> float:
     """
     :param returns: (N,) dense or sparse returns, or successes, of all training episodes in order
-    :return: R-stability; NaN where it is undefined, see :func:`undefined_because`
+    :return: R-stability; NaN with fewer than 200 episodes, where one of the last 200 is NaN, and where the best of the last
+        100 is 0
     """
-    if undefined_because(returns):
+    last = np.asarray(returns[-N_EPISODES:], dtype=np.float64)
+    if len(last) < N_EPISODES or last[WINDOW:].max() == 0:
         return math.nan
-    last = returns[-N_EPISODES:].astype(np.float64)
     best = last[WINDOW:].max()
-    # the i-th of the last 100 episodes is preceded by the values i to i + 99 of the last 200
-    sums = np.cumsum(np.concatenate([[0.0], last]))
-    smoothed = (sums[WINDOW:-1] - sums[: -WINDOW - 1]) / WINDOW
+    smoothed = np.lib.stride_tricks.sliding_window_view(last, WINDOW)[:-1].mean(axis=1)
     return float(np.mean(np.abs((smoothed - best) / best)))
-
-
-def undefined_because(returns: np.ndarray) -> str:
-    """
-    :param returns: as in :func:`r_stability`
-    :return: why it is undefined; empty where it is defined
-    """
-    if len(returns) < N_EPISODES:
-        return TOO_SHORT
-    if np.isnan(returns[-N_EPISODES:]).any():
-        return "undefined: not reported by the task"
-    return BEST_IS_ZERO if returns[-WINDOW:].max() == 0 else ""
 
 
 def smooth(values: np.ndarray, window: int = WINDOW) -> np.ndarray:
     """The rolling mean of the paper's figures; the first values are means of as many as there are.
 
-    :param values: (N,)
+    :param values: (N,), or (N, n_seeds) to be smoothed seed by seed
     :param window: how many values each mean is taken over
-    :return: (N,)
+    :return: of the same shape
     """
-    sums = np.cumsum(np.concatenate([[0.0], values]))
-    ends = np.arange(1, len(values) + 1)
-    starts = np.maximum(ends - window, 0)
-    return (sums[ends] - sums[starts]) / (ends - starts)
+    return pd.DataFrame(values).rolling(window, min_periods=1).mean().to_numpy().reshape(np.shape(values))
 
 
 def final_mean(values: np.ndarray) -> float:
@@ -67,4 +50,4 @@ def final_mean(values: np.ndarray) -> float:
     :param values: (N,) of all training episodes in order
     :return: the mean of the last 100; NaN where there are fewer
     """
-    return float(values[-WINDOW:].mean()) if len(values) >= WINDOW else math.nan
+    return float(np.mean(values[-WINDOW:])) if len(values) >= WINDOW else math.nan

@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import argparse
-import csv
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from sb3_actpc.demonstrations.dataset import Demonstrations
 from sb3_actpc.envs import SPARSE_MUJOCO_IDS
@@ -26,45 +26,7 @@ from sb3_actpc.utils.files import atomic_write
 PAPER_FILE = Path(__file__).with_name("paper_results.csv")
 SCORES_FILE = Path(__file__).with_name("reference_scores.csv")
 N_EPISODES = 20
-_SCORE_COLUMNS = (
-    "env",
-    "measure",
-    "random_score",
-    "random_score_std",
-    "random_episodes",
-    "demonstrators_score",
-    "demonstrators_score_std",
-    "demonstrators_episodes",
-)
-
-
-@dataclass(frozen=True)
-class PaperResult:
-    """A row of the paper's tables (arXiv 2209.09174; five trials, mean and standard deviation).
-
-    :param task: name of our task without its version, such as ``"SparseHopper"``
-    :param algorithm: as the paper writes it
-    :param algo: our name for it; empty for one that we do not have
-    :param score: average return over the last 100 episodes; of robosuite tasks, success in percent
-    :param score_std: its standard deviation
-    :param r_stability: R-stability ("S-Dist" of robosuite tasks); None where the paper gives none
-    :param r_stability_std: its standard deviation, likewise
-    :param table: label of the table in the paper's source
-    """
-
-    task: str
-    algorithm: str
-    algo: str
-    score: float
-    score_std: float
-    r_stability: float | None
-    r_stability_std: float | None
-    table: str
-
-    @property
-    def is_success(self) -> bool:
-        """Whether the score is a rate of success in percent."""
-        return self.table == "tab:robosuite_metrics"
+_SUCCESS_TABLE = "tab:robosuite_metrics"  # its scores are rates of success in percent
 
 
 @dataclass(frozen=True)
@@ -89,37 +51,28 @@ class ReferenceScore:
         return (values - self.random) / (self.demonstrators - self.random)
 
 
+def paper_results(env_id: str | None = None) -> pd.DataFrame:
+    """Rows of the paper's two tables of results (arXiv 2209.09174; five trials, mean and standard deviation).
+
+    :param env_id: Gymnasium id of a task, any version; None for all
+    :return: ``task`` (our name without its version), ``algorithm`` (as the paper writes it), ``algo`` (our name), ``score``
+        and ``score_std`` (average return over the last 100 episodes; of robosuite tasks, success in percent),
+        ``r_stability`` and ``r_stability_std`` ("S-Dist" of robosuite tasks; NaN where the paper gives none), ``table``
+        (label in the paper's source), ``is_success``; no row for a task that the paper does not have
+    """
+    rows = pd.read_csv(PAPER_FILE)
+    rows["is_success"] = rows["table"] == _SUCCESS_TABLE
+    return rows if env_id is None else rows[rows["task"] == env_id.rpartition(":")[2].rpartition("-")[0]]
+
+
 @cache
-def paper_results() -> tuple[PaperResult, ...]:
-    """All rows of the paper's two tables of results."""
-    with open(PAPER_FILE, newline="", encoding="utf-8") as file:
-        return tuple(
-            PaperResult(
-                **{name: row[name] for name in ("task", "algorithm", "algo", "table")},
-                score=float(row["score"]),
-                score_std=float(row["score_std"]),
-                r_stability=float(row["r_stability"]) if row["r_stability"] else None,
-                r_stability_std=float(row["r_stability_std"]) if row["r_stability_std"] else None,
-            )
-            for row in csv.DictReader(file)
-        )
-
-
-def paper_results_of(env_id: str) -> list[PaperResult]:
-    """
-    :param env_id: Gymnasium id of a task, any version
-    :return: its rows; empty for a task that the paper does not have
-    """
-    name = env_id.rpartition(":")[2].rpartition("-")[0]
-    return [result for result in paper_results() if result.task == name]
-
-
 def reference_score(env_id: str) -> ReferenceScore | None:
     """
     :param env_id: Gymnasium id of a task
     :return: its scores; None where none were measured
     """
-    return _reference_scores().get(env_id)
+    row = pd.read_csv(SCORES_FILE, index_col="env").dropna().T.get(env_id)
+    return None if row is None else ReferenceScore(float(row.random_score), float(row.demonstrators_score), row.measure)
 
 
 def measure_of(env_id: str) -> str:
@@ -129,22 +82,6 @@ def measure_of(env_id: str) -> str:
     """
     reference = reference_score(env_id)
     return "dense_return" if reference is None else reference.measure
-
-
-@cache
-def _reference_scores() -> dict[str, ReferenceScore]:
-    return {
-        row["env"]: ReferenceScore(float(row["random_score"]), float(row["demonstrators_score"]), row["measure"])
-        for row in _score_rows()
-        if row["demonstrators_score"]
-    }
-
-
-def _score_rows(path: Path = SCORES_FILE) -> list[dict[str, str]]:
-    if not path.is_file():
-        return []
-    with open(path, newline="", encoding="utf-8") as file:
-        return list(csv.DictReader(file))
 
 
 # ------------------------------------------------------------------ measuring
@@ -174,7 +111,7 @@ def measure_scores(env_id: str, n_episodes: int = N_EPISODES, seed: int = 0) -> 
     :param env_id: Gymnasium id of a sparse task
     :param n_episodes: episodes of random actions; episode i begins with ``reset(seed=seed + i)``
     :param seed: see there
-    :return: a row of ``reference_scores.csv``; the demonstrators' figures are empty for a task without demonstrations
+    :return: a row of ``reference_scores.csv``; the demonstrators' figures are missing for a task without demonstrations
     :raises gymnasium.error.Error: when the task is unknown
     """
     envs = make_eval_envs(env_id, {}, n_episodes)
@@ -183,20 +120,17 @@ def measure_scores(env_id: str, n_episodes: int = N_EPISODES, seed: int = 0) -> 
     finally:
         for env in envs:
             env.close()
+    is_success = bool(paper_results(env_id)["is_success"].any())
     path = find_demonstrations(env_id, "shipped")
-    shown = None if path is None else Demonstrations.load(path)
-    if any(result.is_success for result in paper_results_of(env_id)):
-        row = {"env": env_id, "measure": "success_rate", **_moments("random", played.successes)}
-        demonstrated = None if shown is None else (shown.episode_returns > 0).astype(float)
-    else:
-        row = {"env": env_id, "measure": "dense_return", **_moments("random", played.dense_returns)}
-        demonstrated = None if shown is None else shown.dense_returns
-    return {**row, **({} if demonstrated is None else _moments("demonstrators", demonstrated))}
-
-
-def _moments(who: str, values: np.ndarray) -> dict[str, Any]:
-    spread = round(float(values.std(ddof=1)), 3)
-    return {f"{who}_score": round(float(values.mean()), 3), f"{who}_score_std": spread, f"{who}_episodes": len(values)}
+    scores: dict[str, Any] = {"random": played.successes if is_success else played.dense_returns}
+    if path is not None:
+        shown = Demonstrations.load(path)
+        scores["demonstrators"] = (shown.episode_returns > 0).astype(float) if is_success else shown.dense_returns
+    row: dict[str, Any] = {"env": env_id, "measure": "success_rate" if is_success else "dense_return"}
+    for who, values in scores.items():
+        spread = round(float(values.std(ddof=1)), 3)
+        row |= {f"{who}_score": round(float(values.mean()), 3), f"{who}_score_std": spread, f"{who}_episodes": len(values)}
+    return row
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -209,14 +143,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("envs", nargs="*", help="tasks (default: the sparse MuJoCo tasks that ship with demonstrations)")
     parser.add_argument("--output", type=Path, default=SCORES_FILE, help="file to write (default: the package's)")
     args = parser.parse_args(argv)
-    rows: dict[str, dict[str, Any]] = {row["env"]: dict(row) for row in _score_rows(args.output)}
+    columns = pd.read_csv(SCORES_FILE, nrows=0).columns
+    known = pd.read_csv(args.output) if args.output.is_file() else pd.DataFrame(columns=columns)
+    rows: dict[str, Any] = {row["env"]: row for row in known.to_dict("records")}
     for env_id in args.envs or [env_id for env_id in SPARSE_MUJOCO_IDS if env_id.endswith("-v5")]:
         rows[env_id] = measure_scores(env_id)
         print(", ".join(f"{name} {value}" for name, value in rows[env_id].items()), flush=True)
     with atomic_write(args.output, "w") as file:
-        writer = csv.DictWriter(file, _SCORE_COLUMNS, restval="", lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows[env_id] for env_id in sorted(rows))
+        pd.DataFrame([rows[env_id] for env_id in sorted(rows)], columns=columns).convert_dtypes().to_csv(file, index=False)
     return 0
 
 

@@ -1,17 +1,16 @@
-"""What the runs of a comparison have measured, read from their folders."""
+"""What the runs of a comparison have measured, as tables: read from their folders, or from the small files of an export."""
 
 from __future__ import annotations
 
-import csv
+import io
 import math
-from collections import defaultdict
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from functools import cached_property
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from sb3_actpc.experiments.comparison.execution import ERROR, FINISHED, read_error, run_status
 from sb3_actpc.experiments.comparison.run_table import content_id
@@ -21,192 +20,185 @@ from sb3_actpc.experiments.runs.episode_log import EPISODES
 from sb3_actpc.experiments.runs.evaluation import PROGRESS
 from sb3_actpc.experiments.runs.record import CONFIG, read_config
 from sb3_actpc.experiments.runs.run import DIAGNOSTICS
+from sb3_actpc.utils.files import atomic_write
 
-Columns = dict[str, np.ndarray]
+RUNS, CURVES, SETTINGS = "results.csv", "curves.csv.gz", "settings.json"  # of an export
+SETTLED = 5000  # the worst evaluation is looked for from this step on
+# columns of progress.csv -> of episodes.csv
+MEASURES = {"dense_return": "dense_return", "sparse_return": "sparse_return", "success_rate": "success"}
+_TEXTS = ["task", "variant", "algorithm", "settings", "demonstrations", "status", "version", "versions", "commit", "error"]
+_NO_ROWS = pd.DataFrame(columns=["run"])
 
 
-def read_columns(path: Path) -> Columns:
+@dataclass(frozen=True)
+class Results:
+    """Tables of a comparison.
+
+    :param runs: a row for each run, indexed by its folder's name: ``task``, ``variant``, ``algorithm``, ``settings`` (an id
+        that runs share which differ in their seeds alone), ``demonstrations``, ``seed``, ``status``, ``steps``, what it
+        reached (see :func:`run_measures`), ``seconds``, ``versions``, ``commit``, ``dirty`` (from a source tree with changes)
+        and ``label``: the variant's name, with a part of ``settings`` where several go by that name
+    :param evaluations: the rows of ``progress.csv``, with the column ``run``
+    :param episodes: the rows of ``episodes.csv`` likewise: every training episode; empty for an export
+    :param diagnostics: what the agents logged about themselves, likewise
+    """
+
+    runs: pd.DataFrame
+    evaluations: pd.DataFrame
+    episodes: pd.DataFrame
+    diagnostics: pd.DataFrame
+
+    @property
+    def finished(self) -> pd.DataFrame:
+        """The rows of the finished runs."""
+        return self.runs[self.runs["status"] == FINISHED]
+
+    def groups(self, task: str) -> dict[str, pd.DataFrame]:
+        """
+        :param task: Gymnasium id
+        :return: label -> rows of its finished runs on the task, which differ in their seeds alone
+        """
+        runs = self.finished[self.finished["task"] == task].sort_values("seed", kind="stable")
+        return {str(label): rows for label, rows in runs.groupby("label")}
+
+
+def side_by_side(rows: pd.DataFrame, runs: pd.Index, index: str, column: str) -> pd.DataFrame:
+    """
+    :param rows: of :class:`Results`, with the column ``run``
+    :param runs: which ones
+    :param index: column of steps or episodes
+    :param column: what to lay side by side
+    :return: one column for each run, where all of them have a value
+    """
+    if column not in rows:
+        return pd.DataFrame()
+    return rows[rows["run"].isin(runs)].pivot(index=index, columns="run", values=column).dropna()
+
+
+def read_rows(path: Path) -> pd.DataFrame:
     """
     :param path: a CSV file of numbers; a last row that was not written to its end is left out
-    :return: each column, (n_rows,) float64, NaN where it is empty; empty arrays, or none, where there is no row or no file
+    :return: its rows, NaN where empty; none where there is no row or no file
     """
-    if not path.is_file():
-        return {}
-    with open(path, newline="", encoding="utf-8") as file:
-        header, *rows = [*csv.reader(file)] or [[]]
-    values = [[_number(text) for text in row] for row in rows if len(row) == len(header)]
-    table = np.array(values, dtype=np.float64).reshape(len(values), len(header))
-    return {name: table[:, index] for index, name in enumerate(header)}
+    text = path.read_text(encoding="utf-8") if path.is_file() else ""
+    whole = text[: text.rfind("\n") + 1]
+    if not whole:
+        return pd.DataFrame()
+    return pd.read_csv(io.StringIO(whole), on_bad_lines="skip").apply(pd.to_numeric, errors="coerce")
 
 
-def _number(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        return math.nan
-
-
-@dataclass(frozen=True)
-class RunResult:
-    """A run on the disk.
-
-    :param folder: its own
-    :param task: the comparison's task
-    :param variant: name of the variant
-    :param status: of :func:`~sb3_actpc.experiments.comparison.execution.run_status`
-    :param config: its ``config.json``; empty where it failed before that was written
-    :param error: what ended a failed one
+def load_results(folder: Path) -> Results:
     """
-
-    folder: Path
-    task: str
-    variant: str
-    status: str
-    config: dict[str, Any] = field(default_factory=dict)
-    error: str = ""
-
-    @cached_property
-    def progress(self) -> Columns:
-        """The evaluations."""
-        return read_columns(self.folder / PROGRESS)
-
-    @cached_property
-    def episodes(self) -> Columns:
-        """Every training episode."""
-        return read_columns(self.folder / EPISODES)
-
-    @cached_property
-    def diagnostics(self) -> Columns:
-        """What the agent logged about itself."""
-        return read_columns(self.folder / DIAGNOSTICS)
-
-    @property
-    def seed(self) -> int:
-        """Of the run."""
-        return int(self.folder.name.partition("_")[0].removeprefix("seed"))
-
-    @property
-    def content(self) -> str:
-        """An id that the runs of all seeds share which differ in nothing else."""
-        return content_id(self.config)
-
-    @property
-    def timesteps(self) -> int:
-        """Environment steps until the last evaluation."""
-        steps = self.progress.get("timesteps", np.empty(0))
-        return int(steps[-1]) if len(steps) else 0
-
-    def last(self, name: str) -> float:
-        """
-        :param name: column of ``progress.csv``
-        :return: its last value; NaN without one
-        """
-        values = self.progress.get(name, np.empty(0))
-        return float(values[-1]) if len(values) else math.nan
-
-    def episode_values(self, name: str) -> np.ndarray:
-        """
-        :param name: column of ``episodes.csv``
-        :return: (n_episodes,)
-        """
-        return self.episodes.get(name, np.empty(0))
-
-    @cached_property
-    def measures(self) -> dict[str, float]:
-        """Everything that the report gives of a single run; NaN where it is undefined."""
-        values = {f"average_{name}": final_mean(self.episode_values(column)) for name, column in _EPISODE_MEASURES.items()}
-        values |= {
-            f"r_stability_{name}": r_stability(self.episode_values(column)) for name, column in _EPISODE_MEASURES.items()
-        }
-        values |= {f"evaluation_{name}": self.last(column) for name, column in _EVALUATION_MEASURES.items()}
-        reference = reference_score(self.task)
-        values["normalized"] = math.nan if reference is None else reference.normalize(self.last(reference.measure))
-        demonstrators = self.config.get("demonstrators_return")
-        values["demonstrators_return"] = math.nan if demonstrators is None else float(demonstrators)
-        training_seconds = self.last("seconds") - self.last("evaluation_seconds")
-        values["steps_per_second"] = self.timesteps / max(training_seconds, 0.01)
-        values["seconds"], values["updates"] = self.last("seconds"), self.last("updates")
-        return values
-
-
-_EPISODE_MEASURES = {"dense": "dense_return", "sparse": "sparse_return", "success": "success"}
-_EVALUATION_MEASURES = {"dense": "dense_return", "sparse": "sparse_return", "success": "success_rate"}
-
-
-@dataclass(frozen=True)
-class Group:
-    """The finished runs of one variant on one task, which differ in their seeds alone.
-
-    :param task: Gymnasium id
-    :param variant: name, with a part of an id where several sets of settings go by that name
-    :param runs: by seed
-    """
-
-    task: str
-    variant: str
-    runs: tuple[RunResult, ...]
-
-    @property
-    def algo(self) -> str:
-        """Name of the algorithm."""
-        return str(self.runs[0].config["algo"])
-
-    def values(self, name: str) -> np.ndarray:
-        """
-        :param name: key of :attr:`RunResult.measures`
-        :return: (n_seeds,)
-        """
-        return np.array([run.measures[name] for run in self.runs])
-
-    def last(self, name: str) -> np.ndarray:
-        """
-        :param name: column of ``progress.csv``
-        :return: (n_seeds,), the last evaluation of each; NaN without one
-        """
-        return np.array([run.last(name) for run in self.runs])
-
-    def column(self, get: Callable[[RunResult], np.ndarray]) -> np.ndarray:
-        """
-        :param get: a column of a run
-        :return: (n_seeds, n), cut to the shortest
-        """
-        columns = [get(run) for run in self.runs]
-        return np.stack([column[: min(map(len, columns))] for column in columns])
-
-
-def load_runs(folder: Path) -> list[RunResult]:
-    """
-    :param folder: of a comparison
+    :param folder: of a comparison, or of an export
     :return: its runs, begun and finished
     :raises FileNotFoundError: when there is none
+    :raises OSError: when one cannot be read
     """
+    if (folder / CURVES).is_file():
+        runs = pd.read_csv(folder / RUNS, index_col="run", dtype=dict.fromkeys(_TEXTS, str))  # else 12e4567890 is a number
+        runs[_TEXTS] = runs[_TEXTS].fillna("")
+        return Results(_labelled(runs), pd.read_csv(folder / CURVES), _NO_ROWS, _NO_ROWS)
     found = sorted({path.parent for name in (CONFIG, ERROR) for path in folder.glob(f"*/*/seed[0-9]*_*/{name}")})
     if not found:
         raise FileNotFoundError(f"no runs in {folder}: make some with sb3-actpc compare --out {folder}")
-    return [_load_run(path) for path in found]
+    rows = []
+    tables: dict[str, list[pd.DataFrame]] = {PROGRESS: [], EPISODES: [], DIAGNOSTICS: []}
+    for path in found:
+        name = path.relative_to(folder).as_posix()
+        own = {file: read_rows(path / file) for file in tables}
+        rows.append({"run": name, **_run_row(path, own[PROGRESS], own[EPISODES])})
+        for file, table in own.items():
+            tables[file].append(table.assign(run=name))
+    evaluations, episodes, diagnostics = (
+        pd.concat([part for part in parts if len(part)] or [_NO_ROWS], ignore_index=True) for parts in tables.values()
+    )
+    return Results(_labelled(pd.DataFrame(rows).set_index("run")), evaluations, episodes, diagnostics)
 
 
-def _load_run(folder: Path) -> RunResult:
-    variant, task = folder.parent.name, folder.parent.parent.name
+def run_measures(task: str, evaluations: pd.DataFrame, episodes: pd.DataFrame) -> dict[str, float]:
+    """What one run has reached; NaN where it is undefined.
+
+    :param task: Gymnasium id
+    :param evaluations: rows of its ``progress.csv``
+    :param episodes: rows of its ``episodes.csv``
+    :return: of dense return, sparse return and success rate: the last evaluation's, the worst from 5,000 steps on, the mean of
+        the evaluations in the last half of the steps, the mean of the last 100 training episodes and their R-stability; the
+        measure by which the task is compared, 0 for random actions and 1 for the demonstrators; and what it took
+    """
+    values: dict[str, float] = {}
+    steps = evaluations.get("timesteps", pd.Series(dtype=float))
+    end = float(steps.max()) if len(steps) else 0.0
+    for name, in_episodes in MEASURES.items():
+        column = evaluations.get(name, pd.Series(dtype=float))
+        training = episodes.get(in_episodes, pd.Series(dtype=float)).to_numpy()
+        values[name] = column.iloc[-1] if len(column) else math.nan
+        values[f"{name}_worst"] = column[steps >= SETTLED].min()
+        values[f"{name}_last_half"] = column[(steps >= end / 2) & (steps > 0)].mean()
+        values[f"{name}_training"] = final_mean(training)
+        values[f"{name}_r_stability"] = r_stability(training)
+    reference = reference_score(task)
+    values["normalized"] = math.nan if reference is None else reference.normalize(values[reference.measure])
+    seconds, evaluation, values["updates"] = (
+        evaluations[name].iloc[-1] if len(steps) else math.nan for name in ("seconds", "evaluation_seconds", "updates")
+    )
+    # the clock's resolution is a hundredth of a second
+    return {**values, "seconds": seconds, "steps_per_second": end / max(seconds - evaluation, 0.01)}
+
+
+def _run_row(folder: Path, evaluations: pd.DataFrame, episodes: pd.DataFrame) -> dict[str, Any]:
+    """A row of :class:`Results`' runs. A run that failed before it wrote its settings has hardly more than a name."""
     try:
-        config = read_config(folder)
-    except (FileNotFoundError, ValueError) as error:
-        return RunResult(folder, task, variant, run_status(folder), error=read_error(folder) or str(error))
-    return RunResult(folder, task, variant, run_status(folder), config, read_error(folder))
+        config, error = read_config(folder), read_error(folder)
+    except (FileNotFoundError, ValueError) as problem:
+        config, error = {}, read_error(folder) or str(problem)
+    task, variant = folder.parent.parent.name, folder.parent.name
+    steps = evaluations["timesteps"].iloc[-1] if len(evaluations) else 0
+    return {
+        "task": task,
+        "variant": variant,
+        "algorithm": config.get("algo", ""),
+        "settings": content_id(config) if config else "",
+        "demonstrations": Path(config.get("demonstrations") or "none").name if config else "",
+        "seed": int(folder.name.partition("_")[0].removeprefix("seed")),
+        "status": run_status(folder),
+        "steps": int(steps),
+        "planned_steps": config.get("n_timesteps", 0),
+        "episodes": len(episodes),
+        **run_measures(task, evaluations, episodes),
+        "demonstrators_return": np.nan if config.get("demonstrators_return") is None else config["demonstrators_return"],
+        **_provenance(config),
+        "error": error,
+    }
 
 
-def group_runs(runs: Sequence[RunResult]) -> list[Group]:
+def _provenance(config: Mapping[str, Any]) -> dict[str, Any]:
+    versions = dict(config.get("versions", {}))
+    commit, _, changes = (config.get("git_commit") or "").partition("+")
+    return {
+        "version": versions.pop("sb3-actpc", ""),
+        "versions": ", ".join(f"{name} {version}" for name, version in versions.items()),
+        "commit": commit[:10],
+        "dirty": bool(changes),
+    }
+
+
+def _labelled(runs: pd.DataFrame) -> pd.DataFrame:
+    finished = runs[runs["status"] == FINISHED]
+    several = finished.groupby(["task", "variant"])["settings"].nunique() > 1
+    labels = [
+        f"{variant} [{settings[:4]}]" if several.get((task, variant), False) else variant
+        for task, variant, settings in zip(runs["task"], runs["variant"], runs["settings"], strict=True)
+    ]
+    return runs.assign(label=labels)
+
+
+def write_runs(results: Results, folder: Path) -> Path:
     """
-    :param runs: any
-    :return: the finished ones, those together that differ in their seeds alone
+    :param results: of a comparison
+    :param folder: where to write ``results.csv``
+    :return: the file
+    :raises OSError: when it cannot be written
     """
-    by_content: dict[tuple[str, str, str], list[RunResult]] = defaultdict(list)
-    for run in runs:
-        if run.status == FINISHED:
-            by_content[run.task, run.variant, run.content].append(run)
-    names = [(task, variant) for task, variant, _ in by_content]
-    groups = []
-    for (task, variant, content), members in by_content.items():
-        label = variant if names.count((task, variant)) == 1 else f"{variant} [{content[:4]}]"
-        groups.append(Group(task, label, tuple(sorted(members, key=lambda run: run.seed))))
-    return groups
+    with atomic_write(folder / RUNS, "w") as file:
+        results.runs.drop(columns="label").to_csv(file, float_format="%.8g")
+    return folder / RUNS

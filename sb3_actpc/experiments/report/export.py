@@ -1,0 +1,44 @@
+"""A comparison in a few small files."""
+
+from __future__ import annotations
+
+import gzip
+import json
+from pathlib import Path
+from typing import Any
+
+from sb3_actpc.experiments.comparison.run_table import CONTENT, content_id
+from sb3_actpc.experiments.report.figures import draw_curves
+from sb3_actpc.experiments.report.results import CURVES, SETTINGS, load_results, write_runs
+from sb3_actpc.experiments.runs.record import CONFIG, read_config
+from sb3_actpc.utils.files import atomic_write
+
+
+def export(folder: Path, target: Path) -> list[Path]:
+    """Write what is worth keeping of a comparison into a few small files, from which tables and figures can be made again.
+
+    ``results.csv`` has a row for each run, ``curves.csv.gz`` their evaluations, ``settings.json`` what the ids of settings
+    stand for, ``curves_TASK.png`` the figure of each task.
+
+    :param folder: of the comparison
+    :param target: where to write
+    :return: the files
+    :raises FileNotFoundError: when there are no runs
+    :raises OSError: when a file cannot be written
+    """
+    results = load_results(folder)
+    settings: dict[str, Any] = {}
+    for path in sorted(folder.glob(f"*/*/seed[0-9]*_*/{CONFIG}")):
+        config = read_config(path.parent)
+        settings[content_id(config)] = {name: config[name] for name in CONTENT if config.get(name) is not None}
+    curves = results.evaluations[["run", *results.evaluations.columns.drop("run")]]
+    with atomic_write(target / CURVES) as binary, gzip.GzipFile("", "wb", fileobj=binary, mtime=0) as packed:
+        packed.write(curves.to_csv(index=False, float_format="%.6g").encode())
+    with atomic_write(target / SETTINGS, "w") as file:
+        file.write("{\n" + ",\n".join(f'"{name}": {json.dumps(settings[name])}' for name in sorted(settings)) + "\n}\n")
+    files = [write_runs(results, target), target / CURVES, target / SETTINGS]
+    kept = load_results(target)
+    for task in kept.finished["task"].unique():
+        files.append(target / f"curves_{task}.png")
+        draw_curves(kept, task, files[-1])
+    return files

@@ -1,0 +1,148 @@
+"""Tables of Markdown files that no hand has typed: written from exports, between markers that say what stands in them.
+
+    <!-- table: NAME
+    from: examples/results/first                    # folder of an export, beside the Markdown file
+    rows: {ActPC: actpc, demonstrators: demonstrators}
+    columns: {Hopper: SparseHopper-v5, Reacher: {task: SparseReacher-v5, score: "{success_rate:.2f}"}}
+    score: "{dense_return:.0f} ({sparse_return:.0f})"
+    cell: "{score}, {steps:,.0f}"
+    -->
+    | ... |
+    <!-- /table -->
+
+What a row or a column says is added to what the table says, the row last; a text alone is the variant of a row and the task of
+a column. ``from``, ``task``, ``variant``, ``settings`` and ``planned_steps`` choose runs, ``cell`` says what is written of
+them: columns of ``results.csv`` with a format, which give the mean over the seeds, or with ``each``, ``min``, ``max`` or
+``std`` before it, as in ``{dense_return:each .0f}``; ``{n}``, the number of seeds; and ``{score}``, which stands for what
+``score`` says. A cell without runs is empty. The variants ``demonstrators``, ``random`` and ``paper:ALGO`` are known
+everywhere.
+"""
+
+from __future__ import annotations
+
+import re
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import yaml
+
+from sb3_actpc.experiments.report.figures import reference_lines
+from sb3_actpc.experiments.report.references import measure_of, paper_results
+from sb3_actpc.experiments.report.results import load_results
+from sb3_actpc.experiments.report.tables import UNDEFINED, markdown, number
+from sb3_actpc.utils.files import atomic_write
+
+DIRTY_NOTE = "† with runs from a source tree with uncommitted changes"
+_MARKER = re.compile(r"(<!-- table: (\S+)\n(.*?)-->\n).*?(<!-- /table -->)", re.DOTALL)
+_CHOOSING = ("task", "variant", "settings", "planned_steps")
+_KEYS = {"from", "rows", "columns", "cell", "score", *_CHOOSING}
+
+
+def write_tables(path: Path) -> bool:
+    """Write the tables of a Markdown file anew.
+
+    :param path: of the file
+    :return: whether it has changed
+    :raises ValueError: when a marker is wrong
+    :raises OSError: when the file, or an export, cannot be read, or the file not be written
+    """
+    text = path.read_text(encoding="utf-8")
+    filled = fill_tables(text, path.parent)
+    if filled != text:
+        with atomic_write(path, "w") as file:
+            file.write(filled)
+    return filled != text
+
+
+def fill_tables(text: str, folder: Path) -> str:
+    """
+    :param text: Markdown
+    :param folder: that ``from`` is relative to
+    :return: the same with its tables written anew
+    :raises ValueError: when a marker is not closed, or says something unknown
+    :raises FileNotFoundError: when an export is missing
+    """
+    found = len(_MARKER.findall(text))
+    if not found == text.count("<!-- table:") == text.count("<!-- /table -->"):
+        raise ValueError(
+            "tables are marked by '<!-- table: NAME', a line break, settings, '-->' ... '<!-- /table -->': "
+            f"{text.count('<!-- table:')} begin, {text.count('<!-- /table -->')} end, {found} are whole"
+        )
+
+    def filled(match: re.Match[str]) -> str:
+        try:
+            return f"{match[1]}{_table(yaml.safe_load(match[3]), folder)}\n{match[4]}"
+        except (ValueError, KeyError, yaml.YAMLError) as error:
+            raise ValueError(f"table {match[2]}: {error}") from error
+
+    return _MARKER.sub(filled, text)
+
+
+class _OverSeeds:
+    """Values of the seeds, which a format makes into one text."""
+
+    def __init__(self, values: pd.Series) -> None:
+        self.values = values.to_numpy(dtype=np.float64)
+
+    def __format__(self, form: str) -> str:
+        how, _, form = form.rpartition(" ")
+        known: dict[str, Any] = {
+            "": [self.values.mean()],
+            "each": self.values,
+            "min": [self.values.min()],
+            "max": [self.values.max()],
+            "std": [self.values.std(ddof=1) if len(self.values) > 1 else np.nan],
+        }
+        if how not in known:
+            raise ValueError(f"unknown {how!r} in a format: each, min, max, std, or nothing for the mean")
+        return ", ".join(number(value, form) for value in known[how])
+
+
+def _table(spec: dict[str, Any], folder: Path) -> str:
+    rows, columns = spec.pop("rows"), spec.pop("columns")
+    by_column = [column if isinstance(column, dict) else {"task": column} for column in columns.values()]
+    by_row = {name: row if isinstance(row, dict) else {"variant": row} for name, row in rows.items()}
+    cells = [[name, *(_cell({**spec, **column, **row}, folder) for column in by_column)] for name, row in by_row.items()]
+    text = markdown(pd.DataFrame(cells, columns=["", *columns]))
+    return f"{text}\n\n{DIRTY_NOTE}" if "†" in text else text
+
+
+def _cell(spec: dict[str, Any], folder: Path) -> str:
+    if unknown := sorted(set(spec) - _KEYS):
+        raise ValueError(f"unknown {', '.join(unknown)}; known are {', '.join(sorted(_KEYS))}")
+    runs = _runs(folder / spec["from"])
+    for key in _CHOOSING:
+        if key not in spec:
+            continue
+        if spec[key] not in (known := runs[key].unique()):
+            raise ValueError(f"no {key} {spec[key]!r} in {spec['from']}: there are {', '.join(sorted(map(str, known)))}")
+    for key in _CHOOSING:
+        runs = runs[runs[key] == spec[key]] if key in spec else runs
+    if runs.empty:
+        return ""
+    if runs["seed"].duplicated().any():
+        raise ValueError(f"several runs with one seed for {spec}: name settings ({', '.join(runs['settings'].unique())})")
+    fields: dict[str, Any] = {name: _OverSeeds(runs[name]) for name in map(str, runs.select_dtypes("number"))}
+    fields["n"] = len(runs)
+    fields["score"] = spec.get("score", "").format(**fields)
+    text = re.sub(rf"\s*\({UNDEFINED}\)|, {UNDEFINED}", "", spec["cell"].format(**fields))  # what is not known is left out
+    return f"{text} †" if runs["dirty"].any() else text
+
+
+@cache
+def _runs(folder: Path) -> pd.DataFrame:
+    """The finished runs of an export, and a row for each of the references of its tasks."""
+    results = load_results(folder)
+    rows = []
+    for task in results.finished["task"].unique():
+        measure = measure_of(task)
+        lines = reference_lines(results, task)
+        rows += [{"task": task, "variant": name.removesuffix(" actions"), measure: value} for name, value in lines.items()]
+        for _, row in paper_results(task).iterrows():
+            score = row.score / 100 if row.is_success else row.score
+            rows.append({"task": task, "variant": f"paper:{row.algo}", measure: score})
+    references = pd.DataFrame(rows).assign(dirty=False, seed=0, settings="")
+    return pd.concat([results.finished, references])

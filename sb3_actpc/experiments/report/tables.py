@@ -1,0 +1,54 @@
+"""Tables as Markdown, and numbers as their cells."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pandas as pd
+
+from sb3_actpc.experiments.report.statistics import Interval
+
+UNDEFINED = "n/a"
+
+
+def number(value: float, form: str) -> str:
+    """
+    :param value: any, NaN for an undefined one
+    :param form: of a format, such as ``".1f"``
+    :return: a cell
+    """
+    return UNDEFINED if math.isnan(value) else format(value, form)
+
+
+def mean_and_deviation(values: np.ndarray, form: str) -> str:
+    """
+    :param values: (n_seeds,), NaN where undefined
+    :param form: of a format
+    :return: mean ± sample standard deviation of those that are defined, and of how many (n of N) where not of all
+    """
+    known = values[~np.isnan(values)]
+    if not len(known):
+        return UNDEFINED
+    spread = f" ± {format(known.std(ddof=1), form)}" if len(known) > 1 else ""
+    share = f" ({len(known)} of {len(values)})" if len(known) < len(values) else ""
+    return f"{format(known.mean(), form)}{spread}{share}"
+
+
+def interval(bounds: Interval, form: str) -> str:
+    """
+    :param bounds: lower and upper, NaN where there is none
+    :param form: of a format
+    :return: a cell
+    """
+    return "" if math.isnan(bounds[0]) else f"{format(bounds[0], form)} to {format(bounds[1], form)}"
+
+
+def markdown(table: pd.DataFrame) -> str:
+    """
+    :param table: of texts; of columns with two levels, each is named ``first: second``
+    :return: GitHub's Markdown
+    """
+    names = [": ".join(filter(None, name)) if isinstance(name, tuple) else str(name) for name in table.columns]
+    lines = [names, ["---"] * len(names), *table.astype(str).to_numpy().tolist()]
+    return "\n".join("| " + " | ".join(text.replace("|", "\\|") for text in line) + " |" for line in lines)
