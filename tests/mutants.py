@@ -53,21 +53,34 @@ LEARNS, STORES = "tests/actpc/test_agent.py", "tests/actpc/test_buffers.py"
 COUPLED, SPARSE = "ngc/coupled.py", "envs/sparse_mujoco.py"
 STATISTICS, R_STABILITY = "experiments/report/statistics.py", "experiments/report/r_stability.py"
 SETTLING, LEARNING, SCHEDULED = (f"tests/ngc/test_{name}.py" for name in ("settling", "plasticity", "scheduled"))
+CLOSED, EQUATIONS = "tests/ngc/test_closed_forms.py", "tests/actpc/test_equations.py"
 TASKS = "tests/envs/test_sparse_mujoco.py"
 SCORES, STABLE = (f"tests/experiments/report/test_{name}.py" for name in ("statistics", "r_stability"))
 
 MUTANTS = [
     # ------------------------------------------------------------------ circuits
-    Mutant("changes are subtracted", CIRCUIT, "th._foreach_neg(changes.tensors())", "changes.tensors()", LEARNING),
+    Mutant(
+        "changes are subtracted",
+        CIRCUIT,
+        "th._foreach_neg(changes.tensors())",
+        "changes.tensors()",
+        f"{LEARNING} -k plain_sgd",
+    ),
     Mutant(
         "error synapses change in the other direction",
         CIRCUIT,
         "parameter.grad = weights.grad[:, weights",
         "parameter.grad = -weights.grad[:, weights",
-        f"{LEARNING} -k align",
+        f"{LEARNING} -k plain_sgd",
     ),
-    Mutant("error synapses learn at the weights' rate", CIRCUIT, "scale = self.feedback_rate", "scale = 1.0", LEARNING),
-    Mutant("biases decay", CIRCUIT, "if parameter.dim() > 1]", "if parameter.dim() > 0]", f"{LEARNING} -k decay"),
+    Mutant(
+        "error synapses learn at the weights' rate",
+        CIRCUIT,
+        "scale = self.feedback_rate",
+        "scale = 1.0",
+        f"{LEARNING} -k gamma_e",
+    ),
+    Mutant("biases decay", CIRCUIT, "if parameter.dim() > 1]", "if parameter.dim() > 0]", f"{LEARNING} -k spares_the_biases"),
     Mutant("late errors count less", CIRCUIT, "else e / share for", "else e * share for", f"{SETTLING} -k arriv"),
     Mutant(
         "one step of settling too many",
@@ -84,35 +97,39 @@ MUTANTS = [
         f"{SETTLING} -k project",
     ),
     Mutant(
-        "changes are sums over the batch", PLASTICITY, "inverse_batch = 1.0 / len(errors[0])", "inverse_batch = 1.0", SETTLING
+        "changes are sums over the batch",
+        PLASTICITY,
+        "inverse_batch = 1.0 / len(errors[0])",
+        "inverse_batch = 1.0",
+        f"{SETTLING} -k hebbian",
     ),
     Mutant(
         "the memory's weight is left out of its change",
         PLASTICITY,
         "[memory_weight * (error.t() @ memory)",
         "[(error.t() @ memory)",
-        f"{SETTLING} {SCHEDULED} {LEARNING} -k 'hebbian or backprop or memory'",
+        CLOSED,
     ),
     Mutant(
         "columns are stretched to the bound",
         PLASTICITY,
         "norms.clamp_min(bound)",
         "norms",
-        f"{LEARNING} -k column_norm",
+        CLOSED,
     ),
     Mutant(
         "steps near the soft bound are not shortened",
         PLASTICITY,
         "step.mul_((1.0 - old.abs() / bound).clamp_(0.0, 1.0))",
         "step.mul_(1.0)",
-        f"{LEARNING} -k soft_bound",
+        CLOSED,
     ),
     Mutant(
         "the output's error has the other sign",
         DYNAMICS,
         "th.sub(self.target, self.output",
         "th.sub(self.output, self.target",
-        SETTLING,
+        f"{SETTLING} -k gradient",
     ),
     Mutant(
         "the leak pushes away from rest",
@@ -133,31 +150,31 @@ MUTANTS = [
         DYNAMICS,
         "self.synapses.weights[layer - 1].t(), alpha=-1.0)",
         "self.synapses.weights[layer - 1].t())",
-        SETTLING,
+        f"{SETTLING} -k 'one_step or fixed_point'",
     ),
     Mutant(
         "the sweep goes from the input up",
         DYNAMICS,
         "in range(self.n_hidden, 0, -1):",
         "in range(1, self.n_hidden + 1):",
-        SCHEDULED,
+        f"{SCHEDULED} -k equal_backprop",
     ),
-    Mutant("energy without the half", DYNAMICS, "return 0.5 * th.stack", "return 1.0 * th.stack", SETTLING),
+    Mutant("energy without the half", DYNAMICS, "return 0.5 * th.stack", "return 1.0 * th.stack", CLOSED),
     Mutant(
         "the critic pushes the actor down",
         COUPLED,
         "scale / value.output.shape[1]",
         "-scale / value.output.shape[1]",
-        SCHEDULED,
+        f"{SCHEDULED} -k 'under_scheduled or raises'",
     ),
     Mutant(
         "the pair ignores the nudge",
         COUPLED,
         '== "scheduled" else nudge',
         '== "scheduled" else 1.0',
-        f"{SCHEDULED} -k coupled",
+        f"{SCHEDULED} -k tends_to",
     ),
-    Mutant("the nudge is not divided out", COUPLED, "error.div_(scale)", "error.div_(1.0)", f"{SCHEDULED} -k coupled"),
+    Mutant("the nudge is not divided out", COUPLED, "error.div_(scale)", "error.div_(1.0)", f"{SCHEDULED} -k tends_to"),
     Mutant(
         "the memory's projection is transposed",
         "ngc/memory.py",
@@ -170,7 +187,7 @@ MUTANTS = [
         "ngc/stability.py",
         "SAFETY * error_dynamics_limit(",
         "2 * error_dynamics_limit(",
-        LEARNING,
+        f"{LEARNING} -k auto_rates",
     ),
     # ------------------------------------------------------------------ agent
     Mutant(
@@ -254,7 +271,7 @@ MUTANTS = [
         AGENT,
         "| th.Tensor = self.actor_pressure",
         "| th.Tensor = 1.0",
-        f"{LEARNS} -k 'refresh or pressure'",
+        EQUATIONS,
     ),
     Mutant(
         "the noise on the target's action is not bounded",
@@ -339,14 +356,14 @@ MUTANTS = [
         SIGNALS,
         "(above - (1.0 - self.quantile))",
         "(above - self.quantile)",
-        f"{LEARNS} -k 'normali or quantile'",
+        EQUATIONS,
     ),
     Mutant(
         "demonstrations' instrumental signals are rewards",
         SHOWN,
         "self.instrumental[rows] = -instrumental",
         "self.instrumental[rows] = instrumental",
-        f"{LEARNS} -k demonstr",
+        EQUATIONS,
     ),
     # ------------------------------------------------------------------ buffers
     Mutant(

@@ -1,0 +1,47 @@
+"""Single equations of the agent, each by itself."""
+
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3.common.env_util import make_vec_env
+
+from sb3_actpc import ActPC
+from sb3_actpc.actpc.reward_signals import RunningQuantile
+from tests.actpc.envs import CountingEnv, demonstrations
+
+SMALL = {"settling": "scheduled", "batch_size": 16, "buffer_size": 500, "prior_updates": 5, "seed": 3, "device": "cpu"}
+SGD = {"net_arch": [16, 16], "optimizer_class": th.optim.SGD}  # its steps are the changes themselves
+
+
+def test_the_actors_step_is_proportional_to_the_weight_of_the_critics_pressure():
+    untouched = {"refresh_weight": 0.0, "learning_starts": 60, "learning_rate": 1.0, "policy_kwargs": SGD}
+    steps = []
+    for weight in (0.5, 1.0):
+        env = make_vec_env(CountingEnv)
+        model = ActPC("MlpPolicy", env, actor_pressure=weight, **untouched, **SMALL)
+        model.learn(50)  # nothing is learned yet: both agents are the same
+        before = [parameter.clone() for parameter in model.actor.circuit.parameters()]
+        model._n_updates = 1
+        model._update_actor(model._sample_batch(16))
+        steps.append([new - old for new, old in zip(model.actor.circuit.parameters(), before, strict=True)])
+    assert any(bool(step.abs().max() > 1e-9) for step in steps[1])
+    for half, whole in zip(*steps, strict=True):
+        th.testing.assert_close(2 * half, whole, rtol=1e-3, atol=1e-6)
+
+
+@pytest.mark.parametrize("quantile", [0.9, 0.5])
+def test_the_running_quantile_is_passed_by_as_many_values_as_it_says(quantile):
+    drawn = np.random.default_rng(0).exponential(size=20_000)
+    normalizer = RunningQuantile(quantile)
+    for value in drawn:
+        normalizer(np.array([value]))
+    assert np.mean(drawn <= normalizer.estimate) == pytest.approx(quantile, abs=0.05)
+
+
+def test_demonstrated_steps_are_rewarded_by_surprise_and_punished_for_leaving_the_prior():
+    """What the generator does not foresee draws the agent on, what the prior does not know keeps it back."""
+    env = make_vec_env(CountingEnv)
+    keywords = {"demonstration_fraction": 0.5, "learning_starts": 20, "policy_kwargs": {"net_arch": [16, 16]}, **SMALL}
+    model = ActPC("MlpPolicy", env, demonstrations=demonstrations(), **keywords)
+    model.learn(40)
+    assert model.expert.epistemic.min() > 0.0 > model.expert.instrumental.max()

@@ -1,0 +1,35 @@
+"""Small formulas of the circuits, worked by hand."""
+
+import pytest
+import torch as th
+
+from sb3_actpc.ngc import NGCCircuit
+from sb3_actpc.ngc.plasticity import bound_columns_, hebbian_changes, soft_bound_
+
+
+def test_a_step_shrinks_in_proportion_to_what_is_left_to_the_soft_bound():
+    """M = (w_b - |W|) / w_b: all of it from 0, half of it half way, nothing at the bound, in either direction."""
+    old = th.tensor([0.0, 1.0, -1.0, 2.0, -2.0])
+    new = old + th.tensor([0.4, 0.4, 0.4, -0.4, -0.4])
+    soft_bound_(new, old, 2.0)
+    th.testing.assert_close(new - old, th.tensor([0.4, 0.2, 0.2, 0.0, 0.0]))
+
+
+def test_only_columns_beyond_the_bound_are_shrunk():
+    weights = th.tensor([[3.0, 0.3], [4.0, 0.4]])
+    bound_columns_(weights, 1.0)
+    th.testing.assert_close(weights, th.tensor([[0.6, 0.3], [0.8, 0.4]]))
+
+
+@pytest.mark.parametrize("memory_weight", [1.0, 0.25])
+def test_the_memorys_change_is_weighed_as_the_memory_is(memory_weight):
+    """The prediction holds α_m M m, whose gradient by M is α_m e m^T."""
+    error, memory = th.tensor([[1.0, -2.0], [3.0, 0.0]]), th.tensor([[2.0], [4.0]])
+    changes = hebbian_changes([error], [th.zeros(2, 1)], memory, memory_weight)
+    th.testing.assert_close(changes.memory[0], memory_weight * th.tensor([[7.0], [-2.0]]))
+
+
+def test_the_total_discrepancy_is_half_the_summed_squared_errors():
+    circuit = NGCCircuit(3, 2, ())
+    state = circuit.settle(th.zeros(4, 3), circuit.project(th.zeros(4, 3)) + th.tensor([1.0, -3.0]))
+    th.testing.assert_close(state.total_discrepancy(), th.full((4,), 5.0))
