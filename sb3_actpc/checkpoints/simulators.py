@@ -66,7 +66,7 @@ def capture_vec_env(env: VecEnv, encoder: Encoder, where: str) -> dict[str, Any]
         record["envs"] = [{"reason": reason} for _ in range(env.num_envs)]
         return record
     for index, one in enumerate(innermost.envs):
-        record["envs"].append(_capture_env(one, encoder, f"{where}.{index}"))
+        record["envs"].append(capture_env(one, encoder, f"{where}.{index}"))
     return record
 
 
@@ -90,7 +90,7 @@ def restore_vec_env(env: VecEnv, record: dict[str, Any], decoder: Decoder) -> li
         one = innermost.envs[index] if isinstance(innermost, DummyVecEnv) else None
         reason = entry.get("reason") or _layers_mismatch(one, entry)
         if one is not None:
-            _restore_env(one, entry, decoder, generators_only=reason is not None)
+            restore_env(one, entry, decoder, generators_only=reason is not None)
         if reason is not None:
             lost.append((index, reason))
     for wrapper, entry in zip(wrappers, record["wrappers"], strict=True):
@@ -102,7 +102,13 @@ def restore_vec_env(env: VecEnv, record: dict[str, Any], decoder: Decoder) -> li
 # ------------------------------------------------------------------ one environment
 
 
-def _capture_env(env: gym.Env[Any, Any], encoder: Encoder, where: str) -> dict[str, Any]:
+def capture_env(env: gym.Env[Any, Any], encoder: Encoder, where: str) -> dict[str, Any]:
+    """
+    :param env: one environment, with its wrappers
+    :param encoder: takes the values
+    :param where: its path in the checkpoint
+    :return: JSON; with a "reason" where the state cannot be stored
+    """
     layers = env_layers(env)
     record: dict[str, Any] = {"classes": [type(layer).__qualname__ for layer in layers], "layers": []}
     for depth, layer in enumerate(layers):
@@ -137,7 +143,13 @@ def _layers_mismatch(env: gym.Env[Any, Any] | None, entry: dict[str, Any]) -> st
     return f"it is wrapped as {classes}, the checkpoint's as {entry.get('classes')}"
 
 
-def _restore_env(env: gym.Env[Any, Any], entry: dict[str, Any], decoder: Decoder, generators_only: bool) -> None:
+def restore_env(env: gym.Env[Any, Any], entry: dict[str, Any], decoder: Decoder, generators_only: bool = False) -> None:
+    """
+    :param env: an environment made as the captured one was
+    :param entry: what :func:`capture_env` returned
+    :param decoder: gives the values back
+    :param generators_only: restore the random generators alone
+    """
     for layer, attributes in zip(env_layers(env), entry.get("layers", []), strict=False):
         for name, node in attributes.items():
             if generators_only and not _is_generator(node):
