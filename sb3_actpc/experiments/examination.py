@@ -257,13 +257,8 @@ def _demonstrated_states(model: Any, env: gym.Env[Any, Any], n_states: int, seed
         return []
     if known.dense_rewards is None and not task.startswith("Reacher"):
         return []
-    positions, velocities = rebuilt_states(known, f"Sparse{task}")
-    usable = np.ones(len(known), dtype=bool)
-    usable[[end - 1 for _, end in known.episode_bounds]] = False  # there the episode is over
-    if task.startswith(("Hopper", "Walker2d")):
-        usable &= np.all(np.abs(velocities) < VELOCITY_CLIP, axis=1)
+    positions, velocities, rows = rebuilt_states(known, f"Sparse{task}")
     starts = []
-    rows = np.flatnonzero(usable)
     for row in np.random.default_rng(seed).choice(rows, size=min(n_states, len(rows)), replace=False):
         observation, _ = env.reset(seed=seed)
         if isinstance(observation, dict):
@@ -276,20 +271,27 @@ def _demonstrated_states(model: Any, env: gym.Env[Any, Any], n_states: int, seed
     return starts
 
 
-def rebuilt_states(demonstrations: Demonstrations, sparse_id: str) -> tuple[np.ndarray, np.ndarray]:
+def rebuilt_states(demonstrations: Demonstrations, sparse_id: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """
     :param demonstrations: N transitions of a gymnasium MuJoCo task
     :param sparse_id: id of its sparse version
-    :return: generalised positions (N, nq), x counted from the episode's start, and velocities (N, nv) after each transition
+    :return: generalised positions (N, nq), x counted from the episode's start, and velocities (N, nv) after each transition;
+        the rows after which the episode goes on and no velocity was clipped
     """
     env = gym.make(sparse_id, disable_env_checker=True)
     simulation: Any = env.unwrapped
     positions, n_velocities = simulation.demonstrated_positions(demonstrations), simulation.model.nv
     env.close()
     seen = demonstrations.next_observations.astype(np.float64)
-    if "Reacher" in sparse_id:  # the target stands still
-        return positions, np.concatenate([seen[:, 6:8], np.zeros((len(seen), n_velocities - 2))], axis=1)
-    return positions, seen[:, -n_velocities:]
+    velocities = seen[:, -n_velocities:]
+    usable = np.ones(len(seen), dtype=bool)
+    usable[[end - 1 for _, end in demonstrations.episode_bounds]] = False
+    if "Reacher" in sparse_id:
+        velocities = np.zeros((len(seen), n_velocities))  # the target stands still
+        velocities[:, :2] = seen[:, 6:8]
+    elif "Hopper" in sparse_id or "Walker2d" in sparse_id:
+        usable &= np.all(np.abs(velocities) < VELOCITY_CLIP, axis=1)
+    return positions, velocities, np.flatnonzero(usable)
 
 
 def _capture(env: gym.Env[Any, Any]) -> tuple[dict[str, Any], Decoder]:
