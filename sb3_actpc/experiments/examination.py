@@ -62,7 +62,7 @@ class Examination:
             cell=[f"{v:.2f} ±{e:.2f}" for v, e in zip(self.table.value, self.table.standard_error, strict=True)],
         )
         wide = table.pivot(index="measure", columns="column", values="cell")
-        return str(wide.loc[table.measure.unique(), table.column.unique()].rename_axis(None, axis=1).to_string())
+        return wide.reindex(index=table.measure.unique(), columns=table.column.unique()).to_string(index_names=False)
 
 
 @dataclass(frozen=True)
@@ -307,7 +307,7 @@ def _restore(env: gym.Env[Any, Any], captured: tuple[dict[str, Any], Decoder]) -
     restore_env(env, *captured)
     for layer in env_layers(env):
         if isinstance(layer, TimeLimit):
-            layer._elapsed_steps = 0  # each state has its whole horizon before it
+            layer._elapsed_steps = 0  # type: ignore[assignment]  # each state has its whole horizon before it
 
 
 def _stack(observations: Sequence[Any]) -> Any:
@@ -405,7 +405,7 @@ def _groups(rows: pd.DataFrame) -> dict[str, pd.DataFrame]:
     own = rows[rows.source != "demonstrated"]
     ranks = own.groupby("state").distance.first().dropna().rank(method="first", pct=True)
     if len(ranks) >= 3:
-        thirds = own.state.map(np.ceil(3.0 * ranks))
+        thirds = own.state.map((3.0 * ranks).apply(np.ceil))
         found |= {name: own[thirds == third] for third, name in enumerate(("near", "middle", "far"), start=1)}
     return found
 

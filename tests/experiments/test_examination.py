@@ -43,7 +43,7 @@ class RotationEnv(gym.Env[np.ndarray, np.ndarray]):
 
 
 if ENV_ID not in gym.registry:
-    gym.register(ENV_ID, RotationEnv, max_episode_steps=10)
+    gym.register(ENV_ID, f"{__name__}:RotationEnv", max_episode_steps=10)
 
 
 class RotationAgent:
@@ -119,8 +119,9 @@ def test_the_table_counts_its_states() -> None:
 
 @pytest.mark.parametrize(("name", "value"), [("n_states", 0), ("horizon", 0), ("hold", 0), ("noise", -1), ("perturbation", 3)])
 def test_numbers_out_of_range_are_named(name: str, value: float) -> None:
+    wrong: dict[str, Any] = {name: value}
     with pytest.raises(ValueError, match=f"{name}={value}"):
-        examine(RotationAgent(), ENV_ID, values=true_values, **{name: value})
+        examine(RotationAgent(), ENV_ID, values=true_values, **wrong)
 
 
 def small_agent(env_id: str, **keywords: Any) -> ActPC:
