@@ -8,6 +8,8 @@ import pkgutil
 import sys
 from collections.abc import Sequence
 
+from sb3_actpc import __version__
+
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line.
@@ -36,11 +38,27 @@ def build_parser() -> argparse.ArgumentParser:
     :return: the parser; the parsed ``command`` is the name of the sub-command's module
     """
     parser = argparse.ArgumentParser(prog="sb3-actpc", description="Active predictive coding for Stable-Baselines3.")
+    parser.add_argument("--version", action="version", version=f"sb3-actpc {__version__}")
     parser.add_argument("--debug", action="store_true", help="show where an error came from")
     subparsers = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for module in pkgutil.iter_modules(__path__):
         importlib.import_module(f"{__name__}.{module.name}").add_parser(subparsers)
     return parser
+
+
+def steps(text: str) -> int:
+    """
+    :param text: a whole number, such as ``"100000"`` or ``"1e5"``
+    :return: the number
+    :raises argparse.ArgumentTypeError: when it is none
+    """
+    try:
+        number = float(text)
+        if number == int(number):
+            return int(number)
+    except (ValueError, OverflowError):
+        pass
+    raise argparse.ArgumentTypeError(f"{text!r} is not a whole number, such as 100000 or 1e5")
 
 
 def user_errors() -> tuple[type[Exception], ...]:

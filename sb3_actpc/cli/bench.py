@@ -59,12 +59,11 @@ def run(args: argparse.Namespace) -> int:
 
 def _settings() -> dict[str, dict[str, Any]]:
     """The agents measured: the bare one, the shipped defaults and the paper's preset, with both schedules."""
-    from sb3_actpc.experiments.runs.config import RunConfig, resolve_run
+    from sb3_actpc.experiments.runs import preset
 
     bare = {"circuit_kwargs": {"feedback": "tied"}, "n_critics": 1}
     presets = {"shipped defaults": "actpc", "paper preset": "actpc_paper"}
-    plans = {label: resolve_run(RunConfig(env=TASK, preset=preset)) for label, preset in presets.items()}
-    with_data = {label: {**plan.algorithm_kwargs, "demonstrations": plan.demonstrations} for label, plan in plans.items()}
+    with_data = {label: preset(TASK, name) for label, name in presets.items()}
     settings = {}
     for label, keywords in (("bare", bare), *with_data.items()):
         for settling in ("scheduled", "iterative"):
@@ -85,12 +84,9 @@ def _td3(device: str) -> OffPolicyAlgorithm:
 
 def _actpc(keywords: dict[str, Any], device: str) -> OffPolicyAlgorithm:
     from sb3_actpc import ActPC
-    from sb3_actpc.experiments.runs.config import parse_schedule
 
-    if "learning_rate" in keywords:
-        keywords = {**keywords, "learning_rate": parse_schedule(keywords["learning_rate"])}
     quick = {"prior_updates": 1, "actor_warm_start": 0, "critic_warmup": 0, "batch_size": BATCH_SIZE}
-    return ActPC("MlpPolicy", TASK, **{**keywords, **quick, **_common(device)})
+    return ActPC(env=TASK, **{"policy": "MlpPolicy", **keywords, **quick, **_common(device)})
 
 
 def _common(device: str) -> dict[str, Any]:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sb3_actpc.cli import steps
+
 if TYPE_CHECKING:
-    from sb3_actpc.experiments.comparison import PlannedRun
     from sb3_actpc.experiments.comparison.schedule import Summary
 
 # options that say which runs are compared; a file may say the same
@@ -19,12 +19,14 @@ _COMPARISON = (
     "ablate",
     "seeds",
     "steps",
+    "output",
     "demonstrations",
     "eval_freq",
     "eval_episodes",
     "checkpoint_freq",
     "device",
     "threads",
+    "gym_packages",
 )
 
 
@@ -49,12 +51,15 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     parser.add_argument("--ablate", action="store_true", default=None, help="ActPC with every part, and without each in turn")
     parser.add_argument("--seeds", type=int, metavar="N", help="seeds 0 to N-1 (default: 3)")
-    parser.add_argument("--steps", type=int, metavar="N", help="environment steps of each run (default: the presets')")
-    parser.add_argument("--out", metavar="DIR", help="folder of the comparison (default: runs/comparison)")
+    parser.add_argument("--steps", type=steps, metavar="N", help="environment steps of each run (default: the presets')")
+    parser.add_argument("--output", metavar="DIR", help="folder of the comparison (default: runs/comparison)")
     parser.add_argument("--demonstrations", metavar="FILE", help="as in train (default: the ones in the package)")
-    parser.add_argument("--eval-freq", type=int, metavar="N", help="steps between evaluations (default: a tenth of all)")
+    parser.add_argument("--eval-freq", type=steps, metavar="N", help="steps between evaluations (default: a tenth of all)")
     parser.add_argument("--eval-episodes", type=int, metavar="N", help="episodes in each (default: 10)")
-    parser.add_argument("--checkpoint-freq", type=int, metavar="N", help="steps between checkpoints (default: as --eval-freq)")
+    parser.add_argument(
+        "--checkpoint-freq", type=steps, metavar="N", help="steps between checkpoints (default: as --eval-freq)"
+    )
+    parser.add_argument("--gym-packages", nargs="+", metavar="MODULE", help="as in train")
     parser.add_argument("--device", help="torch device (default: cpu)")
     parser.add_argument("--threads", type=int, metavar="N", help="threads of each run (default: 1)")
     parser.add_argument("--workers", type=int, metavar="N", help="runs at a time (default: one for each core)")
@@ -63,7 +68,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     parser.add_argument("--address", help="Ray cluster to use (default: one is started on this machine)")
     parser.add_argument("--retry-failed", action="store_true", help="try runs again that failed before")
-    parser.add_argument("--dry-run", action="store_true", help="print the table of runs and the time it will take, and end")
+    parser.add_argument(
+        "--dry-run", action="store_true", help="print the table of runs, with the seconds of those finished, and end"
+    )
     parser.add_argument("--no-progress", action="store_true", help="lines instead of progress bars")
 
 
@@ -76,23 +83,21 @@ def run(args: argparse.Namespace) -> int:
     :raises FileNotFoundError: when a file is missing
     """
     from sb3_actpc.experiments.comparison import plan_runs, read_comparison
-    from sb3_actpc.experiments.comparison.display import make_display
+    from sb3_actpc.experiments.comparison.display import describe_runs, make_display
     from sb3_actpc.experiments.comparison.engines import make_engine
     from sb3_actpc.experiments.comparison.schedule import run_comparison
 
-    given = _given(args)
-    folder = Path(args.out or given.pop("out", None) or "runs/comparison")
-    given.pop("out", None)
-    comparison = read_comparison(given)
-    runs = plan_runs(comparison, folder)
+    comparison = read_comparison(_given(args))
+    runs, folder = plan_runs(comparison), Path(comparison.output)
     if args.dry_run:
-        _print_table(runs, args, comparison.threads)
+        print(describe_runs(runs))
         return 0
+    threads = max(run.threads for run in runs)
     with make_display(not args.no_progress) as display:
         summary = run_comparison(
             runs,
             folder,
-            lambda: make_engine(args.engine, args.workers, comparison.threads, args.address),
+            lambda: make_engine(args.engine, args.workers, threads, args.address),
             display,
             args.retry_failed,
         )
@@ -100,18 +105,13 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _given(args: argparse.Namespace) -> dict[str, Any]:
-    from sb3_actpc.experiments.comparison.run_table import read_yaml
+    from sb3_actpc.experiments.comparison.plan import read_comparison_file
 
-    given = {} if args.file is None else read_yaml(Path(args.file))
-    options = {name: getattr(args, name) for name in _COMPARISON}
-    return {**given, **{name: value for name, value in options.items() if value is not None}}
-
-
-def _print_table(runs: Sequence[PlannedRun], args: argparse.Namespace, threads: int) -> None:
-    from sb3_actpc.experiments.comparison.engines.local import usable_cores
-    from sb3_actpc.experiments.comparison.estimate import describe_table
-
-    print(describe_table(runs, args.workers or max(1, usable_cores() // threads), args.retry_failed))
+    given = {} if args.file is None else read_comparison_file(Path(args.file))
+    options = {name: getattr(args, name) for name in _COMPARISON if getattr(args, name) is not None}
+    if "steps" in options:  # a file may call them n_timesteps
+        given.pop("n_timesteps", None)
+    return {**given, **options}
 
 
 def _conclude(summary: Summary, folder: Path) -> int:
@@ -121,7 +121,7 @@ def _conclude(summary: Summary, folder: Path) -> int:
     n_runs = len(summary.finished) + len(summary.failed) + len(summary.unfinished)
     print(f"{len(summary.finished)} of {n_runs} runs are finished; see them with: sb3-actpc report {folder}")
     for run, message in summary.failed:
-        print(f"sb3-actpc: failed: {run.name} ({run.folder}): {message}", file=sys.stderr)
+        print(f"sb3-actpc: failed: {run.label} ({run.folder}): {message}", file=sys.stderr)
     if summary.stopped_by is not None:
         reason = f"the disk is full ({summary.message}), free some space" if summary.message else summary.stopped_by
         print(

@@ -17,7 +17,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from sb3_actpc.baselines import BC, BCRNN
 from sb3_actpc.baselines.bc_policies import BCRNNPolicy
 from sb3_actpc.demonstrations.dataset import Demonstrations
-from sb3_actpc.experiments.runs import RunConfig, train_run
+from sb3_actpc.experiments.runs import Run, train_run
 from sb3_actpc.experiments.runs.evaluation import play_episodes
 from tests.recordings import record
 
@@ -224,12 +224,12 @@ def test_an_offline_method_is_evaluated_at_every_interval_and_not_untrained(tmp_
         patch.setattr("sb3_actpc.experiments.runs.evaluation.play_episodes", counted)
         for algo in ("bc", "actpc"):
             played.clear()
-            overrides = {"batch_size": 4} | ({"actor_warm_start": 0} if algo == "actpc" else {})
+            settings = {"batch_size": 4} | ({"actor_warm_start": 0} if algo == "actpc" else {})
             folder = tmp_path / algo
             train_run(
-                RunConfig(
-                    "SparseReacher-v5", algo, n_timesteps=30, eval_freq=10, eval_episodes=6, checkpoint_freq=0, progress=False,
-                    output=str(folder), overrides=overrides,
+                Run(
+                    env="SparseReacher-v5", algo=algo, n_timesteps=30, eval_freq=10, eval_episodes=6, checkpoint_freq=0,
+                    progress=False, output=str(folder), settings=settings,
                 )
             )  # fmt: skip
             with open(folder / "progress.csv", encoding="utf-8") as file:

@@ -12,7 +12,7 @@ from sb3_actpc.baselines import HER
 from sb3_actpc.baselines.prioritized import PrioritizedHerReplayBuffer, SumTree
 from sb3_actpc.demonstrations import fit_demonstrations
 from sb3_actpc.envs import GOAL_MUJOCO_IDS, sparse_env_id
-from sb3_actpc.experiments.runs import RunConfig, train_run
+from sb3_actpc.experiments.runs import Run, train_run
 from tests.checkpoints.runs import assert_same, learn_in_two, learn_straight
 from tests.recordings import record
 
@@ -253,9 +253,9 @@ def test_actpc_runs_on_the_same_goal_task_and_demonstrations() -> None:
 def test_actpc_and_her_run_on_fetch(tmp_path) -> None:
     pytest.importorskip("gymnasium_robotics")
     for algo, more in (("her", {}), ("actpc", {"policy": "MultiInputPolicy", "replay_buffer_class": "HerReplayBuffer"})):
-        overrides = {"learning_starts": 50, "batch_size": 16, "policy_kwargs": {"net_arch": [8]}, "buffer_size": 100, **more}
-        options = {"overrides": overrides, "progress": False, "eval_episodes": 1, "output": str(tmp_path / algo)}
-        result = train_run(RunConfig("FetchReach-v4", algo, n_timesteps=55, eval_freq=55, checkpoint_freq=0, **options))
+        settings = {"learning_starts": 50, "batch_size": 16, "policy_kwargs": {"net_arch": [8]}, "buffer_size": 100, **more}
+        options = {"settings": settings, "progress": False, "eval_episodes": 1, "output": str(tmp_path / algo)}
+        result = train_run(Run(env="FetchReach-v4", algo=algo, n_timesteps=55, eval_freq=55, checkpoint_freq=0, **options))
         assert result["success_rate"] in (0.0, 1.0) and result["timesteps"] == 55
 
 
@@ -263,6 +263,6 @@ def test_actpc_and_her_run_on_fetch(tmp_path) -> None:
 def test_her_solves_fetch_reach_within_its_20000_steps(tmp_path) -> None:
     """At least 90 % of 50 episodes, as every working HER does."""
     pytest.importorskip("gymnasium_robotics")
-    config = RunConfig("FetchReach-v4", "her", eval_episodes=50, progress=False, output=str(tmp_path / "run"))
+    config = Run(env="FetchReach-v4", algo="her", eval_episodes=50, progress=False, output=str(tmp_path / "run"))
     result = train_run(config, print)
     assert result["success_rate"] >= 0.9

@@ -103,8 +103,9 @@ def test_a_stopped_run_goes_on_as_if_it_never_was(
     with open("stopped/progress.csv", encoding="utf-8") as file:
         seconds = [float(row["seconds"]) for row in csv.DictReader(file)]
     assert seconds == sorted(seconds)
-    assert not Path("stopped/checkpoints").exists()  # nothing is left to resume
+    assert len(list_bundles("stopped/checkpoints")) == 1  # of the end
     assert main(["train", "--resume", "stopped"]) == 2
+    assert "is finished: say with --steps how many more" in capsys.readouterr().err
 
 
 def test_a_run_stopped_in_its_pretraining_goes_on_as_if_it_never_was(
@@ -151,8 +152,8 @@ def test_a_run_with_checkpoints_is_left_alone_and_the_next_gets_another_folder(m
     ("arguments", "message"),
     [
         (["--resume", "nowhere"], "no run in nowhere"),
-        (["--resume", "nowhere", "--steps", "9"], "--steps cannot be given with --resume"),
-        (["--env", "SparseReacher-v5", "--checkpoint-freq", "-1"], "checkpoint_freq must be at least 0"),
+        (["--resume", "nowhere", "--seed", "9"], "--seed cannot be given with --resume"),
+        (["--env", "SparseReacher-v5", "--checkpoint-freq", "-1"], "checkpoint_freq=-1 must be at least 0"),
     ],
 )
 def test_mistakes_are_named(arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:

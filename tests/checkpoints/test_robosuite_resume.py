@@ -11,7 +11,7 @@ from stable_baselines3.common.vec_env import SubprocVecEnv
 
 from sb3_actpc import ActPC
 from sb3_actpc.envs import ROBOSUITE_IDS
-from sb3_actpc.experiments.runs import RunConfig, train_run
+from sb3_actpc.experiments.runs import Run, train_run
 from sb3_actpc.experiments.runs.environments import make_train_env
 from tests.checkpoints.runs import assert_same, learn_in_two, learn_straight
 from tests.demonstrations.made_up import made_up
@@ -79,14 +79,14 @@ def test_several_mujoco_environments_stay_in_this_process() -> None:
 @pytest.mark.parametrize("n_envs", [1, 2])
 def test_the_command_trains_with_the_shipped_settings(n_envs: int, tmp_path: Path) -> None:
     """But for sizes: the shipped warm start takes a minute."""
-    config = RunConfig(
+    config = Run(
         env="SparseLift-v0",
         n_timesteps=60,
         n_envs=n_envs,
         eval_episodes=1,
         eval_freq=60,
         env_kwargs={"horizon": 25},
-        overrides={"actor_warm_start": 5, "prior_updates": 5, "critic_warmup": 10},
+        settings={"actor_warm_start": 5, "prior_updates": 5, "critic_warmup": 10},
         output=str(tmp_path / "run"),
         progress=False,
     )

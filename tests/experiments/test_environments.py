@@ -9,8 +9,7 @@ import pytest
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_actpc.experiments.runs import RunConfig, play_episodes, train_run
-from sb3_actpc.experiments.runs.config import resolve_run
+from sb3_actpc.experiments.runs import Run, play_episodes, resolve, train_run
 from sb3_actpc.experiments.runs.environments import make_env, make_train_env
 from sb3_actpc.experiments.runs.evaluation import NormalizedPredictor
 from sb3_actpc.experiments.runs.run import build_model
@@ -33,13 +32,13 @@ class Recorder(BaseCallback):
         return True
 
 
-def prepare(algo: str, folder: Path, **overrides: Any) -> tuple[Any, Any]:
+def prepare(algo: str, folder: Path, **more: Any) -> tuple[Any, Any]:
     """An agent that only acts at random, with its environment."""
-    settings = {"learning_starts": 10_000, "buffer_size": 1000, "noise_type": None, **overrides}
-    config = RunConfig(ENV_ID, algo, n_envs=2, seed=3, demonstrations=str(record_file(folder, ENV_ID)), overrides=settings)
-    plan = resolve_run(config)
-    env = make_train_env(ENV_ID, plan.env_kwargs, plan.n_envs, config.seed, plan.normalize)
-    return build_model(plan, config, env), env
+    settings = {"learning_starts": 10_000, "buffer_size": 1000, "noise_type": None, **more}
+    run = Run(env=ENV_ID, algo=algo, n_envs=2, seed=3, demonstrations=str(record_file(folder, ENV_ID)), settings=settings)
+    run = resolve(run)
+    env = make_train_env(ENV_ID, run.env_kwargs, run.n_envs, run.seed, run.normalize)
+    return build_model(run, env), env
 
 
 def test_algorithms_with_one_seed_see_the_same_states_rewards_and_ends(tmp_path: Path) -> None:
@@ -74,10 +73,9 @@ def test_algorithms_are_given_the_same_demonstrations(tmp_path: Path) -> None:
 
 
 def prepare_logo(folder: Path) -> tuple[Any, Any]:
-    config = RunConfig(ENV_ID, "logo", demonstrations=str(record_file(folder, ENV_ID)))
-    plan = resolve_run(config)
-    env = make_train_env(ENV_ID, plan.env_kwargs, 1, 0)
-    return build_model(plan, config, env), env
+    run = resolve(Run(env=ENV_ID, algo="logo", demonstrations=str(record_file(folder, ENV_ID))))
+    env = make_train_env(ENV_ID, run.env_kwargs, 1, 0)
+    return build_model(run, env), env
 
 
 class LoggedEnv(gym.Env[np.ndarray, np.ndarray]):
@@ -107,10 +105,10 @@ def test_algorithms_are_evaluated_on_the_same_episodes_at_the_same_steps(tmp_pat
     fewer = {"learning_starts": 10, "batch_size": 4, "policy_kwargs": {"net_arch": [4]}}
     on_policy = {"n_steps": 16, "batch_size": 4, "policy_kwargs": {"net_arch": [4]}}
     logs = {}
-    for algo, overrides in (("td3", fewer), ("sac_rlpd", fewer), ("actpc", fewer), ("logo", on_policy)):
+    for algo, settings in (("td3", fewer), ("sac_rlpd", fewer), ("actpc", fewer), ("logo", on_policy)):
         LoggedEnv.log = []
         options = {"eval_freq": 16, "eval_episodes": 3, "progress": False, "output": str(tmp_path / algo)}
-        train_run(RunConfig("Logged-v0", algo, n_timesteps=32, overrides=overrides, checkpoint_freq=0, **options))
+        train_run(Run(env="Logged-v0", algo=algo, n_timesteps=32, settings=settings, checkpoint_freq=0, **options))
         logs[algo] = LoggedEnv.log
         rows = (tmp_path / algo / "progress.csv").read_text(encoding="utf-8").splitlines()
         assert [row.split(",")[0] for row in rows[1:]] == ["0", "16", "32"]
@@ -122,23 +120,22 @@ def test_algorithms_are_evaluated_on_the_same_episodes_at_the_same_steps(tmp_pat
 
 def test_on_policy_algorithms_say_that_they_keep_no_checkpoints(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="logo learns on policy and keeps no checkpoints: leave --checkpoint-freq out"):
-        resolve_run(RunConfig("Pendulum-v1", "logo", checkpoint_freq=10))
-    assert resolve_run(RunConfig("Pendulum-v1", "logo")).checkpoint_freq == 0
+        resolve(Run(env="Pendulum-v1", algo="logo", checkpoint_freq=10))
+    assert resolve(Run(env="Pendulum-v1", algo="logo")).checkpoint_freq == 0
     with pytest.raises(ValueError, match="bc is quick enough to be run again and keeps no checkpoints"):
-        resolve_run(RunConfig("Pendulum-v1", "bc", checkpoint_freq=10))
+        resolve(Run(env="Pendulum-v1", algo="bc", checkpoint_freq=10))
     with pytest.raises(ValueError, match="PPO takes no action noise"):
-        resolve_run(RunConfig("Pendulum-v1", "ppo", overrides={"noise_type": "normal", "noise_std": 0.1}))
+        resolve(Run(env="Pendulum-v1", algo="ppo", settings={"noise_type": "normal", "noise_std": 0.1}))
 
 
 def test_a_policy_on_normalised_observations_is_evaluated_and_replayed_on_them(tmp_path: Path) -> None:
     """PPO learns from normalised observations; the environments of the evaluation do not normalise."""
-    overrides = {"n_steps": 64, "batch_size": 32, "n_epochs": 1}
-    config = RunConfig("Pendulum-v1", "ppo", overrides=overrides)
-    plan = resolve_run(config)
-    assert plan.normalize == {"gamma": 0.99}
-    env = make_train_env("Pendulum-v1", {}, 1, 0, plan.normalize)
+    settings = {"n_steps": 64, "batch_size": 32, "n_epochs": 1}
+    run = resolve(Run(env="Pendulum-v1", algo="ppo", settings=settings))
+    assert run.normalize == {"gamma": 0.99}
+    env = make_train_env("Pendulum-v1", {}, 1, 0, run.normalize)
     assert isinstance(env, VecNormalize)
-    model = build_model(plan, config, env)
+    model = build_model(run, env)
     model.learn(128)
     env.training = False
     observation = np.array([[0.5, -0.5, 3.0]], dtype=np.float32)

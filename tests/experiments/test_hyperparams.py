@@ -11,9 +11,9 @@ import yaml
 
 from sb3_actpc.baselines.offline.served import ServedAlgorithm
 from sb3_actpc.envs import ROBOSUITE_IDS, sparse_env_id
-from sb3_actpc.experiments.runs import ALGORITHMS, RunConfig, load_preset
-from sb3_actpc.experiments.runs.config import HYPERPARAMS_FOLDERS, resolve_run
+from sb3_actpc.experiments.runs import ALGORITHMS, Run, load_preset, resolve
 from sb3_actpc.experiments.runs.environments import make_train_env, register_tasks
+from sb3_actpc.experiments.runs.presets import HYPERPARAMS_FOLDERS
 from sb3_actpc.experiments.runs.run import build_model
 from tests.recordings import record_file
 
@@ -75,14 +75,13 @@ def test_every_entry_builds_its_agent_which_trains(
     sparse = sparse_env_id(env_id)
     demonstrations = str(record_file(recordings, sparse, N_EPISODES)) if sparse.startswith("Sparse") else "none"
     n_steps = 16 if algo in ("logo", "ppo") else 3
-    overrides = dict(FEWER[algo])
+    settings = dict(FEWER[algo])
     if algo in ("her", "actpc") and demonstrations == "none":  # nothing to learn from but an episode of its own
-        overrides["learning_starts"], n_steps = 50, 52
-    config = RunConfig(env_id, algo, preset, demonstrations=demonstrations, overrides=overrides)
-    plan = resolve_run(config)
-    env = make_train_env(env_id, plan.env_kwargs, plan.n_envs, 0, plan.normalize)
+        settings["learning_starts"], n_steps = 50, 52
+    run = resolve(Run(env=env_id, algo=algo, preset=preset, demonstrations=demonstrations, settings=settings))
+    env = make_train_env(env_id, run.env_kwargs, run.n_envs, 0, run.normalize)
     try:
-        model = build_model(plan, config, env)
+        model = build_model(run, env)
         if isinstance(model, ServedAlgorithm):
             return
         before = [parameter.clone() for parameter in model.policy.parameters()]

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from sb3_actpc.experiments.zoo import NET_ARCHS, convert_actpc_params, main
 
 from sb3_actpc.cli import main as command_line
-from sb3_actpc.experiments.zoo import NET_ARCHS, convert_actpc_params, main
 from tests.recordings import record
 
 ROOT = Path(__file__).resolve().parents[2]

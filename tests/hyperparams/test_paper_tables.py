@@ -10,7 +10,7 @@ import pytest
 
 from sb3_actpc.demonstrations.dataset import Demonstrations, shipped_demonstrations
 from sb3_actpc.experiments.runs import load_preset
-from sb3_actpc.experiments.runs.config import load_algorithm
+from sb3_actpc.experiments.runs.algorithms import load_algorithm
 
 FILE = Path(__file__).with_name("paper_tables.csv")
 ENTRIES = list(csv.DictReader(FILE.read_text(encoding="utf-8").splitlines()))

@@ -1,13 +1,10 @@
 """Head-to-head comparisons: a table of runs, brought to their end on one machine or many, and a report about them."""
 
-from sb3_actpc.experiments.comparison.run_table import Comparison, PlannedRun, Task, plan_runs, read_comparison
-from sb3_actpc.experiments.comparison.variants import Variant, ablation_variants, find_variant, variant_names
+from sb3_actpc.experiments.comparison.plan import Comparison, plan_runs, read_comparison
+from sb3_actpc.experiments.comparison.variants import ablation_variants, find_variant, variant_names
 
 __all__ = [
     "Comparison",
-    "PlannedRun",
-    "Task",
-    "Variant",
     "ablation_variants",
     "find_variant",
     "plan_runs",

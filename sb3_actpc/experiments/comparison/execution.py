@@ -4,25 +4,23 @@ from __future__ import annotations
 
 import errno
 import json
-import shutil
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from filelock import FileLock, Timeout
 from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_actpc.checkpoints import DamagedCheckpoint, TrainingStopped, list_bundles
-from sb3_actpc.experiments.comparison.lock import folder_lock
-from sb3_actpc.experiments.comparison.run_table import PlannedRun
-from sb3_actpc.experiments.runs import resume_run, train_run
-from sb3_actpc.experiments.runs.record import CONFIG, RESULT, read_config, read_result, write_result
-from sb3_actpc.experiments.runs.run import CHECKPOINTS
+from sb3_actpc.checkpoints import TrainingStopped
+from sb3_actpc.experiments.runs import Run, finish_run
+from sb3_actpc.experiments.runs.record import CONFIG, RESULT, read_result, write_result
 from sb3_actpc.utils.files import atomic_write
 
-ERROR, LOG = "error.json", "log.txt"
+ERROR, LOG, LOCK = "error.json", "log.txt", ".lock"
 FINISHED, FAILED, UNFINISHED, NEW = "finished", "failed", "unfinished", "new"
 STOPPED, LOST, DISK_FULL = "stopped", "lost", "disk full"  # outcomes that leave a run unfinished
 _FULL = (errno.ENOSPC, errno.EDQUOT)
@@ -40,6 +38,38 @@ class Outcome:
 
     status: str
     message: str = ""
+
+
+class FolderBusy(ValueError):
+    """Another process works in the folder."""
+
+
+@contextmanager
+def folder_lock(folder: Path, wait: float, report: Callable[[str], None] = lambda line: None) -> Iterator[None]:
+    """Hold a folder. The lock is the operating system's: it is gone with the process that held it, however that ended.
+
+    :param folder: made when it does not exist
+    :param wait: seconds to wait for another process that holds it
+    :param report: given a line when there is one to wait for
+    :return: context manager
+    :raises FolderBusy: when the other still holds it then
+    :raises OSError: when the folder cannot be written
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    lock = FileLock(folder / LOCK)
+    try:
+        lock.acquire(timeout=0)
+    except Timeout:
+        report(f"{folder} is in use by another process: waiting {wait:.0f} seconds for it")
+        try:
+            lock.acquire(timeout=wait)
+        except Timeout:
+            message = f"{folder} is in use by another process: wait until it has ended, or choose another folder"
+            raise FolderBusy(message) from None
+    try:
+        yield
+    finally:
+        lock.release()
 
 
 def is_disk_full(error: Exception) -> bool:
@@ -114,11 +144,11 @@ def repair_result(folder: Path, report: Callable[[str], None]) -> None:
         report(f"{damage}: written again from the run's other files")
 
 
-def execute_run(run: PlannedRun, report: Callable[[str], None], on_steps: Callable[[int], None]) -> Outcome:
+def execute_run(run: Run, report: Callable[[str], None], on_steps: Callable[[int], None]) -> Outcome:
     """Bring a run to its end, from its newest whole checkpoint where there is one. Raises nothing: an error is recorded in
     the run's ``error.json`` and returned.
 
-    :param run: row of the table
+    :param run: of a comparison
     :param report: given lines of text
     :param on_steps: given the environment steps done so far, about once a second
     :return: what came of it
@@ -127,38 +157,12 @@ def execute_run(run: PlannedRun, report: Callable[[str], None], on_steps: Callab
         with folder_lock(run.folder, LOCK_WAIT, report):
             (run.folder / ERROR).unlink(missing_ok=True)
             if run_status(run.folder) != FINISHED:
-                _train(run, report, StepWatch(on_steps))
+                finish_run(run, report, [StepWatch(on_steps)])
     except TrainingStopped as stop:
         return Outcome(STOPPED, str(stop))
     except Exception as error:  # whatever it is, the other runs go on
         return _failure(run.folder, error)
     return Outcome(FINISHED)
-
-
-def _train(run: PlannedRun, report: Callable[[str], None], watch: StepWatch) -> None:
-    checkpoints = run.folder / CHECKPOINTS
-    if not _has_config(run.folder, report):
-        shutil.rmtree(checkpoints, ignore_errors=True)
-    if list_bundles(checkpoints):
-        try:
-            resume_run(run.folder, report, progress=False, callbacks=[watch])
-            return
-        except DamagedCheckpoint as error:
-            report(f"{error}: the run starts again")
-            shutil.rmtree(checkpoints)
-    train_run(run.config, report, [watch])
-
-
-def _has_config(folder: Path, report: Callable[[str], None]) -> bool:
-    try:
-        read_config(folder)
-    except FileNotFoundError:
-        return False
-    except ValueError as error:
-        report(f"{error}: the run starts again")
-        (folder / CONFIG).unlink()
-        return False
-    return True
 
 
 def _failure(folder: Path, error: Exception) -> Outcome:

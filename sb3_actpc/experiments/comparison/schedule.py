@@ -6,9 +6,9 @@ from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol
 
 from sb3_actpc.checkpoints import StopSignals
+from sb3_actpc.experiments.comparison.display import LineDisplay
 from sb3_actpc.experiments.comparison.engines import Engine, Event
 from sb3_actpc.experiments.comparison.execution import (
     DISK_FULL,
@@ -18,40 +18,18 @@ from sb3_actpc.experiments.comparison.execution import (
     LOST,
     STOPPED,
     Outcome,
+    folder_lock,
     is_disk_full,
     read_error,
     repair_result,
     run_status,
     write_error,
 )
-from sb3_actpc.experiments.comparison.lock import folder_lock
-from sb3_actpc.experiments.comparison.run_table import PlannedRun
+from sb3_actpc.experiments.runs import Run
 
 MAX_LOSSES = 3  # times that the process of one run may die before the run counts as failed
 LOCK_WAIT = 5.0  # seconds for another command in the same folder to end
 POLL = 0.5  # seconds
-
-
-class Display(Protocol):
-    """Shows how a comparison goes on."""
-
-    def begin(self, runs: Sequence[PlannedRun], n_finished: int) -> None:
-        """:param runs: those still to do
-        :param n_finished: those done before"""
-
-    def started(self, run: PlannedRun) -> None:
-        """:param run: now under way"""
-
-    def stepped(self, run: PlannedRun, steps: int) -> None:
-        """:param run: under way
-        :param steps: done so far"""
-
-    def ended(self, run: PlannedRun, outcome: Outcome) -> None:
-        """:param run: no longer under way
-        :param outcome: what came of it"""
-
-    def line(self, text: str) -> None:
-        """:param text: one line"""
 
 
 @dataclass
@@ -65,18 +43,18 @@ class Summary:
     :param message: of the full disk
     """
 
-    finished: list[PlannedRun] = field(default_factory=list)
-    failed: list[tuple[PlannedRun, str]] = field(default_factory=list)
-    unfinished: list[PlannedRun] = field(default_factory=list)
+    finished: list[Run] = field(default_factory=list)
+    failed: list[tuple[Run, str]] = field(default_factory=list)
+    unfinished: list[Run] = field(default_factory=list)
     stopped_by: str | None = None
     message: str = ""
 
 
 def run_comparison(
-    runs: Sequence[PlannedRun],
+    runs: Sequence[Run],
     folder: Path,
     make_engine: Callable[[], Engine],
-    display: Display,
+    display: LineDisplay,
     retry_failed: bool = False,
 ) -> Summary:
     """Bring every run of a table to its end that is not there yet.
@@ -124,10 +102,10 @@ def is_to_do(status: str, retry_failed: bool) -> bool:
 class _Scheduler:
     """Keeps an engine busy."""
 
-    def __init__(self, engine: Engine, display: Display, runs: Sequence[PlannedRun], summary: Summary) -> None:
+    def __init__(self, engine: Engine, display: LineDisplay, runs: Sequence[Run], summary: Summary) -> None:
         self.engine, self.display, self.summary = engine, display, summary
         self.waiting = deque(runs)
-        self.under_way: dict[str, PlannedRun] = {}
+        self.under_way: dict[str, Run] = {}
         self.losses: Counter[str] = Counter()
 
     def run(self) -> None:
@@ -172,7 +150,7 @@ class _Scheduler:
         elif event.outcome.status in (LOST, STOPPED) and self.summary.stopped_by is None:
             self._try_again(run, event.outcome)
 
-    def _try_again(self, run: PlannedRun, outcome: Outcome) -> None:
+    def _try_again(self, run: Run, outcome: Outcome) -> None:
         """Somebody ended the run's process, not the run."""
         self.losses[run.id] += 1
         if self.losses[run.id] < MAX_LOSSES:

@@ -25,7 +25,7 @@ def main() -> int:
     threading.Thread(target=_stop_when_input_closes, daemon=True).start()
 
     from sb3_actpc.experiments.comparison.execution import execute_run
-    from sb3_actpc.experiments.comparison.run_table import PlannedRun
+    from sb3_actpc.experiments.runs import Run
 
     def send(**message: Any) -> None:
         try:
@@ -33,7 +33,7 @@ def main() -> int:
         except BrokenPipeError:  # the command was killed: nobody listens
             pass
 
-    outcome = execute_run(PlannedRun.from_json(text), lambda line: print(line, flush=True), lambda steps: send(steps=steps))
+    outcome = execute_run(Run.from_json(text), lambda line: print(line, flush=True), lambda steps: send(steps=steps))
     send(status=outcome.status, message=outcome.message)
     return 0
 

@@ -7,10 +7,10 @@ import json
 from pathlib import Path
 from typing import Any
 
-from sb3_actpc.experiments.comparison.run_table import CONTENT, content_id
 from sb3_actpc.experiments.report.figures import draw_curves
 from sb3_actpc.experiments.report.results import CURVES, SETTINGS, load_results, write_runs
 from sb3_actpc.experiments.runs.record import CONFIG, read_config
+from sb3_actpc.experiments.runs.schema import CONTENT, content_id
 from sb3_actpc.utils.files import atomic_write
 
 

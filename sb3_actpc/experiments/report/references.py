@@ -19,7 +19,7 @@ import pandas as pd
 from sb3_actpc.demonstrations.dataset import Demonstrations
 from sb3_actpc.envs import SPARSE_MUJOCO_IDS
 from sb3_actpc.experiments.runs import play_episodes
-from sb3_actpc.experiments.runs.config import find_demonstrations
+from sb3_actpc.experiments.runs.presets import find_demonstrations
 from sb3_actpc.experiments.runs.run import make_eval_envs
 from sb3_actpc.utils.files import atomic_write
 

@@ -13,13 +13,13 @@ import numpy as np
 import pandas as pd
 
 from sb3_actpc.experiments.comparison.execution import ERROR, FINISHED, read_error, run_status
-from sb3_actpc.experiments.comparison.run_table import content_id
 from sb3_actpc.experiments.report.r_stability import final_mean, r_stability
 from sb3_actpc.experiments.report.references import reference_score
 from sb3_actpc.experiments.runs.episode_log import EPISODES
 from sb3_actpc.experiments.runs.evaluation import PROGRESS
 from sb3_actpc.experiments.runs.record import CONFIG, read_config
 from sb3_actpc.experiments.runs.run import DIAGNOSTICS
+from sb3_actpc.experiments.runs.schema import content_id
 from sb3_actpc.utils.files import atomic_write
 
 RUNS, CURVES, SETTINGS = "results.csv", "curves.csv.gz", "settings.json"  # of an export
@@ -173,12 +173,11 @@ def _run_row(folder: Path, evaluations: pd.DataFrame, episodes: pd.DataFrame) ->
 
 def _provenance(config: Mapping[str, Any]) -> dict[str, Any]:
     versions = dict(config.get("versions", {}))
-    commit, _, changes = (config.get("git_commit") or "").partition("+")
     return {
         "version": versions.pop("sb3-actpc", ""),
         "versions": ", ".join(f"{name} {version}" for name, version in versions.items()),
-        "commit": commit[:10],
-        "dirty": bool(changes),
+        "commit": (config.get("git_commit") or "")[:10],
+        "dirty": bool(config.get("dirty")),
     }
 
 

@@ -5,7 +5,9 @@ from __future__ import annotations
 import contextlib
 import importlib
 import io
-from collections.abc import Mapping
+import os
+import sys
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -84,12 +86,18 @@ def register_tasks(env_id: str) -> None:
             importlib.import_module("gymnasium_robotics")
 
 
-def check_env_id(env_id: str) -> None:
+def check_env_id(env_id: str, gym_packages: Sequence[str] = ()) -> None:
     """Check that an environment is registered; ids with a module (``module:Name-v0``) are left to ``gymnasium.make``.
 
     :param env_id: Gymnasium id
-    :raises gymnasium.error.Error: when it is unknown
+    :param gym_packages: modules that register environments, imported first; the working folder is looked in, too
+    :raises ImportError: when there is no such module
+    :raises gymnasium.error.Error: when the id is unknown
     """
+    if os.getcwd() not in sys.path:  # as with `python -m`
+        sys.path.append(os.getcwd())
+    for package in gym_packages:
+        importlib.import_module(package)
     register_tasks(env_id)
     if ":" not in env_id:
         gym.spec(env_id)

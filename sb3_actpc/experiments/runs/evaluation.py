@@ -186,7 +186,8 @@ class EvaluationCallback(BaseCallback):
     """Evaluates the untrained agent (:meth:`begin`; offline methods excepted), then every ``eval_freq`` steps, and at the end.
 
     Each evaluation starts its episodes from the same seeds, appends a row to ``progress.csv`` and saves
-    ``model.zip`` (written under another name and renamed, so that a stopped run leaves a whole one). ``seconds`` are those
+    ``model.zip`` (written under another name and renamed, so that a stopped run leaves a whole one), where the agent of the
+    best evaluation is to be kept only when no dense return before was higher. ``seconds`` are those
     since :meth:`begin`, the evaluations' own (``evaluation_seconds``) among them; ``updates`` are the agent's.
 
     :param envs: environments that only this callback uses, closed by whoever made them
@@ -195,6 +196,8 @@ class EvaluationCallback(BaseCallback):
     :param eval_episodes: episodes in each evaluation
     :param seed: seed of the first episode of each evaluation
     :param report: given one line of text after each evaluation
+    :param keeps_best: keep the agent of the best evaluation, not that of the last
+    :param target_return: end the training at the first evaluation whose mean dense return reaches it; None for never
     """
 
     def __init__(
@@ -205,8 +208,13 @@ class EvaluationCallback(BaseCallback):
         eval_episodes: int,
         seed: int,
         report: Callable[[str], None],
+        keeps_best: bool = False,
+        target_return: float | None = None,
     ) -> None:
         super().__init__()
+        self.keeps_best = keeps_best
+        self.target_return = np.inf if target_return is None else target_return
+        self.best_return = -np.inf
         self.envs = envs
         self.folder = folder
         self.eval_freq = eval_freq
@@ -245,6 +253,7 @@ class EvaluationCallback(BaseCallback):
         return {
             "wall_seconds": self.wall_seconds,
             "evaluation_seconds": self.evaluation_seconds,
+            "best_return": self.best_return,
             "last_summary": self.last_summary,
             "last_timesteps": self._last_timesteps,
             "rows": (self.folder / PROGRESS).read_text(encoding="utf-8"),
@@ -257,6 +266,7 @@ class EvaluationCallback(BaseCallback):
         """
         self._started = time.perf_counter() - state["wall_seconds"]
         self.evaluation_seconds = state["evaluation_seconds"]
+        self.best_return = state["best_return"]
         self.last_summary = state["last_summary"]
         self._last_timesteps = state["last_timesteps"]
         with atomic_write(self.folder / PROGRESS, "w") as file:
@@ -267,7 +277,7 @@ class EvaluationCallback(BaseCallback):
         is_last = self.num_timesteps >= self.model._total_timesteps
         if not is_last and self.num_timesteps - self._last_timesteps >= self.eval_freq:
             self._evaluate()
-        return True
+        return self.best_return < self.target_return
 
     def _on_training_end(self) -> None:
         if self._last_timesteps != self.num_timesteps:
@@ -277,13 +287,11 @@ class EvaluationCallback(BaseCallback):
         started = time.perf_counter()
         n_episodes = self.eval_episodes if n_episodes is None else n_episodes
         statistics = play_episodes(NormalizedPredictor.wrap(self.model), self.envs, n_episodes, self.seed)
-        NormalizedPredictor.save(self.model, self.folder)
-        with atomic_write(self.folder / "model.zip") as file:
-            self.model.save(cast(BufferedIOBase, file))
+        self.last_summary = statistics.summary()
+        self._keep_model(float(statistics.dense_returns.mean()))
         now = time.perf_counter()
         self.evaluation_seconds += now - started
         self._last_timesteps = self.num_timesteps
-        self.last_summary = statistics.summary()
         self._append_row(
             {
                 **self.last_summary,
@@ -299,6 +307,13 @@ class EvaluationCallback(BaseCallback):
         self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
         self.logger.dump(self.num_timesteps)  # a row of the agent's own figures beside each evaluation
         self.report(_evaluation_line(self.num_timesteps, self.last_summary))
+
+    def _keep_model(self, dense_return: float) -> None:
+        if not self.keeps_best or dense_return >= self.best_return:
+            NormalizedPredictor.save(self.model, self.folder)
+            with atomic_write(self.folder / "model.zip") as file:
+                self.model.save(cast(BufferedIOBase, file))
+        self.best_return = max(self.best_return, dense_return)
 
     def _append_row(self, values: dict[str, Any]) -> None:
         with open(self.folder / PROGRESS, "a", newline="", encoding="utf-8") as file:

@@ -23,21 +23,21 @@ def package_versions() -> dict[str, str]:
     return versions
 
 
-def git_commit(checkout: Path = CHECKOUT) -> str | None:
-    """The commit that a source checkout stands on.
+def git_state(checkout: Path = CHECKOUT) -> tuple[str | None, bool | None]:
+    """What a source checkout stands on.
 
     :param checkout: folder that holds ``.git``
-    :return: 40 hex digits, followed by ``+changes`` where files differ from it; None for an installed package or where git
-        cannot be asked
+    :return: the commit, 40 hex digits, and whether files that git knows differ from it; None and None for an installed package
+        or where git cannot be asked
     """
     if not (checkout / ".git").exists():
-        return None
+        return None, None
     try:
         commit = _git(checkout, "rev-parse", "HEAD")
         changes = _git(checkout, "status", "--porcelain", "--untracked-files=no")
     except (OSError, subprocess.SubprocessError):
-        return None
-    return f"{commit}+changes" if changes else commit
+        return None, None
+    return commit, bool(changes)
 
 
 def file_hash(path: Path | None) -> str | None:

@@ -2,47 +2,59 @@
 
 from __future__ import annotations
 
-import copy
 import shutil
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
-import numpy as np
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, ProgressBarCallback
-from stable_baselines3.common.logger import CSVOutputFormat, Logger
-from stable_baselines3.common.noise import ActionNoise, NormalActionNoise, OrnsteinUhlenbeckActionNoise
+from stable_baselines3.common.logger import CSVOutputFormat, KVWriter, Logger, TensorBoardOutputFormat
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_actpc.checkpoints import CheckpointCallback, Restored, list_bundles, restore
+from sb3_actpc.checkpoints import CheckpointCallback, DamagedCheckpoint, list_bundles, restore
 from sb3_actpc.demonstrations.dataset import Demonstrations
-from sb3_actpc.experiments.runs.config import RunConfig, RunPlan, load_algorithm, parse_schedule, resolve_run
+from sb3_actpc.experiments.runs.algorithms import load_algorithm, why_no_checkpoints
 from sb3_actpc.experiments.runs.environments import check_env_id, make_eval_envs, make_train_env
 from sb3_actpc.experiments.runs.episode_log import EpisodeLog
 from sb3_actpc.experiments.runs.evaluation import PROGRESS, EvaluationCallback, NormalizedPredictor, Predictor, play_episodes
-from sb3_actpc.experiments.runs.record import read_config, read_plan, write_config, write_result
+from sb3_actpc.experiments.runs.presets import agent_keywords, find_demonstrations, fitting_policy, resolve
+from sb3_actpc.experiments.runs.provenance import git_state, package_versions
+from sb3_actpc.experiments.runs.record import (
+    CONFIG,
+    RESULT,
+    check_demonstrations,
+    read_result,
+    read_run,
+    write_config,
+    write_result,
+)
+from sb3_actpc.experiments.runs.schema import Run, content_id
 from sb3_actpc.experiments.runs.summary import plot_learning_curve
 
 # the evaluation's episodes start from other states than the training's
 EVALUATION_SEED_OFFSET = 1_000_000
 CHECKPOINTS = "checkpoints"  # folder in the run's folder
 DIAGNOSTICS = "diagnostics.csv"  # what the agent logs about itself
+Report = Callable[[str], None]
 
 
-def train_run(
-    config: RunConfig, report: Callable[[str], None] = lambda line: None, callbacks: Sequence[BaseCallback] = ()
-) -> dict[str, Any]:
+def silent(line: str) -> None:
+    """:param line: nobody wants to see it"""
+
+
+def train_run(run: Run, report: Report = silent, callbacks: Sequence[BaseCallback] = ()) -> dict[str, Any]:
     """Train one agent; its folder then holds ``config.json``, ``progress.csv`` (the evaluations), ``episodes.csv`` (every
     training episode), ``diagnostics.csv`` (what the agent logs), ``model.zip``, the plot and, last, ``result.json``.
 
-    Works with any algorithm of ``ALGORITHMS``; those that learn on policy keep no checkpoints. Sets the number of torch
-    threads of the process.
+    Works with any algorithm of ``ALGORITHMS``; :func:`~sb3_actpc.experiments.runs.algorithms.why_no_checkpoints` says which
+    cannot be gone on with. Sets the number of torch threads of the process.
 
-    :param config: what to train
+    :param run: what to train
     :param report: given a line of text when the run starts and after each evaluation
     :param callbacks: further ones to watch the training with
     :return: the content of ``result.json`` (see :func:`~sb3_actpc.experiments.runs.record.write_result`), and the folder
@@ -50,47 +62,180 @@ def train_run(
     :raises ValueError: when a setting is unknown or has a wrong value
     :raises gymnasium.error.Error: when the environment is unknown
     """
-    check_env_id(config.env)
-    return _run(config, resolve_run(config), report, None, callbacks)
+    check_env_id(run.env, run.gym_packages)
+    run = resolve(run)
+    return _run(run.model_copy(update={"output": str(run_folder(run))}), report, callbacks, resumes=False)
 
 
 def resume_run(
-    folder: Path,
-    report: Callable[[str], None] = lambda line: None,
-    progress: bool = True,
-    callbacks: Sequence[BaseCallback] = (),
+    folder: Path, report: Report = silent, progress: bool = True, callbacks: Sequence[BaseCallback] = (), more_steps: int = 0
 ) -> dict[str, Any]:
-    """Go on with a run that was stopped, from its newest whole checkpoint, with the settings in its ``config.json``.
+    """Go on with a run from its newest whole checkpoint, with the settings in its ``config.json``.
 
     :param folder: run folder
     :param report: given a line of text when the run goes on, after each evaluation and for each damaged checkpoint
     :param progress: show a progress bar
     :param callbacks: further ones to watch the training with
+    :param more_steps: added to those that the run was to have; a finished run needs some
     :return: as :func:`train_run`
     :raises FileNotFoundError: when the folder is not that of a run
-    :raises ValueError: when the run is finished, or its checkpoints do not fit or are all damaged
+    :raises ValueError: when the run is finished and gets no more steps, or its checkpoints do not fit or are all damaged
     """
-    if (folder / "result.json").exists():
-        raise ValueError(f"the run in {folder} is finished: start another with more --steps")
-    config, plan = read_plan(folder, progress)
-    if not plan.learns_off_policy:
-        raise ValueError(f"{config.algo} {plan.without_checkpoints}: start the run again, in another folder")
-    check_env_id(config.env)
-    return _run(config, plan, report, folder, callbacks)
+    run = read_run(folder).model_copy(update={"progress": progress})
+    without = why_no_checkpoints(load_algorithm(run.algo))
+    if without:
+        raise ValueError(f"{run.algo} {without}: start the run again, in another folder")
+    if more_steps < 0:
+        raise ValueError(f"more_steps={more_steps} must be at least 0")
+    is_finished = (folder / RESULT).exists()
+    if is_finished and not more_steps:
+        raise ValueError(f"the run in {folder} is finished: say with --steps how many more it shall have")
+    if is_finished and not list_bundles(folder / CHECKPOINTS):
+        raise ValueError(
+            f"the run in {folder} is finished and kept no checkpoint to go on from: train another with more --steps"
+        )
+    check_env_id(run.env, run.gym_packages)
+    check_demonstrations(run)
+    if more_steps:
+        run = run.model_copy(update={"n_timesteps": (run.n_timesteps or 0) + more_steps})
+        write_config(run)
+        (folder / RESULT).unlink(missing_ok=True)
+    return _run(run, report, callbacks, resumes=True)
 
 
-def _run(
-    config: RunConfig, plan: RunPlan, report: Callable[[str], None], resumed: Path | None, more: Sequence[BaseCallback]
-) -> dict[str, Any]:
-    th.set_num_threads(config.threads)
-    eval_envs = make_eval_envs(config.env, plan.env_kwargs, config.eval_episodes)
-    train_env = make_train_env(config.env, plan.env_kwargs, plan.n_envs, config.seed, plan.normalize)
+def finish_run(run: Run, report: Report = silent, callbacks: Sequence[BaseCallback] = ()) -> dict[str, Any]:
+    """Bring a run to its end, whatever has become of it: begun now, gone on with from its newest whole checkpoint, given more
+    steps when it ended with fewer, or left alone when it is done.
+
+    :param run: with its folder (``output``)
+    :param report: as of :func:`train_run`
+    :param callbacks: as of :func:`train_run`
+    :return: as :func:`train_run`
+    :raises ValueError: when the folder holds another run, or for a wrong setting
+    """
+    check_env_id(run.env, run.gym_packages)
+    run, folder = resolve(run), run.folder
+    stored = _stored_run(folder, report)
+    if stored is not None and _content(stored) != _content(run):
+        raise ValueError(f"{folder} holds another run, of other settings: choose another folder")
+    if stored is not None and (folder / RESULT).is_file():
+        more = (run.n_timesteps or 0) - (stored.n_timesteps or 0)
+        result = read_result(folder)
+        if more <= 0 or (run.target_return is not None and result["dense_return"] >= run.target_return):
+            return {**result, "folder": str(folder)}
+        return resume_run(folder, report, run.progress, callbacks, more)
+    if stored is not None and list_bundles(folder / CHECKPOINTS):
+        try:
+            return resume_run(folder, report, run.progress, callbacks)
+        except DamagedCheckpoint as error:
+            report(f"{error}: the run starts again")
+    shutil.rmtree(folder / CHECKPOINTS, ignore_errors=True)
+    return train_run(run, report, callbacks)
+
+
+def _stored_run(folder: Path, report: Report) -> Run | None:
     try:
-        return _train(config, plan, train_env, eval_envs, report, resumed, more)
-    finally:
-        train_env.close()
+        return read_run(folder)
+    except FileNotFoundError:
+        return None
+    except ValueError as error:
+        report(f"{error}: the run starts again")
+        (folder / CONFIG).unlink()
+        return None
+
+
+def _content(run: Run) -> str:
+    """An id of what must not change; the policy may have been fitted to the observations."""
+    return content_id({**run.model_dump(), "n_timesteps": None, "policy": None}, run.seed)
+
+
+def _run(run: Run, report: Report, callbacks: Sequence[BaseCallback], resumes: bool) -> dict[str, Any]:
+    th.set_num_threads(run.threads)
+    with ExitStack() as stack:
+        eval_envs = make_eval_envs(run.env, run.env_kwargs, run.eval_episodes)
         for env in eval_envs:
-            env.close()
+            stack.callback(env.close)
+        train_env = make_train_env(run.env, run.env_kwargs, run.n_envs or 1, run.seed, run.normalize)
+        stack.callback(train_env.close)
+        model = build_model(run, train_env)
+        stack.callback(close_model, model)
+        result = _train(run, model, eval_envs, report, callbacks, resumes)
+    return {**result, "folder": str(run.folder)}
+
+
+def _train(
+    run: Run,
+    model: BaseAlgorithm,
+    eval_envs: list[gym.Env[Any, Any]],
+    report: Report,
+    more: Sequence[BaseCallback],
+    resumes: bool,
+) -> dict[str, Any]:
+    folder, checkpoints = run.folder, run.folder / CHECKPOINTS
+    goes_on = resumes and bool(list_bundles(checkpoints))
+    restored = None
+    if goes_on:  # before any file of the run is touched
+        assert isinstance(model, OffPolicyAlgorithm)
+        restored = restore(model, checkpoints, report)
+    folder.mkdir(parents=True, exist_ok=True)
+    if not resumes:
+        run = _begun(run, model)
+        write_config(run)
+    model.set_logger(_logger(model, folder))
+    seed = run.seed + EVALUATION_SEED_OFFSET
+    evaluation = EvaluationCallback(
+        eval_envs, folder, run.eval_freq or 1, run.eval_episodes, seed, report, run.keep == "best", run.target_return
+    )
+    episodes = EpisodeLog(folder, lambda: evaluation.wall_seconds)
+    since = f" from step {model.num_timesteps}" if goes_on else ""
+    report(f"{run.env}: {run.algo}, {run.n_timesteps} steps{since}, into {folder}")
+    if not goes_on:
+        episodes.begin()
+        evaluation.begin(model)
+    saver = None
+    if run.checkpoint_freq:
+        saver = CheckpointCallback(checkpoints, run.checkpoint_freq, at_end=False, report=report, restored=restored)
+    callbacks = [*([] if saver is None else [saver]), evaluation, episodes, *more]
+    _learn(model, run.n_timesteps or 0, callbacks, run.progress, goes_on)
+    plot_learning_curve(folder / PROGRESS, folder / "learning_curve.png", f"{run.env}, {run.algo}", run.demonstrators_return)
+    _keep_last_checkpoint(saver, run.continuable, report)
+    return write_result(folder)
+
+
+def _begun(run: Run, model: BaseAlgorithm) -> Run:
+    """With what is known once the agent has been made."""
+    commit, dirty = git_state()
+    policy = fitting_policy(run.policy or "MlpPolicy", model.observation_space)
+    reference = demonstrators_return(find_demonstrations(run.env, run.demonstrations))
+    filled = {"policy": policy, "demonstrators_return": reference, "versions": package_versions()}
+    return run.model_copy(update={**filled, "git_commit": commit, "dirty": dirty})
+
+
+def _logger(model: BaseAlgorithm, folder: Path) -> Logger:
+    """Into the run's folder, and for TensorBoard where the settings say so."""
+    formats: list[KVWriter] = [CSVOutputFormat(str(folder / DIAGNOSTICS))]
+    if model.tensorboard_log is not None:
+        try:
+            formats.append(TensorBoardOutputFormat(str(Path(model.tensorboard_log) / folder.name)))
+        except AssertionError as error:
+            message = f"tensorboard_log={model.tensorboard_log!r} needs TensorBoard: pip install tensorboard, or leave it out"
+            raise ImportError(message) from error
+    return Logger(str(folder), formats)
+
+
+def _keep_last_checkpoint(saver: CheckpointCallback | None, continuable: bool, report: Report) -> None:
+    """One, of the finished run, so that it can be given more steps; or none."""
+    if saver is None:
+        return
+    if not continuable:
+        shutil.rmtree(saver.folder, ignore_errors=True)
+        return
+    try:
+        saver.save()
+    except OSError as error:
+        report(f"no checkpoint of the end: {error.strerror or error}; the run is finished, and cannot be given more steps")
+    for bundle in list_bundles(saver.folder)[:-1]:
+        shutil.rmtree(bundle, ignore_errors=True)
 
 
 def evaluate_run(folder: Path, n_episodes: int = 10, seed: int = 0) -> dict[str, Any]:
@@ -106,59 +251,55 @@ def evaluate_run(folder: Path, n_episodes: int = 10, seed: int = 0) -> dict[str,
     """
     if n_episodes < 1:
         raise ValueError(f"episodes must be at least 1, found {n_episodes}")
-    record, model = load_run(folder)
-    envs = make_eval_envs(record["env"], record["env_kwargs"], n_episodes)
-    try:
-        statistics = play_episodes(model, envs, n_episodes, seed)
-    finally:
-        close_model(model)
+    run, model = load_run(folder)
+    with ExitStack() as stack:
+        stack.callback(close_model, model)
+        envs = make_eval_envs(run.env, run.env_kwargs, n_episodes)
         for env in envs:
-            env.close()
+            stack.callback(env.close)
+        statistics = play_episodes(model, envs, n_episodes, seed)
     return {
         **statistics.summary(),
         "failed_after": statistics.failed_after(),
-        "env": record["env"],
-        "algo": record["algo"],
-        "seed": record["seed"],
+        **{name: getattr(run, name) for name in ("env", "algo", "seed", "demonstrators_return")},
         "eval_episodes": n_episodes,
-        "demonstrators_return": record.get("demonstrators_return"),
     }
 
 
-def load_run(folder: Path) -> tuple[dict[str, Any], Predictor]:
-    """The recorded settings and the model of a run. The model is unpickled: open only runs that you trust.
+def load_run(folder: Path) -> tuple[Run, Predictor]:
+    """A run and its model. The model is unpickled: open only runs that you trust.
 
     :param folder: run folder
-    :return: the content of ``config.json``, and the model on the CPU, with its normalisation of observations where it has one
+    :return: the run, and the model on the CPU, with its normalisation of observations where it has one
     :raises FileNotFoundError: when the folder, ``config.json`` or ``model.zip`` does not exist
     :raises ValueError: when one of the two cannot be read
+    :raises gymnasium.error.Error: when its environment is unknown
     """
-    record = read_config(folder)
+    run = read_run(folder)
     if not (folder / "model.zip").is_file():
         raise FileNotFoundError(f"no run in {folder}: model.zip is missing")
-    model = load_algorithm(record["algo"]).load(folder / "model.zip", device="cpu")
-    return record, NormalizedPredictor.wrap_saved(model, folder)
+    check_env_id(run.env, run.gym_packages)
+    model = load_algorithm(run.algo).load(folder / "model.zip", device="cpu")
+    return run, NormalizedPredictor.wrap_saved(model, folder)
 
 
-def run_folder(config: RunConfig) -> Path:
+def run_folder(run: Run) -> Path:
     """The folder of a run: new, or left by a run that stopped before its first checkpoint.
 
-    :param config: the user's choices
-    :return: ``config.output``, or ``runs/<env>/<algo>_<preset>_seed<seed>`` with ``_2``, ``_3``, … when it holds a result or
+    :param run: the user's choices
+    :return: ``run.output``, or ``runs/<env>/<algo>_<preset>_seed<seed>`` with ``_2``, ``_3``, … when it holds a result or
         checkpoints
-    :raises ValueError: when ``config.output`` holds a finished run, or one that can be resumed
+    :raises ValueError: when ``run.output`` holds a finished run, or one that can be resumed
     """
-    if config.output is not None:
-        if (Path(config.output) / "result.json").exists():
-            raise ValueError(f"{config.output} already holds a finished run: choose another folder")
-        if list_bundles(Path(config.output) / CHECKPOINTS):
-            raise ValueError(
-                f"{config.output} holds a stopped run: go on with --resume {config.output}, or choose another folder"
-            )
-        return Path(config.output)
-    base = Path("runs") / config.env.replace(":", "_") / f"{config.algo}_{config.preset_name}_seed{config.seed}"
+    if run.output is not None:
+        if (run.folder / RESULT).exists():
+            raise ValueError(f"{run.output} already holds a finished run: choose another folder")
+        if list_bundles(run.folder / CHECKPOINTS):
+            raise ValueError(f"{run.output} holds a stopped run: go on with --resume {run.output}, or choose another folder")
+        return run.folder
+    base = Path("runs") / run.env.replace(":", "_") / f"{run.algo}_{run.preset_name}_seed{run.seed}"
     folder, number = base, 1
-    while (folder / "result.json").exists() or list_bundles(folder / CHECKPOINTS):
+    while (folder / RESULT).exists() or list_bundles(folder / CHECKPOINTS):
         number += 1
         folder = base.with_name(f"{base.name}_{number}")
     return folder
@@ -175,68 +316,20 @@ def demonstrators_return(path: Path | None) -> float | None:
     return None if returns is None else float(returns.mean())
 
 
-def build_model(plan: RunPlan, config: RunConfig, env: VecEnv) -> BaseAlgorithm:
+def build_model(run: Run, env: VecEnv) -> BaseAlgorithm:
     """Make the agent.
 
-    :param plan: the resolved settings
-    :param config: the user's choices
+    :param run: filled in
     :param env: training environment
     :return: the agent, not trained
     :raises ValueError: when a setting has a wrong value
     """
-    kwargs = copy.deepcopy(plan.algorithm_kwargs)  # SB3 adds keys of its own to the dictionaries it is given
-    if "learning_rate" in kwargs:
-        kwargs["learning_rate"] = parse_schedule(kwargs["learning_rate"])
-    if plan.uses_demonstrations:
-        kwargs["demonstrations"] = plan.demonstrations
-    if plan.noise is not None:
-        kwargs["action_noise"] = _action_noise(*plan.noise, size=int(np.prod(env.action_space.shape or (1,))))
+    algorithm, keywords = load_algorithm(run.algo), agent_keywords(run, env.observation_space, env.action_space)
     try:
-        return plan.algorithm(plan.policy, env, seed=config.seed, device=config.device, **kwargs)
+        return algorithm(env=env, seed=run.seed, device=run.device, **keywords)
     except (TypeError, AssertionError) as error:
         # SB3 checks some settings by assertion
-        raise ValueError(f"{plan.algorithm.__name__}: {error}") from error
-
-
-def _train(
-    config: RunConfig,
-    plan: RunPlan,
-    train_env: VecEnv,
-    eval_envs: list[gym.Env[Any, Any]],
-    report: Callable[[str], None],
-    resumed: Path | None,
-    more: Sequence[BaseCallback],
-) -> dict[str, Any]:
-    reference = demonstrators_return(plan.demonstrations)
-    model = build_model(plan, config, train_env)
-    folder = run_folder(config) if resumed is None else resumed
-    has_checkpoint = resumed is not None and bool(list_bundles(folder / CHECKPOINTS))
-    restored = None
-    if has_checkpoint:  # before any file of the run is touched
-        assert isinstance(model, OffPolicyAlgorithm)
-        restored = restore(model, folder / CHECKPOINTS, report)
-    folder.mkdir(parents=True, exist_ok=True)
-    if resumed is None:
-        write_config(folder, config, plan, reference)
-    model.set_logger(Logger(str(folder), [CSVOutputFormat(str(folder / DIAGNOSTICS))]))
-    evaluation = EvaluationCallback(
-        eval_envs, folder, plan.eval_freq, config.eval_episodes, config.seed + EVALUATION_SEED_OFFSET, report
-    )
-    episodes = EpisodeLog(folder, lambda: evaluation.wall_seconds)
-    since = f" from step {model.num_timesteps}" if has_checkpoint else ""
-    report(f"{config.env}: {config.algo}, {plan.n_timesteps} steps{since}, into {folder}")
-    if not has_checkpoint:
-        episodes.begin()
-        evaluation.begin(model)
-    callbacks = [*_checkpoints(folder, plan, report, restored), evaluation, episodes, *more]
-    try:
-        _learn(model, plan.n_timesteps, callbacks, config.progress, goes_on=has_checkpoint)
-    finally:
-        close_model(model)
-    plot_learning_curve(folder / PROGRESS, folder / "learning_curve.png", f"{config.env}, {config.algo}", reference)
-    result = write_result(folder)
-    shutil.rmtree(folder / CHECKPOINTS, ignore_errors=True)  # there is nothing left to resume
-    return {**result, "folder": str(folder)}
+        raise ValueError(f"{algorithm.__name__}: {error}") from error
 
 
 def close_model(model: Any) -> None:
@@ -244,16 +337,6 @@ def close_model(model: Any) -> None:
     :param model: ends its other process, where it has one
     """
     getattr(model, "close", lambda: None)()
-
-
-def _checkpoints(
-    folder: Path, plan: RunPlan, report: Callable[[str], None], restored: Restored | None
-) -> list[BaseCallback]:
-    """The one that saves checkpoints, where they are wanted."""
-    if not plan.checkpoint_freq:
-        return []
-    options: dict[str, Any] = {"at_end": False, "report": report, "restored": restored}
-    return [CheckpointCallback(folder / CHECKPOINTS, plan.checkpoint_freq, **options)]
 
 
 def _learn(model: BaseAlgorithm, n_timesteps: int, callbacks: list[BaseCallback], progress: bool, goes_on: bool) -> None:
@@ -269,10 +352,3 @@ def _learn(model: BaseAlgorithm, n_timesteps: int, callbacks: list[BaseCallback]
         for one in bar:
             if hasattr(one, "pbar"):
                 one.pbar.close()
-
-
-def _action_noise(noise_type: str, noise_std: float, size: int) -> ActionNoise:
-    mean, sigma = np.zeros(size), noise_std * np.ones(size)
-    if noise_type == "normal":
-        return NormalActionNoise(mean, sigma)
-    return OrnsteinUhlenbeckActionNoise(mean, sigma)

@@ -12,10 +12,12 @@ import numpy as np
 import yaml
 
 from sb3_actpc.demonstrations.dataset import Demonstrations
-from sb3_actpc.experiments.comparison import PlannedRun, plan_runs, read_comparison
+from sb3_actpc.experiments.comparison import plan_runs, read_comparison
+from sb3_actpc.experiments.comparison.display import LineDisplay
 from sb3_actpc.experiments.comparison.engines import Event
 from sb3_actpc.experiments.comparison.execution import Outcome, execute_run
 from sb3_actpc.experiments.comparison.schedule import Summary, run_comparison
+from sb3_actpc.experiments.runs import Run
 from sb3_actpc.experiments.runs.run import CHECKPOINTS
 
 EPISODE_LENGTH = 8
@@ -106,11 +108,11 @@ def write_demonstrations(path: Path = Path("demonstrations.npz")) -> None:
     ).save(path)
 
 
-def small_runs(folder: Path, algos: Sequence[Any] = ("first",), seeds: int = 1, **env_kwargs: Any) -> list[PlannedRun]:
+def small_runs(folder: Path, algos: Sequence[Any] = ("first",), seeds: int = 1, **env_kwargs: Any) -> list[Run]:
     """A table of ActPC's runs on the point; a name stands for the small preset with another discount."""
     discounts = {"first": 0.9, "second": 0.8, "third": 0.7}
     entries = [
-        {"name": one, "algo": "actpc", "preset": "small.yml", "overrides": {"gamma": discounts[one]}}
+        {"name": one, "algo": "actpc", "preset": "small.yml", "settings": {"gamma": discounts[one]}}
         if isinstance(one, str)
         else one
         for one in algos
@@ -124,19 +126,19 @@ class InlineEngine:
     """Executes runs in this process, one after the other, and remembers which."""
 
     def __init__(self) -> None:
-        self.begun: list[PlannedRun] = []
+        self.begun: list[Run] = []
         self.lines: list[str] = []
         self._events: list[Event] = []
 
     def capacity(self) -> int:
         return 1
 
-    def start(self, run: PlannedRun) -> None:
+    def start(self, run: Run) -> None:
         self.begun.append(run)
         outcome = self.execute(run)
         self._events += [Event(run.id, steps=run.n_timesteps), Event(run.id, outcome=outcome)]
 
-    def execute(self, run: PlannedRun) -> Outcome:
+    def execute(self, run: Run) -> Outcome:
         return execute_run(run, self.lines.append, lambda steps: None)
 
     def poll(self, timeout: float) -> list[Event]:
@@ -148,34 +150,30 @@ class InlineEngine:
     def close(self) -> None: ...
 
 
-class Lines:
+class Lines(LineDisplay):
     """A display that keeps what it is told."""
 
     def __init__(self) -> None:
         self.lines: list[str] = []
+        super().__init__(self.lines.append)
 
-    def begin(self, runs: Sequence[PlannedRun], n_finished: int) -> None:
+    def begin(self, runs: Sequence[Run], n_finished: int) -> None:
         self.lines.append(f"{len(runs)} to do, {n_finished} finished")
 
-    def started(self, run: PlannedRun) -> None:
-        self.lines.append(f"started {run.name}")
+    def started(self, run: Run) -> None:
+        self.lines.append(f"started {run.label}")
 
-    def stepped(self, run: PlannedRun, steps: int) -> None: ...
-
-    def ended(self, run: PlannedRun, outcome: Outcome) -> None:
-        self.lines.append(f"{outcome.status} {run.name} {outcome.message}")
-
-    def line(self, text: str) -> None:
-        self.lines.append(text)
+    def ended(self, run: Run, outcome: Outcome) -> None:
+        self.lines.append(f"{outcome.status} {run.label} {outcome.message}")
 
 
-def bring_to_end(runs: Sequence[PlannedRun], folder: Path, **options: Any) -> tuple[Summary, InlineEngine, Lines]:
+def bring_to_end(runs: Sequence[Run], folder: Path, **options: Any) -> tuple[Summary, InlineEngine, Lines]:
     """:func:`run_comparison` in this process."""
     engine, display = InlineEngine(), Lines()
     return run_comparison(runs, folder, lambda: engine, display, **options), engine, display
 
 
-def interrupt_after(run: PlannedRun, n_steps: int) -> None:
+def interrupt_after(run: Run, n_steps: int) -> None:
     """Execute a run whose process is stopped at a step, after a checkpoint."""
     from sb3_actpc.actpc import ActPC
 

@@ -32,7 +32,7 @@ def write_comparison(algos: list[str], **env_kwargs: object) -> None:
     """What :func:`small_runs` plans, as a file for the command."""
     discounts = {"first": 0.9, "second": 0.8}
     entries = [
-        {"name": name, "algo": "actpc", "preset": "small.yml", "overrides": {"gamma": discounts[name]}} for name in algos
+        {"name": name, "algo": "actpc", "preset": "small.yml", "settings": {"gamma": discounts[name]}} for name in algos
     ]
     given = {
         "envs": [{"env": TASK, "env_kwargs": env_kwargs, "demonstrations": "none"}],
@@ -41,7 +41,7 @@ def write_comparison(algos: list[str], **env_kwargs: object) -> None:
         "eval_freq": 20,
         "eval_episodes": 1,
         "checkpoint_freq": 10,
-        "out": str(OUT),
+        "output": str(OUT),
     }
     Path("c.yml").write_text(yaml.safe_dump(given), encoding="utf-8")
 

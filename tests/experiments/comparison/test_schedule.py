@@ -13,8 +13,7 @@ import pytest
 
 from sb3_actpc.checkpoints import list_bundles
 from sb3_actpc.cli import main
-from sb3_actpc.experiments.comparison import PlannedRun
-from sb3_actpc.experiments.comparison.display import LineDisplay, Tally, duration, make_display
+from sb3_actpc.experiments.comparison.display import LineDisplay, LiveDisplay, describe_runs, make_display
 from sb3_actpc.experiments.comparison.engines.cluster import _execute, pack_folder, unpack_folder
 from sb3_actpc.experiments.comparison.execution import (
     FAILED,
@@ -22,12 +21,14 @@ from sb3_actpc.experiments.comparison.execution import (
     LOST,
     NEW,
     UNFINISHED,
+    FolderBusy,
     Outcome,
     execute_run,
+    folder_lock,
     run_status,
 )
-from sb3_actpc.experiments.comparison.lock import FolderBusy, folder_lock
 from sb3_actpc.experiments.comparison.schedule import MAX_LOSSES
+from sb3_actpc.experiments.runs import Run
 from sb3_actpc.experiments.runs.record import read_result
 from sb3_actpc.experiments.runs.run import CHECKPOINTS
 from tests.checkpoints.runs import log_rows
@@ -44,7 +45,7 @@ def empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_preset()
 
 
-def measured(run: PlannedRun) -> list[Any]:
+def measured(run: Run) -> list[Any]:
     """What a run wrote, without times of the clock."""
     return [log_rows(run.folder / name) for name in FILES]
 
@@ -64,7 +65,7 @@ def test_all_runs_are_brought_to_their_end_once() -> None:
 def test_a_table_that_grows_is_only_added_to() -> None:
     bring_to_end(small_runs(OUT, ["first"]), OUT)
     _, engine, _ = bring_to_end(small_runs(OUT, ["first", "second"], seeds=2), OUT)
-    assert [(run.variant, run.config.seed) for run in engine.begun] == [("second", 0), ("first", 1), ("second", 1)]
+    assert [(run.name, run.seed) for run in engine.begun] == [("second", 0), ("first", 1), ("second", 1)]
 
 
 def test_an_unfinished_run_goes_on_from_its_checkpoint_and_ends_as_the_one_never_stopped() -> None:
@@ -155,7 +156,7 @@ class FaultyEngine(tasks.InlineEngine):
 
     n_losses = 0
 
-    def execute(self, run: PlannedRun) -> Outcome:
+    def execute(self, run: Run) -> Outcome:
         if self.n_losses:
             self.n_losses -= 1
             return Outcome(LOST, "the process of the run ended with signal 9")
@@ -229,10 +230,10 @@ def test_a_second_command_in_the_folder_is_refused_with_a_message(
 ) -> None:
     monkeypatch.setattr("sb3_actpc.experiments.comparison.schedule.LOCK_WAIT", 0.3)
     with folder_lock(OUT, 0.0):
-        assert main(["compare", "--envs", "SparseReacher-v5", "--algos", "actpc", "--out", str(OUT)]) == 2
+        assert main(["compare", "--envs", "SparseReacher-v5", "--algos", "actpc", "--output", str(OUT)]) == 2
     captured = capsys.readouterr()
-    assert f"out is in use by another process ({os.getpid()}): waiting" in captured.out
-    assert f"out is in use by another process ({os.getpid()}): wait until it has ended" in captured.err
+    assert "out is in use by another process: waiting" in captured.out
+    assert "out is in use by another process: wait until it has ended" in captured.err
     assert not list(OUT.rglob("seed*"))
 
 
@@ -274,40 +275,15 @@ def test_a_node_without_the_folders_works_on_a_copy_that_comes_back() -> None:
     assert not list((run.folder / CHECKPOINTS).rglob("*.json"))  # gone from the copy, gone from here
 
 
-def test_the_tally_counts_steps_and_estimates_the_time_left() -> None:
-    now = [0.0]
-    tally = Tally(lambda: now[0])
-    runs = small_runs(OUT, ["first", "second"])  # 60 steps each
-    tally.begin(runs, 3)
-    assert tally.seconds_left is None
-    tally.step(runs[0].id, 20)  # where it was found
-    now[0] = 10.0
-    tally.step(runs[0].id, 40)
-    # 20 steps in 10 seconds; 20 + 60 are left
-    assert (tally.steps_per_second, tally.seconds_left) == (2.0, 40.0)
-    tally.n_running = 1
-    assert tally.summary() == "3 of 5 runs done, 1 running, 2 steps/s, 40 s left"
-    tally.end(runs[0].id, FINISHED)
-    assert (tally.n_finished, tally.n_running) == (4, 0)
-
-
-def test_the_estimate_comes_from_what_was_measured_and_counts_what_is_left() -> None:
-    from sb3_actpc.experiments.comparison.estimate import GUESSED, MEASURED, estimate_runs, steps_done
-
-    finished, stopped, new = [*small_runs(OUT, seeds=2), *small_runs(OUT, ["second"])]
+def test_the_table_gives_the_seconds_of_finished_runs_to_those_of_their_kind_and_guesses_none() -> None:
+    finished, alike, other = [*small_runs(OUT, seeds=2), *small_runs(OUT, ["second"])]
     bring_to_end([finished], OUT)
-    interrupt_after(stopped, 33)
     result = json.loads((finished.folder / "result.json").read_text(encoding="utf-8"))
     (finished.folder / "result.json").write_text(json.dumps({**result, "wall_seconds": 600.0}), encoding="utf-8")
-    estimates = estimate_runs([finished, stopped, new])
-    assert steps_done(stopped.folder) == 33
-    # 600 seconds for 60 steps: 10 for each of the 27 that are left
-    assert (estimates[stopped.id].seconds, estimates[stopped.id].source) == (270.0, MEASURED)
-    assert (estimates[new.id].seconds, estimates[new.id].source) == (60 * 15.0 / 1000.0, GUESSED)
-
-
-def test_durations_are_for_people() -> None:
-    assert [duration(seconds) for seconds in (5.2, 61.0, 7500.0)] == ["5 s", "1 min 01 s", "2 h 05 min"]
+    rows = {line.split()[0]: line.split()[1:] for line in describe_runs([finished, alike, other]).splitlines()[1:4]}
+    assert rows[finished.id][-2:] == ["finished", "600"]
+    assert rows[alike.id][-2:] == ["new", "600"]
+    assert rows[other.id][-1] == "new"
 
 
 def test_without_a_terminal_there_are_lines() -> None:
@@ -319,15 +295,13 @@ def test_without_a_terminal_there_are_lines() -> None:
     display.begin([run], 0)
     display.started(run)
     display.ended(run, Outcome(FAILED, "a reason"))
-    assert "failed" in lines[-1] and "a reason" in lines[-1] and "1 failed" in lines[-1]
+    assert "failed" in lines[-1] and "a reason" in lines[-1] and "0 of 1 runs done" in lines[-1]
 
 
 def test_in_a_terminal_there_are_bars() -> None:
     from io import StringIO
 
     from rich.console import Console
-
-    from sb3_actpc.experiments.comparison.display import LiveDisplay
 
     text = StringIO()
     [run] = small_runs(OUT)
@@ -338,7 +312,7 @@ def test_in_a_terminal_there_are_bars() -> None:
         display.progress.refresh()
         display.ended(run, Outcome(FINISHED))
     shown = text.getvalue()
-    assert "30/60" in shown and "2 of 2 runs done" in shown
+    assert "30/60" in shown and "60/60" in shown and "2 of 2 runs done" in shown
 
 
 def test_disk_full_is_told_from_other_errors() -> None:

@@ -5,10 +5,11 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from sb3_actpc.experiments.comparison import Variant, ablation_variants, plan_runs, read_comparison
+from sb3_actpc.experiments.comparison import ablation_variants, plan_runs, read_comparison
 from sb3_actpc.experiments.comparison.execution import FINISHED, execute_run
 from sb3_actpc.experiments.report.ablations import arriving_gradient, changed_actions, without_effect
 from sb3_actpc.experiments.report.results import Results, load_results
+from sb3_actpc.experiments.runs import Run
 from tests.experiments.comparison.tasks import TASK, write_demonstrations, write_preset
 
 BASE, *ABLATIONS = ablation_variants()
@@ -19,7 +20,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("ablations")
 
 
-def run_variants(folder: Path, *variants: Variant) -> Results:
+def run_variants(folder: Path, *variants: Run) -> Results:
     """Of each a run of 56 steps: seven episodes, the first of them random, and an update after each later step."""
     write_preset(folder / "small.yml", demonstration_fraction=0.25, n_timesteps=56)
     write_demonstrations(folder / "demonstrations.npz")
@@ -32,7 +33,7 @@ def run_variants(folder: Path, *variants: Variant) -> Results:
 
 
 @pytest.mark.parametrize("variant", ABLATIONS, ids=[variant.name for variant in ABLATIONS])
-def test_the_removal_of_a_part_changes_an_action(variant: Variant, folder: Path) -> None:
+def test_the_removal_of_a_part_changes_an_action(variant: Run, folder: Path) -> None:
     results = run_variants(folder, BASE, variant)
     [task] = results.runs["task"].unique()
     groups = results.groups(task)

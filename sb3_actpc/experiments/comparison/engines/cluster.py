@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import io
 import os
 import socket
@@ -15,9 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from sb3_actpc.experiments.comparison.engines.base import Event
-from sb3_actpc.experiments.comparison.execution import LOG, LOST, STOPPED, Outcome, execute_run
-from sb3_actpc.experiments.comparison.lock import LOCK
-from sb3_actpc.experiments.comparison.run_table import PlannedRun
+from sb3_actpc.experiments.comparison.execution import LOCK, LOG, LOST, STOPPED, Outcome, execute_run
+from sb3_actpc.experiments.runs import Run
 
 CONNECTION_TIME = 10.0  # seconds
 _PROBE = ".shared-"  # a file by which a node sees whether it shares the folders
@@ -48,7 +46,7 @@ class RayEngine:
             self.ray.init(address=address, log_to_driver=False, **options)
         self._task = self.ray.remote(num_cpus=threads, max_retries=0)(_execute)
         self._board = self._start_board()
-        self._tasks: dict[Any, PlannedRun] = {}  # by Ray's reference to the answer
+        self._tasks: dict[Any, Run] = {}  # by Ray's reference to the answer
         self._steps: dict[str, int] = {}
         self._is_stopping = False
 
@@ -57,12 +55,12 @@ class RayEngine:
         fitting = int(self.ray.cluster_resources().get("CPU", 0)) // self.threads
         return max(1, fitting if self.n_workers is None else min(fitting, self.n_workers))
 
-    def start(self, run: PlannedRun) -> None:
+    def start(self, run: Run) -> None:
         """:param run: one that is not under way
         :raises OSError: when its folder cannot be written"""
         run.folder.mkdir(parents=True, exist_ok=True)
         folder = run.folder.absolute()
-        run = dataclasses.replace(run, config=dataclasses.replace(run.config, output=str(folder)))
+        run = run.model_copy(update={"output": str(folder)})
         probe = folder / f"{_PROBE}{uuid.uuid4().hex}"
         probe.touch()
         packed = self.ray.put(pack_folder(folder))
@@ -145,7 +143,7 @@ def _execute(job: str, probe: str, packed: bytes, board: Any) -> tuple[str, str,
     :param board: is told the steps; None for nobody
     :return: status and message of the outcome, and the folder where it has to be sent back
     """
-    run = PlannedRun.from_json(job)
+    run = Run.from_json(job)
 
     def on_steps(steps: int) -> None:
         if board is not None:
@@ -157,12 +155,12 @@ def _execute(job: str, probe: str, packed: bytes, board: Any) -> tuple[str, str,
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         unpack_folder(packed, folder)
-        local = dataclasses.replace(run, config=dataclasses.replace(run.config, output=str(folder)))
+        local = run.model_copy(update={"output": str(folder)})
         outcome = _execute_with_log(local, on_steps)
         return outcome.status, outcome.message, pack_folder(folder)
 
 
-def _execute_with_log(run: PlannedRun, on_steps: Callable[[int], None]) -> Outcome:
+def _execute_with_log(run: Run, on_steps: Callable[[int], None]) -> Outcome:
     """With what it reports in the run's folder, as the local engine has it."""
     with open(run.folder / LOG, "a", encoding="utf-8") as log:
         return execute_run(run, lambda line: print(line, file=log, flush=True), on_steps)

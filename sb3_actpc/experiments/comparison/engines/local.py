@@ -12,7 +12,7 @@ from typing import IO
 
 from sb3_actpc.experiments.comparison.engines.base import Event
 from sb3_actpc.experiments.comparison.execution import LOG, LOST, STOPPED, Outcome
-from sb3_actpc.experiments.comparison.run_table import PlannedRun
+from sb3_actpc.experiments.runs import Run
 
 SAVING_TIME = 60.0  # seconds that a worker gets to save its checkpoint
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMEXPR_NUM_THREADS")
@@ -38,7 +38,7 @@ class LocalEngine:
         """See :class:`~sb3_actpc.experiments.comparison.engines.Engine`, as for the others."""
         return self.n_workers
 
-    def start(self, run: PlannedRun) -> None:
+    def start(self, run: Run) -> None:
         """:param run: one that is not under way
         :raises OSError: when its log cannot be written or no process can be started"""
         run.folder.mkdir(parents=True, exist_ok=True)

@@ -1,0 +1,125 @@
+"""From tasks, algorithms and seeds to a list of runs, each with an id made from its content and a folder of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from sb3_actpc.experiments.comparison.variants import ablation_variants, parse_variant, part_of_run
+from sb3_actpc.experiments.runs import Run, resolve
+from sb3_actpc.experiments.runs.environments import check_env_id
+from sb3_actpc.experiments.runs.presets import read_yaml
+from sb3_actpc.experiments.runs.schema import Count, Schema, merged
+
+OWN_KEYS = ("envs", "algos", "ablate", "seeds", "output")
+
+
+class Comparison(Schema):
+    """Which runs are compared: every task with every variant and every seed.
+
+    :param tasks: parts of runs, with ``env``
+    :param variants: parts of runs, with a name and an algorithm
+    :param seeds: how many seeds; they are 0, 1, ...
+    :param shared: what holds for all runs; a task's own comes first, and a variant's before that
+    :param output: folder of the comparison
+    :raises ValueError: for a wrong number of seeds
+    """
+
+    tasks: tuple[Run, ...]
+    variants: tuple[Run, ...]
+    seeds: Count = 3
+    shared: Run = Run()
+    output: str = "runs/comparison"
+
+
+def read_comparison(given: Mapping[str, Any]) -> Comparison:
+    """
+    :param given: ``envs`` (ids, or mappings with ``env`` and other keys of a :class:`~sb3_actpc.experiments.runs.Run`),
+        ``algos`` (names, or mappings: see :func:`~sb3_actpc.experiments.comparison.variants.parse_variant`), ``ablate`` (true
+        adds the ablations), ``seeds``, ``output``, and keys of a run that hold for all. Values of None count as not given
+    :return: the comparison
+    :raises ValueError: when a key is unknown or a value is wrong
+    """
+    given = {str(key): value for key, value in given.items() if value is not None}
+    own = {key: given.pop(key) for key in OWN_KEYS if key in given}
+    shared = part_of_run({"eval_episodes": 10, "continuable": False, **given})
+    variants = [parse_variant(entry) for entry in _list(own, "algos")]
+    if own.get("ablate"):
+        variants += [variant for variant in ablation_variants() if variant not in variants]
+    tasks = [_parse_task(entry) for entry in _list(own, "envs")]
+    if not tasks:
+        raise ValueError("no task to compare on: give at least one, such as --envs SparseHopper-v5")
+    if not variants:
+        raise ValueError("no algorithm to compare: give at least one, such as --algos actpc, or --ablate")
+    _check_names([task.env for task in tasks])
+    _check_names([str(variant.name) for variant in variants])
+    rest = {key: own[key] for key in ("seeds", "output") if key in own}
+    return Comparison(tasks=tasks, variants=variants, shared=shared, **rest)
+
+
+def read_comparison_file(path: Path) -> dict[str, Any]:
+    """
+    :param path: a YAML file with the keys of :func:`read_comparison`
+    :return: its content
+    :raises FileNotFoundError: when there is none
+    :raises ValueError: when it is not a YAML mapping
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"no comparison file at {path}")
+    content = read_yaml(path.read_bytes(), str(path))
+    if not isinstance(content, dict):
+        raise ValueError(f"{path}: expected a mapping with envs, algos, seeds, n_timesteps and output")
+    return content
+
+
+def plan_runs(comparison: Comparison, folder: Path | None = None) -> list[Run]:
+    """Fill in and check every run before any is begun.
+
+    :param comparison: which runs
+    :param folder: where their folders go, as ``<task>/<variant>/seed<seed>_<id>``; by default the comparison's
+    :return: the runs: the first seed of everything, then the second, ...
+    :raises ValueError: when a name or a setting is unknown or wrong
+    :raises FileNotFoundError: when a preset or a demonstrations file does not exist
+    :raises gymnasium.error.Error: when a task is unknown
+    """
+    folder = Path(comparison.output) if folder is None else folder
+    filled = [_fill(comparison.shared, task, variant) for task in comparison.tasks for variant in comparison.variants]
+    return [_placed(run, seed, folder) for seed in range(comparison.seeds) for run in filled]
+
+
+def _fill(shared: Run, task: Run, variant: Run) -> Run:
+    env = task.env if variant.task_prefix is None else task.env.replace("Sparse", variant.task_prefix, 1)
+    run = Run(**{**merged(shared, task, variant), "env": env, "task": task.env, "progress": False})
+    check_env_id(env, run.gym_packages)
+    try:
+        return resolve(run)
+    except (ValueError, FileNotFoundError) as error:
+        raise type(error)(f"{task.env}, {variant.name}: {error}") from error
+
+
+def _placed(run: Run, seed: int, folder: Path) -> Run:
+    run = run.model_copy(update={"seed": seed})
+    own = folder / str(run.task).replace(":", "_") / str(run.name) / f"seed{seed}_{run.id}"
+    return run.model_copy(update={"output": str(own)})
+
+
+def _parse_task(entry: Any) -> Run:
+    if isinstance(entry, str):
+        return Run(env=entry)
+    if not isinstance(entry, Mapping) or "env" not in entry:
+        raise ValueError(f"expected a Gymnasium id or a mapping with env, found {entry!r}")
+    return part_of_run({str(key): value for key, value in entry.items()})
+
+
+def _list(given: Mapping[str, Any], name: str) -> list[Any]:
+    entries = given.get(name, [])
+    if not isinstance(entries, (list, tuple)):
+        raise ValueError(f"{name} must be a list, found {entries!r}")
+    return list(entries)
+
+
+def _check_names(names: Sequence[str]) -> None:
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise ValueError(f"{twice[0]!r} is given twice: leave one out, or give it another name")
