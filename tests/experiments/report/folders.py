@@ -26,7 +26,7 @@ def write_run(
     algo: str = "actpc",
     checksum: int = 1,
     finished: bool = True,
-    commit: str | None = None,
+    dirty: bool = False,
     **settings: Any,
 ) -> Path:
     """A run of 1000 steps, with the given dense returns of its training episodes and of its last evaluation."""
@@ -41,7 +41,8 @@ def write_run(
         "settings": settings,
         "demonstrators_return": 2000.0,
         "versions": {"sb3-actpc": "0.1.0", "torch": "2.13.0"},
-        "git_commit": commit,
+        "git_commit": "a" * 40,
+        "dirty": dirty,
     }
     (folder / "config.json").write_text(json.dumps(config), encoding="utf-8")
     n = len(returns)

@@ -30,7 +30,7 @@ def folder(tmp_path: Path) -> Path:
     write_run(tmp_path / "runs", seed=0, final=100.0)
     write_run(tmp_path / "runs", seed=1, final=300.0)
     write_run(tmp_path / "runs", REACHER, final=-4.0)
-    write_run(tmp_path / "runs", variant="td3", algo="td3", final=7.0, commit="a" * 40 + "+changes")
+    write_run(tmp_path / "runs", variant="td3", algo="td3", final=7.0, dirty=True)
     write_run(tmp_path / "runs", seed=2, final=900.0, finished=False)
     export(tmp_path / "runs", tmp_path / "kept")
     return tmp_path
