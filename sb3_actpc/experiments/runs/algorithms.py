@@ -1,0 +1,91 @@
+"""The algorithms by name, and what their constructors take."""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+
+from sb3_actpc.utils.constructors import constructor_keywords
+
+# name on the command line -> "module:class", imported only when it is used
+ALGORITHMS = {
+    "actpc": "sb3_actpc.actpc:ActPC",
+    "bc": "sb3_actpc.baselines:BC",
+    "bc_rnn": "sb3_actpc.baselines:BCRNN",
+    "bcq": "sb3_actpc.baselines:BCQ",
+    "cql": "sb3_actpc.baselines:CQL",
+    "ddpg": "sb3_actpc.baselines:DDPGDemo",
+    "hbc": "sb3_actpc.baselines:HBC",
+    "her": "sb3_actpc.baselines:HER",
+    "iris": "sb3_actpc.baselines:IRIS",
+    "logo": "sb3_actpc.baselines:LOGO",
+    "ppo": "stable_baselines3:PPO",
+    "sac": "stable_baselines3:SAC",
+    "sac_rlpd": "sb3_actpc.baselines:RLPD",
+    "td3": "sb3_actpc.baselines:TD3Demo",
+}
+# constructor keywords that have an option of their own
+_OPTION_OF = {
+    "env": "--env",
+    "seed": "--seed",
+    "device": "--device",
+    "demonstrations": "--demonstrations",
+    "action_noise": "--set noise_type=normal --set noise_std=0.1",
+}
+
+
+def load_algorithm(name: str) -> type[BaseAlgorithm]:
+    """Import an algorithm of the table.
+
+    :param name: key of ``ALGORITHMS``
+    :return: the class
+    :raises ValueError: when there is no such name
+    """
+    if name not in ALGORITHMS:
+        raise ValueError(
+            f"unknown algorithm {name!r}{nearest(name, ALGORITHMS)}: expected one of {', '.join(sorted(ALGORITHMS))}"
+        )
+    module, _, class_name = ALGORITHMS[name].partition(":")
+    return getattr(importlib.import_module(module), class_name)
+
+
+def check_keywords(algorithm: type[BaseAlgorithm], settings: Mapping[str, Any]) -> None:
+    """Check that a class takes these settings.
+
+    :param algorithm: the class
+    :param settings: constructor keywords
+    :raises ValueError: naming the first one that it does not take, or that has an option of its own
+    """
+    known = constructor_keywords(algorithm)
+    for name in settings:
+        if name in _OPTION_OF:
+            raise ValueError(f"{name!r} is not set here: use {_OPTION_OF[name]}")
+        if name not in known:
+            raise ValueError(f"{algorithm.__name__} has no setting {name!r}{nearest(name, known)}")
+
+
+def why_no_checkpoints(algorithm: type[BaseAlgorithm]) -> str:
+    """
+    :param algorithm: the class
+    :return: why its runs cannot be stopped and gone on with; empty where they can
+    """
+    if issubclass(algorithm, OffPolicyAlgorithm):
+        return ""
+    reason = "learns on policy" if issubclass(algorithm, OnPolicyAlgorithm) else "is quick enough to be run again"
+    return f"{reason} and keeps no checkpoints"
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """
+    :param name: that nothing goes by
+    :param known: names that there are
+    :return: ``" (did you mean 'gamma'?)"``, or nothing where none is near
+    """
+    close = difflib.get_close_matches(name, list(known), n=1)
+    return f" (did you mean {close[0]!r}?)" if close else ""

@@ -1,0 +1,277 @@
+"""Files of settings, and what they make of a run: everything that is not said comes from the preset."""
+
+from __future__ import annotations
+
+import copy
+import re
+from collections.abc import Iterable, Mapping
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import yaml
+from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
+from stable_baselines3.common.utils import LinearSchedule
+from torch import nn
+
+from sb3_actpc.demonstrations.dataset import shipped_demonstrations
+from sb3_actpc.envs import sparse_env_id
+from sb3_actpc.experiments.runs.algorithms import check_keywords, load_algorithm, why_no_checkpoints
+from sb3_actpc.experiments.runs.environments import make_env
+from sb3_actpc.experiments.runs.provenance import file_hash
+from sb3_actpc.experiments.runs.schema import Run, merged
+from sb3_actpc.utils.constructors import constructor_keywords
+
+PACKAGE_FOLDER = Path(__file__).resolve().parents[2]
+# inside an installed wheel, or beside the package in a source checkout
+HYPERPARAMS_FOLDERS = (PACKAGE_FOLDER / "hyperparams", PACKAGE_FOLDER.parent / "hyperparams")
+# keys of a preset, as rl-zoo3 has them, that are not the algorithm's
+RUN_KEYS = ("n_timesteps", "n_envs", "policy", "env_kwargs", "noise_type", "noise_std", "normalize")
+_ACTIVATIONS: dict[str, type[nn.Module]] = {"relu": nn.ReLU, "tanh": nn.Tanh, "elu": nn.ELU, "leaky_relu": nn.LeakyReLU}
+
+
+class _PlainLoader(yaml.SafeLoader):
+    """YAML 1.1 of plain values, in which ``1e-3`` is a number, as it is in YAML 1.2."""
+
+
+_PlainLoader.add_implicit_resolver(
+    "tag:yaml.org,2002:float", re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$"), list("-+.0123456789")
+)
+
+
+def read_yaml(text: str | bytes, source: str) -> Any:
+    """The one reader of YAML: plain values, nothing in it is run.
+
+    :param text: YAML, UTF-8 when it is bytes
+    :param source: where it is from, for the message
+    :return: the values
+    :raises ValueError: naming the source, when the text is not YAML or contains itself
+    """
+    try:
+        return yaml.load(text, Loader=_PlainLoader)
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        raise ValueError(f"{source}: not YAML of plain values ({' '.join(str(error).split())})") from error
+
+
+def load_preset(preset: str, env_id: str) -> dict[str, Any]:
+    """Settings of one environment in a preset file: its own entry, else ``default`` (never both).
+
+    :param preset: name of a file of ``hyperparams/`` without suffix, or a path ending in ``.yml`` or ``.yaml``
+    :param env_id: Gymnasium id
+    :return: a new dictionary of plain values
+    :raises FileNotFoundError: when there is no such preset
+    :raises ValueError: when the file is not a YAML mapping, or has neither entry
+    """
+    path = _preset_path(preset)
+    entries = read_yaml(path.read_bytes(), str(path))
+    if not isinstance(entries, Mapping):
+        raise ValueError(f"{path}: expected a mapping from environment ids to settings")
+    settings = entries.get(env_id, entries.get("default"))
+    if not isinstance(settings, Mapping):
+        raise ValueError(f"{path}: expected a mapping under {env_id!r} or 'default', found {settings!r}")
+    return {str(key): value for key, value in settings.items()}
+
+
+def resolve(run: Run) -> Run:
+    """Read the preset, put what the user said in its place, find the demonstrations, and check it all.
+
+    :param run: the user's choices, or a run that is filled in already
+    :return: the run with everything filled in
+    :raises FileNotFoundError: when the preset or the demonstrations file does not exist
+    :raises ValueError: when a setting is unknown or has a wrong value, or a sparse task has no demonstrations
+    :raises ImportError: when the algorithm is of another package that is not installed
+    """
+    if run.is_resolved:
+        return run
+    if not run.env:
+        raise ValueError("env is missing: give a Gymnasium id, such as SparseHopper-v5")
+    algorithm = load_algorithm(run.algo)
+    settings = with_changes(load_preset(run.preset or run.algo, run.env), run.settings)
+    entries = {name: settings.pop(name, None) for name in RUN_KEYS}
+    preset = Run(**{name: value for name, value in entries.items() if value is not None})
+    chosen = {name: getattr(run, name) for name in run.model_fields_set - {"settings"} if getattr(run, name) is not None}
+    run = Run(**merged(preset, Run(**chosen)))
+    if run.n_timesteps is None:
+        raise ValueError(f"n_timesteps is neither in the preset {run.preset_name!r} nor given: give --steps")
+    check_keywords(algorithm, settings)
+    getattr(algorithm, "check_installed", lambda: None)()
+    _check_noise(run, constructor_keywords(algorithm))
+    eval_freq = run.eval_freq or max(1, run.n_timesteps // 10)
+    without = why_no_checkpoints(algorithm)
+    if without and run.checkpoint_freq:
+        raise ValueError(f"{run.algo} {without}: leave --checkpoint-freq out, or give 0")
+    normalize = run.normalize
+    if normalize is not None and "gamma" in settings:
+        normalize = {"gamma": settings["gamma"], **normalize}
+    filled = {
+        "settings": settings,
+        "policy": run.policy or "MlpPolicy",
+        "n_envs": run.n_envs or 1,
+        "noise_std": None if run.noise_type is None else run.noise_std,
+        "normalize": normalize,
+        "eval_freq": eval_freq,
+        "checkpoint_freq": 0 if without else eval_freq if run.checkpoint_freq is None else run.checkpoint_freq,
+        "demonstrations_sha256": file_hash(find_demonstrations(run.env, run.demonstrations)),
+        "is_resolved": True,
+    }
+    return Run(**{**merged(run), **filled})
+
+
+def preset(env_id: str, name: str | None = None, algo: str = "actpc") -> dict[str, Any]:
+    """A preset as keywords of the agent's constructor: ``ActPC(env=env, **preset("SparseHopper-v5"))``.
+
+    ``noise_type`` and ``noise_std`` become ``action_noise``, ``lin_4e-4`` a schedule, and the demonstrations are those in the
+    package. Left out is what is not the agent's: ``n_timesteps`` (of ``learn``), ``n_envs``, ``env_kwargs`` and ``normalize``
+    (of the environment).
+
+    :param env_id: Gymnasium id of the task
+    :param name: as in ``--preset``, by default the algorithm's own
+    :param algo: key of ``ALGORITHMS``
+    :return: the keywords, without the environment
+    :raises FileNotFoundError: when there is no such preset
+    :raises ValueError: when one of its settings is unknown or wrong
+    """
+    run = resolve(Run(env=env_id, algo=algo, preset=name))
+    with closing(make_env(env_id, run.env_kwargs)) as env:
+        return agent_keywords(run, env.observation_space, env.action_space)
+
+
+def agent_keywords(run: Run, observation_space: gym.Space[Any], action_space: gym.Space[Any]) -> dict[str, Any]:
+    """
+    :param run: filled in
+    :param observation_space: of its environment
+    :param action_space: of its environment
+    :return: keywords of its algorithm's constructor, all but the environment, the seed and the device
+    :raises ValueError: when a text that stands for an object is unknown
+    """
+    keywords = copy.deepcopy(run.settings)  # SB3 adds keys of its own to the dictionaries it is given
+    if "learning_rate" in keywords:
+        keywords["learning_rate"] = parse_schedule(keywords["learning_rate"])
+    if isinstance(keywords.get("train_freq"), list):
+        keywords["train_freq"] = tuple(keywords["train_freq"])
+    activation = (keywords.get("policy_kwargs") or {}).get("activation_fn")
+    if isinstance(activation, str):
+        if activation not in _ACTIVATIONS:
+            raise ValueError(f"activation_fn={activation!r} is unknown: choose one of {', '.join(_ACTIVATIONS)}")
+        keywords["policy_kwargs"]["activation_fn"] = _ACTIVATIONS[activation]
+    demonstrations = find_demonstrations(run.env, run.demonstrations)
+    if demonstrations is not None and "demonstrations" in constructor_keywords(load_algorithm(run.algo)):
+        keywords["demonstrations"] = demonstrations
+    if run.noise_type is not None:
+        size = int(np.prod(action_space.shape or (1,)))
+        kind = NormalActionNoise if run.noise_type == "normal" else OrnsteinUhlenbeckActionNoise
+        keywords["action_noise"] = kind(np.zeros(size), np.full(size, run.noise_std))
+    return {"policy": fitting_policy(run.policy or "MlpPolicy", observation_space), **keywords}
+
+
+def fitting_policy(policy: str, observation_space: gym.Space[Any]) -> str:
+    """
+    :param policy: name of SB3's policy
+    :param observation_space: of the environment
+    :return: the policy; for observations of several parts the one that takes them
+    """
+    return "MultiInputPolicy" if policy == "MlpPolicy" and isinstance(observation_space, gym.spaces.Dict) else policy
+
+
+def parse_schedule(value: float | str) -> float | LinearSchedule:
+    """A learning rate, or as in rl-zoo3 ``lin_3e-4``: falling linearly to zero at the end of training.
+
+    :param value: a number, or a text such as ``"lin_3e-4"``
+    :return: the number, or the schedule
+    :raises ValueError: when it is neither
+    """
+    if not isinstance(value, str):
+        return value
+    prefix, _, number = value.rpartition("_")
+    try:
+        start = float(number)
+    except ValueError:
+        prefix = "wrong"
+    if prefix not in ("", "lin"):
+        raise ValueError(f"learning_rate={value!r} must be a number or lin_<number>, such as lin_3e-4")
+    return LinearSchedule(start, 0.0, 1.0) if prefix else start
+
+
+def parse_assignments(assignments: Iterable[str]) -> dict[str, Any]:
+    """Turn ``key=value`` texts into a dictionary; the values are read as YAML.
+
+    :param assignments: such as ``["gamma=0.98", "policy_kwargs.net_arch=[64, 64]"]``
+    :return: such as ``{"gamma": 0.98, "policy_kwargs.net_arch": [64, 64]}``
+    :raises ValueError: when a text has no ``=`` or no key, or the value is not YAML
+    """
+    values = {}
+    for assignment in assignments:
+        key, separator, text = assignment.partition("=")
+        if not separator or not key.strip():
+            raise ValueError(f"expected key=value, found {assignment!r}")
+        values[key.strip()] = read_yaml(text, f"the value of {assignment!r}")
+    return values
+
+
+def with_changes(settings: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """
+    :param settings: such as ``{"policy_kwargs": {"n_critics": 2}}``
+    :param changes: what replaces them; with a dotted key, such as ``"policy_kwargs.net_arch"``, a value in a mapping
+    :return: the settings with the changes
+    :raises ValueError: when a dotted key leads into something that is no mapping
+    """
+    changed = copy.deepcopy(dict(settings))
+    for key, value in changes.items():
+        *parents, last = key.split(".")
+        place = changed
+        for parent in parents:
+            if place.get(parent) is None:
+                place[parent] = {}
+            place = place[parent]
+            if not isinstance(place, dict):
+                raise ValueError(f"{key}={value!r}: {parent}={place!r} is no mapping")
+        place[last] = value
+    return changed
+
+
+def find_demonstrations(env_id: str, choice: str) -> Path | None:
+    """The demonstrations file of a run.
+
+    :param env_id: Gymnasium id of the task
+    :param choice: ``"shipped"`` (for a task whose name begins with ``Sparse``, or its goal version), ``"weak"`` (a weaker
+        demonstrator's), ``"none"``, or a path
+    :return: the file, or None for none
+    :raises FileNotFoundError: when the path does not exist, or a sparse task has no shipped file
+    """
+    if choice == "none":
+        return None
+    if choice == "weak":
+        return shipped_demonstrations(sparse_env_id(env_id), weak=True)
+    if choice != "shipped":
+        if not Path(choice).is_file():
+            raise FileNotFoundError(f"no demonstrations file at {choice}")
+        return Path(choice)
+    env_id = sparse_env_id(env_id)
+    return shipped_demonstrations(env_id) if env_id.rpartition(":")[2].startswith("Sparse") else None
+
+
+def preset_names() -> list[str]:
+    """Of the files in the package."""
+    return sorted({path.stem for folder in HYPERPARAMS_FOLDERS for path in folder.glob("*.yml")})
+
+
+def _preset_path(name: str) -> Path:
+    if Path(name).suffix in (".yml", ".yaml"):
+        if not Path(name).is_file():
+            raise FileNotFoundError(f"no preset file at {name}")
+        return Path(name)
+    for folder in HYPERPARAMS_FOLDERS:
+        if (folder / f"{name}.yml").is_file():
+            return folder / f"{name}.yml"
+    raise FileNotFoundError(f"no preset {name!r}: expected one of {', '.join(preset_names())}, or a path ending in .yml")
+
+
+def _check_noise(run: Run, keywords: list[str]) -> None:
+    if run.noise_type is None:
+        return
+    if run.noise_std is None:
+        raise ValueError(f"noise_type={run.noise_type!r} needs a standard deviation: give noise_std, such as 0.1")
+    if "action_noise" not in keywords:
+        raise ValueError(f"{load_algorithm(run.algo).__name__} takes no action noise: leave noise_type and noise_std out")

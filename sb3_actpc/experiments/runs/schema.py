@@ -1,0 +1,255 @@
+"""What a run is: one class from a file, or the command line, to ``config.json``.
+
+A :class:`Run` holds what a user chose. :func:`~sb3_actpc.experiments.runs.presets.resolve` fills in the rest, from the preset
+among others, and the filled one is what ``config.json`` holds, what goes to a worker, and what a stopped run goes on with.
+A part of a run (an entry of a comparison's file, say) is a :class:`Run` too; :func:`merged` puts parts together.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import AfterValidator, AliasChoices, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+
+from sb3_actpc.experiments.runs.algorithms import ALGORITHMS, nearest
+from sb3_actpc.utils.checks import check_device
+
+VERSION = 2  # of config.json
+MAX_SEED = 2**31 - 1  # other generators get a seed derived from it, which must be below 2**32
+# what decides the outcome of a run, apart from its seed
+CONTENT = (
+    "algo",
+    "env",
+    "env_kwargs",
+    "policy",
+    "n_timesteps",
+    "n_envs",
+    "noise_type",
+    "noise_std",
+    "normalize",
+    "settings",
+    "demonstrations_sha256",
+    "eval_freq",
+    "eval_episodes",
+)
+# what resolve() and the beginning of the training fill in
+FILLED = ("is_resolved", "demonstrations_sha256", "demonstrators_return", "versions", "git_commit", "dirty")
+_MESSAGES = {
+    "greater_than_equal": "must be at least {ge}",
+    "less_than_equal": "must be at most {le}",
+    "int_type": "must be a whole number",
+    "int_parsing": "must be a whole number",
+    "int_from_float": "must be a whole number",
+    "finite_number": "must be a finite number",
+    "string_type": "must be a text",
+    "dict_type": "must be a mapping",
+    "literal_error": "must be {expected}",
+}
+
+
+def _number(value: Any) -> Any:
+    """Texts such as ``"1e5"`` are numbers, truth values are none."""
+    if isinstance(value, bool):
+        raise ValueError("must be a number")
+    try:
+        return float(value) if isinstance(value, str) else value
+    except ValueError as error:
+        raise ValueError("must be a number") from error
+
+
+def _algorithm(name: str) -> str:
+    if name not in ALGORITHMS:
+        raise ValueError(f"is no algorithm{nearest(name, ALGORITHMS)}: choose one of {', '.join(sorted(ALGORITHMS))}")
+    return name
+
+
+def _device(name: str) -> str:
+    check_device(name)
+    return name
+
+
+def _keywords(value: Any) -> Any:
+    """As in rl-zoo3: true, false, or keywords."""
+    return {True: {}, False: None}[value] if isinstance(value, bool) else value
+
+
+Count = Annotated[int, BeforeValidator(_number), Field(ge=1)]
+Real = Annotated[float, BeforeValidator(_number), Field(allow_inf_nan=False)]
+Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.+-]*$")]
+Keywords = dict[str, Any]
+
+
+class Schema(BaseModel):
+    """Immutable, and with errors of one line that name the key, the value, and the nearest known key."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    def __init__(self, **given: Any) -> None:
+        try:
+            super().__init__(**given)
+        except ValidationError as error:
+            raise ValueError(_describe(error, self.known_keys())) from error
+
+    @classmethod
+    def known_keys(cls) -> list[str]:
+        """Every name that a value can be given by."""
+        aliases = [field.validation_alias for field in cls.model_fields.values()]
+        choices = [name for alias in aliases if isinstance(alias, AliasChoices) for name in map(str, alias.choices)]
+        return sorted({*cls.model_fields, *choices} - set(FILLED))
+
+
+class Run(Schema):
+    """One training run, or a part of what is said about it.
+
+    :param env: Gymnasium id of the task
+    :param algo: key of ``ALGORITHMS``
+    :param preset: name of a file of ``hyperparams/``, or a path ending in ``.yml``; by default the name of the algorithm
+    :param n_timesteps: environment steps to train for, also called ``steps``; by default the preset's
+    :param seed: seed of the agent and of the training environment
+    :param demonstrations: ``"shipped"`` or ``"weak"`` (the files in the package for a sparse task), ``"none"``, or a path
+    :param settings: the algorithm's keywords that replace the preset's; ``"policy_kwargs.net_arch"`` replaces one value in a
+        mapping. Once filled in: all of them
+    :param env_kwargs: keywords of the environment, added to the preset's
+    :param policy: name of SB3's policy; by default the preset's
+    :param n_envs: parallel training environments; by default the preset's, or 1
+    :param noise_type: of the action noise, by default the preset's
+    :param noise_std: its standard deviation
+    :param normalize: keywords of SB3's ``VecNormalize`` around the training environment, or true;
+        by default the preset's
+    :param eval_freq: environment steps between two evaluations; by default a tenth of the training
+    :param eval_episodes: episodes in each evaluation
+    :param checkpoint_freq: environment steps between two checkpoints, 0 for none; by default as ``eval_freq``
+    :param keep: which agent is kept as ``model.zip``: that of the ``"last"`` evaluation, or of the ``"best"`` (dense return)
+    :param target_return: the training ends at the first evaluation whose mean dense return reaches it; None for never
+    :param output: run folder; by default ``runs/<env>/<algo>_<preset>_seed<seed>``
+    :param device: torch device
+    :param threads: threads that torch uses
+    :param progress: show a progress bar
+    :param continuable: keep the last checkpoint when the run is finished, so that it can be given more steps
+    :param gym_packages: modules to import before the environment is made, which register it; the working folder is looked in
+    :param task: of a comparison; ``env`` may be another version of it
+    :param name: of this way of running the algorithm in a comparison, a variant
+    :param about: what the variant is, for a report
+    :param task_prefix: what the variant's environment begins with, in the place of the task's ``Sparse``
+    :param is_resolved: whether everything is filled in
+    :param demonstrations_sha256: of the file's content; filled in, as those that follow
+    :param demonstrators_return: mean dense return of the demonstrations
+    :param versions: of the packages
+    :param git_commit: of the source checkout that ran
+    :param dirty: whether files differed from that commit
+    :raises ValueError: in one line that names the value, when one is wrong
+    """
+
+    env: str = ""
+    algo: Annotated[str, AfterValidator(_algorithm)] = "actpc"
+    preset: str | None = None
+    n_timesteps: Count | None = Field(None, validation_alias=AliasChoices("n_timesteps", "steps"))
+    seed: Annotated[int, BeforeValidator(_number), Field(ge=0, le=MAX_SEED)] = 0
+    demonstrations: str = "shipped"
+    settings: Keywords = Field(default_factory=dict)
+    env_kwargs: Keywords = Field(default_factory=dict)
+    policy: str | None = None
+    n_envs: Annotated[Count, Field(le=1024)] | None = None
+    noise_type: Literal["normal", "ornstein-uhlenbeck"] | None = None
+    noise_std: Annotated[Real, Field(ge=0)] | None = None
+    normalize: Annotated[Keywords | None, BeforeValidator(_keywords)] = None
+    eval_freq: Count | None = None
+    eval_episodes: Count = 5
+    checkpoint_freq: Annotated[int, BeforeValidator(_number), Field(ge=0)] | None = None
+    keep: Literal["last", "best"] = "last"
+    target_return: Real | None = None
+    output: str | None = None
+    device: Annotated[str, AfterValidator(_device)] = "cpu"
+    threads: Annotated[Count, Field(le=1024)] = 1
+    progress: bool = True
+    continuable: bool = True
+    gym_packages: tuple[str, ...] = ()
+    task: str | None = None
+    name: Name | None = None
+    about: str = ""
+    task_prefix: str | None = None
+    is_resolved: bool = False
+    demonstrations_sha256: str | None = None
+    demonstrators_return: float | None = None
+    versions: dict[str, str] = Field(default_factory=dict)
+    git_commit: str | None = None
+    dirty: bool | None = None
+
+    @property
+    def id(self) -> str:
+        """Ten hex digits made from what decides the outcome of a filled run."""
+        return content_id(self.model_dump(), self.seed)
+
+    @property
+    def preset_name(self) -> str:
+        """Name of the preset without folder and suffix."""
+        return Path(self.preset or self.algo).stem
+
+    @property
+    def folder(self) -> Path:
+        """The run's own, where it is said."""
+        assert self.output is not None
+        return Path(self.output)
+
+    @property
+    def label(self) -> str:
+        """Task, variant and seed, for people."""
+        return f"{self.task or self.env} {self.name or self.algo} seed {self.seed}"
+
+    def to_json(self) -> str:
+        """On one line."""
+        return self.model_dump_json()
+
+    @classmethod
+    def from_json(cls, text: str) -> Run:
+        """
+        :param text: what :meth:`to_json` returned
+        :return: the run
+        """
+        return cls(**json.loads(text))
+
+
+def merged(*parts: Run) -> dict[str, Any]:
+    """
+    :param parts: of one run; what is said later counts more, ``settings`` and ``env_kwargs`` are put together
+    :return: keywords of a :class:`Run`: everything that was said
+    """
+    said: dict[str, Any] = {}
+    for part in parts:
+        for name in part.model_fields_set:
+            value = getattr(part, name)
+            said[name] = {**said.get(name, {}), **value} if name in ("settings", "env_kwargs") else value
+    return said
+
+
+def content_id(record: Mapping[str, Any], seed: int | None = None) -> str:
+    """
+    :param record: a run's ``config.json``, or as much of it as decides the outcome
+    :param seed: the run's; None for an id that all seeds share
+    :return: ten hex digits
+    """
+    content = {name: record[name] for name in CONTENT if record.get(name) is not None}
+    text = json.dumps({**content, "seed": seed}, sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:10]
+
+
+def _describe(error: ValidationError, known: list[str]) -> str:
+    """The first mistake, in one line."""
+    first = error.errors()[0]
+    key = ".".join(str(part) for part in first["loc"])
+    if first["type"] == "extra_forbidden":
+        return f"unknown key {key!r}{nearest(key, known)}: expected some of {', '.join(known)}"
+    if first["type"] == "string_pattern_mismatch":
+        return f"{key}={first['input']!r} must be letters, digits and . _ + -: it becomes a folder's"
+    context = first.get("ctx", {})
+    message = _MESSAGES.get(first["type"], first["msg"].removeprefix("Value error, ")).format(**context)
+    return f"{key}={first['input']!r} {message}" if first["type"] != "value_error" or not _names_itself(message) else message
+
+
+def _names_itself(message: str) -> bool:
+    """Whether an error of ours names the value already."""
+    return message.partition("=")[0].isidentifier()
