@@ -71,8 +71,8 @@ def check_demonstrations(run: Run) -> None:
     path = find_demonstrations(run.env, run.demonstrations)
     if file_hash(path) != run.demonstrations_sha256:
         raise ValueError(
-            f"{run.folder}: the demonstrations ({path}) are not those that the run began with: put them back, or start the run "
-            "again in another folder"
+            f"{run.folder}: the demonstrations ({path}) are not those that the run began with: put them back, or start the "
+            "run again in another folder"
         )
 
 
