@@ -26,6 +26,7 @@ def write_run(
     algo: str = "actpc",
     checksum: int = 1,
     finished: bool = True,
+    commit: str | None = None,
     dirty: bool = False,
     **settings: Any,
 ) -> Path:
@@ -41,7 +42,7 @@ def write_run(
         "settings": settings,
         "demonstrators_return": 2000.0,
         "versions": {"sb3-actpc": "0.1.0", "torch": "2.13.0"},
-        "git_commit": "a" * 40,
+        "git_commit": commit,
         "dirty": dirty,
     }
     (folder / "config.json").write_text(json.dumps(config), encoding="utf-8")

@@ -16,7 +16,7 @@ from tests.experiments.report.folders import HOPPER, REACHER, write_run
 def test_an_export_is_read_as_the_folders_are(tmp_path: Path) -> None:
     write_run(tmp_path / "runs", seed=0, returns=[1.0] * 120, final=1 / 3, commit="1" * 40)
     write_run(tmp_path / "runs", seed=1, final=3000.123, commit="12e4567890" * 4, gamma=0.5)
-    write_run(tmp_path / "runs", REACHER, "td3", algo="td3", final=-4.0, dirty=True)
+    write_run(tmp_path / "runs", REACHER, "td3", algo="td3", final=-4.0, commit="a" * 40, dirty=True)
     write_run(tmp_path / "runs", REACHER, "td3", seed=1, algo="td3", finished=False)
     files = export(tmp_path / "runs", tmp_path / "kept")
     names = ["results.csv", "curves.csv.gz", "settings.json", f"curves_{HOPPER}.png", f"curves_{REACHER}.png"]
