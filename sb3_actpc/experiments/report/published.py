@@ -1,20 +1,24 @@
-"""Tables of Markdown files that no hand has typed: written from exports, between markers that say what stands in them.
+"""Tables of Markdown files that no hand has typed: written from exports, between markers.
 
-    <!-- table: NAME
-    from: examples/results/first                    # folder of an export, beside the Markdown file
-    rows: {ActPC: actpc, demonstrators: demonstrators}
-    columns: {Hopper: SparseHopper-v5, Reacher: {task: SparseReacher-v5, score: "{success_rate:.2f}"}}
-    score: "{dense_return:.0f} ({sparse_return:.0f})"
-    cell: "{score}, {steps:,.0f}"
-    -->
+    <!-- table: examples/results/tables.yml NAME -->
     | ... |
     <!-- /table -->
 
+The YAML file, named from the Markdown file's folder, says for each name what stands in the table:
+
+    NAME:
+      from: first                    # folder of an export, beside the YAML file
+      rows: {ActPC: actpc, demonstrators: demonstrators}
+      columns: {Hopper: SparseHopper-v5, Reacher: {task: SparseReacher-v5, score: "{success_rate:.2f}"}}
+      score: "{dense_return:.0f} ({sparse_return:.0f})"
+      cell: "{score}, {steps:,.0f}"
+
 What a row or a column says is added to what the table says, the row last; a text alone is the variant of a row and the task of
-a column. ``from``, ``task``, ``variant``, ``settings`` and ``planned_steps`` choose runs, ``cell`` says what is written of
-them: columns of ``results.csv`` with a format, which give the mean over the seeds, or with ``each``, ``min``, ``max`` or
-``std`` before it, as in ``{dense_return:each .0f}``; ``{n}``, the number of seeds; and ``{score}``, which stands for what
-``score`` says. A cell without runs is empty. The variants ``demonstrators``, ``random`` and ``paper:ALGO`` are known
+a column. ``from``, ``task``, ``variant``, ``settings``, ``seed`` and ``planned_steps`` choose runs, ``cell`` says what is
+written of them: columns of ``results.csv`` with a format, which give the mean over the seeds, or with ``each``, ``min``,
+``max`` or ``std`` before it, as in ``{dense_return:each .0f}``; ``{n}``, the number of seeds; ``{paper}``, what the paper
+gives for the algorithm; and ``{score}``, which stands for what ``score`` says. A cell without runs is empty; † marks one with
+runs from a source tree with uncommitted changes. The variants ``demonstrators``, ``random`` and ``paper:ALGO`` are known
 everywhere.
 """
 
@@ -35,9 +39,8 @@ from sb3_actpc.experiments.report.results import load_results
 from sb3_actpc.experiments.report.tables import UNDEFINED, markdown, number
 from sb3_actpc.utils.files import atomic_write
 
-DIRTY_NOTE = "† with runs from a source tree with uncommitted changes"
-_MARKER = re.compile(r"(<!-- table: (\S+)\n(.*?)-->\n).*?(<!-- /table -->)", re.DOTALL)
-_CHOOSING = ("task", "variant", "settings", "planned_steps")
+_MARKER = re.compile(r"(<!-- table: (\S+) (\S+) -->\n).*?(<!-- /table -->)", re.DOTALL)
+_CHOOSING = ("task", "variant", "settings", "seed", "planned_steps")
 _KEYS = {"from", "rows", "columns", "cell", "score", *_CHOOSING}
 
 
@@ -60,23 +63,26 @@ def write_tables(path: Path) -> bool:
 def fill_tables(text: str, folder: Path) -> str:
     """
     :param text: Markdown
-    :param folder: that ``from`` is relative to
+    :param folder: its own
     :return: the same with its tables written anew
     :raises ValueError: when a marker is not closed, or says something unknown
-    :raises FileNotFoundError: when an export is missing
+    :raises FileNotFoundError: when the YAML file or an export is missing
     """
     found = len(_MARKER.findall(text))
     if not found == text.count("<!-- table:") == text.count("<!-- /table -->"):
         raise ValueError(
-            "tables are marked by '<!-- table: NAME', a line break, settings, '-->' ... '<!-- /table -->': "
+            "tables are marked by '<!-- table: FILE.yml NAME -->' and '<!-- /table -->': "
             f"{text.count('<!-- table:')} begin, {text.count('<!-- /table -->')} end, {found} are whole"
         )
 
     def filled(match: re.Match[str]) -> str:
         try:
-            return f"{match[1]}{_table(yaml.safe_load(match[3]), folder)}\n{match[4]}"
+            specs = yaml.safe_load((folder / match[2]).read_text(encoding="utf-8"))
+            if match[3] not in specs:
+                raise ValueError(f"not in {match[2]}: there are {', '.join(specs)}")
+            return f"{match[1]}{_table(specs[match[3]], (folder / match[2]).parent)}\n{match[4]}"
         except (ValueError, KeyError, yaml.YAMLError) as error:
-            raise ValueError(f"table {match[2]}: {error}") from error
+            raise ValueError(f"table {match[3]}: {error}") from error
 
     return _MARKER.sub(filled, text)
 
@@ -106,8 +112,7 @@ def _table(spec: dict[str, Any], folder: Path) -> str:
     by_column = [column if isinstance(column, dict) else {"task": column} for column in columns.values()]
     by_row = {name: row if isinstance(row, dict) else {"variant": row} for name, row in rows.items()}
     cells = [[name, *(_cell({**spec, **column, **row}, folder) for column in by_column)] for name, row in by_row.items()]
-    text = markdown(pd.DataFrame(cells, columns=["", *columns]))
-    return f"{text}\n\n{DIRTY_NOTE}" if "†" in text else text
+    return markdown(pd.DataFrame(cells, columns=["", *columns]))
 
 
 def _cell(spec: dict[str, Any], folder: Path) -> str:
@@ -126,23 +131,24 @@ def _cell(spec: dict[str, Any], folder: Path) -> str:
     if runs["seed"].duplicated().any():
         raise ValueError(f"several runs with one seed for {spec}: name settings ({', '.join(runs['settings'].unique())})")
     fields: dict[str, Any] = {name: _OverSeeds(runs[name]) for name in map(str, runs.select_dtypes("number"))}
-    fields["n"] = len(runs)
+    fields["n"] = _OverSeeds(runs["algorithm"].notna().groupby(runs["task"]).sum().replace(0, np.nan))
     fields["score"] = spec.get("score", "").format(**fields)
-    text = re.sub(rf"\s*\({UNDEFINED}\)|, {UNDEFINED}", "", spec["cell"].format(**fields))  # what is not known is left out
-    return f"{text} †" if runs["dirty"].any() else text
+    text = re.sub(rf"(\s*\(|, | x ){UNDEFINED}\)?", "", spec["cell"].format(**fields))  # what is not known is left out
+    return "" if text == UNDEFINED else f"{text} †" if runs["dirty"].any() else text
 
 
 @cache
 def _runs(folder: Path) -> pd.DataFrame:
     """The finished runs of an export, and a row for each of the references of its tasks."""
     results = load_results(folder)
-    rows = []
+    papers, rows = {}, []
     for task in results.finished["task"].unique():
         measure = measure_of(task)
         lines = reference_lines(results, task)
         rows += [{"task": task, "variant": name.removesuffix(" actions"), measure: value} for name, value in lines.items()]
         for _, row in paper_results(task).iterrows():
-            score = row.score / 100 if row.is_success else row.score
-            rows.append({"task": task, "variant": f"paper:{row.algo}", measure: score})
-    references = pd.DataFrame(rows).assign(dirty=False, seed=0, settings="")
-    return pd.concat([results.finished, references])
+            papers[task, row.algo] = row.score / 100 if row.is_success else row.score
+            rows.append({"task": task, "variant": f"paper:{row.algo}", measure: papers[task, row.algo]})
+    own = zip(results.finished["task"], results.finished["algorithm"], strict=True)
+    runs = results.finished.assign(paper=[papers.get(one, np.nan) for one in own])
+    return pd.concat([runs, pd.DataFrame(rows).assign(dirty=False, seed=0, settings="")])

@@ -18,7 +18,8 @@ def number(value: float, form: str) -> str:
     :param form: of a format, such as ``".1f"``
     :return: a cell
     """
-    return UNDEFINED if math.isnan(value) else format(value, form)
+    text = UNDEFINED if math.isnan(value) else format(value, form)
+    return text.removeprefix("-") if not text.strip("-0.") else text  # no negative zero
 
 
 def mean_and_deviation(values: np.ndarray, form: str) -> str:

@@ -6,22 +6,23 @@ import pytest
 
 from sb3_actpc.cli import main
 from sb3_actpc.experiments.report.export import export
-from sb3_actpc.experiments.report.published import DIRTY_NOTE, fill_tables, write_tables
+from sb3_actpc.experiments.report.published import fill_tables, write_tables
 from tests.experiments.report.folders import REACHER, write_run
 
 ROOT = Path(__file__).resolve().parents[3]
-TABLE = """Before.
+PAGE = """Before.
 
-<!-- table: one
-from: kept
-rows: {{{rows}}}
-columns: {{Hopper: SparseHopper-v5, Reacher: {{task: SparseReacher-v5, score: "{{success_rate:.2f}}"}}}}
-score: "{{dense_return:.0f}} ({{sparse_return:.0f}})"
-cell: "{cell}"
--->
+<!-- table: tables.yml one -->
 old
 <!-- /table -->
 After."""
+TABLE = """one:
+  from: kept
+  rows: {{{rows}}}
+  columns: {{Hopper: SparseHopper-v5, Reacher: {{task: SparseReacher-v5, score: "{{success_rate:.2f}}"}}}}
+  score: "{{dense_return:.0f}} ({{sparse_return:.0f}})"
+  cell: "{cell}"
+"""
 
 
 @pytest.fixture
@@ -38,8 +39,9 @@ def folder(tmp_path: Path) -> Path:
 
 def lines(folder: Path, rows: str, cell: str = "{score}") -> list[str]:
     """Of the table."""
-    text = fill_tables(TABLE.format(rows=rows, cell=cell), folder)
-    assert text.startswith("Before.\n\n<!-- table: one\nfrom: kept\n") and text.endswith("\n<!-- /table -->\nAfter.")
+    (folder / "tables.yml").write_text(TABLE.format(rows=rows, cell=cell), encoding="utf-8")
+    text = fill_tables(PAGE, folder)
+    assert text.startswith("Before.\n\n<!-- table: tables.yml one -->\n|") and text.endswith("\n<!-- /table -->\nAfter.")
     assert fill_tables(text, folder) == text
     return text.split("-->\n")[1].splitlines()[:-1]
 
@@ -50,13 +52,13 @@ def test_a_cell_is_the_mean_over_the_seeds_of_finished_runs(folder: Path) -> Non
         "|  | Hopper | Reacher |",
         "| --- | --- | --- |",
         "| ActPC | 200 (2) | 1.00 |",
-        "| demonstrators | 2000 | n/a |",  # of the runs; their sparse return is not known, nor their success
-        "| its paper | 2171 | n/a |",
+        "| demonstrators | 2000 |  |",  # of the runs; their sparse return is not known, nor their success
+        "| its paper | 2171 |  |",
     ]
 
 
 def test_other_figures_than_the_mean(folder: Path) -> None:
-    cell = "{dense_return:each .0f}; {dense_return:min .0f} to {dense_return:max .1f} ± {dense_return:std .1f} of {n}"
+    cell = "{dense_return:each .0f}; {dense_return:min .0f} to {dense_return:max .1f} ± {dense_return:std .1f} of {n:.0f}"
     assert (
         lines(folder, "ActPC: actpc", cell)[2] == "| ActPC | 100, 300; 100 to 300.0 ± 141.4 of 2 | -4; -4 to -4.0 ± n/a of 1 |"
     )
@@ -64,12 +66,18 @@ def test_other_figures_than_the_mean(folder: Path) -> None:
 
 def test_a_row_says_more_than_a_column_and_runs_of_a_changed_source_tree_are_marked(folder: Path) -> None:
     table = lines(folder, "TD3: {variant: td3, cell: '{score}, {steps:,.0f}'}, ActPC: actpc")
-    assert table[2:] == ["| TD3 | 7 (2), 1,000 † |  |", "| ActPC | 200 (2) | 1.00 |", "", DIRTY_NOTE]
+    assert lines(folder, "ActPC: actpc, d: demonstrators", "{dense_return:.0f} x {n:.0f}")[2:] == [
+        "| ActPC | 200 x 2 | -4 x 1 |",
+        "| d | 2000 |  |",
+    ]
+    assert lines(folder, "ActPC: actpc", "{paper:.1f}")[2] == "| ActPC | 2170.7 | -9.3 |"
+    assert table[2:] == ["| TD3 | 7 (2), 1,000 † |  |", "| ActPC | 200 (2) | 1.00 |"]
 
 
 def test_the_command_writes_what_has_changed(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = folder / "page.md"
-    path.write_text(TABLE.format(rows="ActPC: actpc", cell="{score}"), encoding="utf-8")
+    path.write_text(PAGE, encoding="utf-8")
+    (folder / "tables.yml").write_text(TABLE.format(rows="ActPC: actpc", cell="{score}"), encoding="utf-8")
     assert main(["report", "--tables", str(path)]) == 0 and str(path) in capsys.readouterr().out
     assert "| ActPC | 200 (2) | 1.00 |" in path.read_text(encoding="utf-8")
     assert not write_tables(path)
@@ -96,13 +104,18 @@ def test_runs_with_several_settings_are_not_mixed(folder: Path) -> None:
     write_run(folder / "runs", seed=0, final=500.0, gamma=0.5)
     export(folder / "runs", folder / "more")
     with pytest.raises(ValueError, match="several runs with one seed"):
-        fill_tables(TABLE.format(rows="A: actpc", cell="{n}").replace("kept", "more"), folder)
+        lines(folder, "A: {variant: actpc, from: more}")
+
+
+def test_a_name_that_is_not_in_the_file_is_an_error(folder: Path) -> None:
+    lines(folder, "A: actpc")
+    with pytest.raises(ValueError, match=r"table two: not in tables\.yml: there are one"):
+        fill_tables(PAGE.replace(" one ", " two "), folder)
 
 
 def test_a_marker_that_is_not_closed_is_an_error(tmp_path: Path) -> None:
-    text = TABLE.format(rows="A: actpc", cell="{n}").replace("<!-- /table -->", "")
     with pytest.raises(ValueError, match="1 begin, 0 end, 0 are whole"):
-        fill_tables(text, tmp_path)
+        fill_tables(PAGE.replace("<!-- /table -->", ""), tmp_path)
 
 
 @pytest.mark.parametrize("name", ["README.md", "RESULTS.md"])
