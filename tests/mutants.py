@@ -479,12 +479,12 @@ MUTANTS = [
     Mutant(
         "R-stability's window ends one episode late",
         R_STABILITY,
-        "smoothed = (sums[WINDOW:-1] - sums[: -WINDOW - 1]) / WINDOW",
-        "smoothed = (sums[WINDOW + 1 :] - sums[1:-WINDOW]) / WINDOW",
+        "sliding_window_view(last, WINDOW)[:-1]",
+        "sliding_window_view(last, WINDOW)[1:]",
         STABLE,
     ),
     Mutant("R-stability's best is of all episodes", R_STABILITY, "best = last[WINDOW:].max()", "best = last.max()", STABLE),
-    Mutant("the final mean is the first", R_STABILITY, "values[-WINDOW:].mean()", "values[:WINDOW].mean()", STABLE),
+    Mutant("the final mean is the first", R_STABILITY, "np.mean(values[-WINDOW:])", "np.mean(values[:WINDOW])", STABLE),
     Mutant(
         "a fifth is trimmed, not a quarter",
         STATISTICS,
