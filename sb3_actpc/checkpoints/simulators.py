@@ -11,12 +11,11 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper
 
 from sb3_actpc.checkpoints.encoding import Decoder, Encoder, OpaqueValue
 
-# buffers of the current step, and what the constructors make anew
+# what the constructors make anew, and the time of the clock
 _SKIPPED = {"venv", "env", "class_attributes", "results_writer", "obs_spaces", "metadata", "_metadata", "spec", "_cached_spec"}
-_SKIPPED_WALL_TIME = {"t_start"}
+_SKIPPED |= {"t_start"}
 # under this name, what an environment's own checkpoint_state() returned
 _OWN_STATE = "checkpoint_state()"
-_DUMMY_SKIPPED = {"envs", "buf_infos", "reset_infos", "keys", "actions"}
 _IN_ARENA = ("efc_", "contact", "iefc_", "iM", "iLD", "iacc", "ifrc_")  # of MuJoCo's data
 
 
@@ -94,7 +93,8 @@ def restore_vec_env(env: VecEnv, record: dict[str, Any], decoder: Decoder) -> li
         if reason is not None:
             lost.append((index, reason))
     for wrapper, entry in zip(wrappers, record["wrappers"], strict=True):
-        _restore_attributes(wrapper, entry["attributes"], decoder)
+        for name, node in entry["attributes"].items():
+            _set_attribute(wrapper, name, node, decoder)
     innermost._seeds, innermost._options = decoder.decode(record["seeds"])
     return lost
 
@@ -115,7 +115,7 @@ def capture_env(env: gym.Env[Any, Any], encoder: Encoder, where: str) -> dict[st
         attributes: dict[str, Any] = {}
         for name, value in _layer_values(layer).items():
             try:
-                attributes[name] = _encode_attribute(layer, name, value, encoder, f"{where}.{depth}.{name}")
+                attributes[name] = _encode_attribute(value, encoder, f"{where}.{depth}.{name}")
             except OpaqueValue as error:
                 record.setdefault("reason", str(error))
         record["layers"].append(attributes)
@@ -125,12 +125,12 @@ def capture_env(env: gym.Env[Any, Any], encoder: Encoder, where: str) -> dict[st
 def _layer_values(layer: gym.Env[Any, Any]) -> dict[str, Any]:
     """What to store of an environment or a wrapper: its attributes and, first, what it says of the objects that it hides
     (``checkpoint_state()``; the attributes named in ``checkpoint_skipped`` hold them)."""
-    skipped = {*_SKIPPED, *_SKIPPED_WALL_TIME, *getattr(layer, "checkpoint_skipped", ())}
+    skipped = {*_SKIPPED, *getattr(layer, "checkpoint_skipped", ())}
     own = {_OWN_STATE: layer.checkpoint_state()} if hasattr(layer, "checkpoint_state") else {}
     return own | {name: value for name, value in vars(layer).items() if name not in skipped}
 
 
-def _encode_attribute(layer: Any, name: str, value: Any, encoder: Encoder, where: str) -> Any:
+def _encode_attribute(value: Any, encoder: Encoder, where: str) -> Any:
     if _is_physics(value):
         return {"physics": encoder.encode(capture_physics(value.model, value), where)}
     return encoder.encode(value, where)
@@ -163,11 +163,6 @@ def restore_env(env: gym.Env[Any, Any], entry: dict[str, Any], decoder: Decoder,
                 _set_attribute(layer, name, node, decoder)
 
 
-def _restore_attributes(layer: Any, attributes: dict[str, Any], decoder: Decoder) -> None:
-    for name, node in attributes.items():
-        _set_attribute(layer, name, node, decoder)
-
-
 def _set_attribute(layer: Any, name: str, node: Any, decoder: Decoder) -> None:
     existing = vars(layer).get(name)
     if isinstance(node, dict) and "left" in node:
@@ -184,7 +179,7 @@ def _is_generator(node: Any) -> bool:
 def _capture_wrapper(wrapper: VecEnv, encoder: Encoder, where: str) -> dict[str, Any]:
     attributes = {}
     for name, value in vars(wrapper).items():
-        if name in _SKIPPED or name in _SKIPPED_WALL_TIME:
+        if name in _SKIPPED:
             continue
         try:
             attributes[name] = encoder.encode(value, f"{where}.{name}")
