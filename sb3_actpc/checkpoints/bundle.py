@@ -20,7 +20,7 @@ import numpy as np
 FORMAT = "sb3_actpc checkpoint"
 VERSION = 3
 MANIFEST = "manifest.json"
-PIECE = 2**20  # bytes read at a time
+PIECE = 2**18  # bytes read at a time
 _NAME = re.compile(r"(\d{6,})_step_(\d+)")
 _TEMPORARY = ".writing-"
 Report = Callable[[str], None]
