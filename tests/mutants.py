@@ -187,7 +187,7 @@ MUTANTS = [
         "ngc/stability.py",
         "SAFETY * error_dynamics_limit(",
         "2 * error_dynamics_limit(",
-        f"{LEARNING} -k auto_rates",
+        CLOSED,
     ),
     # ------------------------------------------------------------------ agent
     Mutant(

@@ -5,6 +5,7 @@ import torch as th
 
 from sb3_actpc.ngc import NGCCircuit
 from sb3_actpc.ngc.plasticity import bound_columns_, hebbian_changes, soft_bound_
+from sb3_actpc.ngc.stability import settling_rates
 
 
 def test_a_step_shrinks_in_proportion_to_what_is_left_to_the_soft_bound():
@@ -33,3 +34,10 @@ def test_the_total_discrepancy_is_half_the_summed_squared_errors():
     circuit = NGCCircuit(3, 2, ())
     state = circuit.settle(th.zeros(4, 3), circuit.project(th.zeros(4, 3)) + th.tensor([1.0, -3.0]))
     th.testing.assert_close(state.total_discrepancy(), th.full((4,), 5.0))
+
+
+@pytest.mark.parametrize("norm", [1.0, 5.0, 20.0])
+def test_the_automatic_rate_is_stable_where_every_unit_is_active(norm):
+    """One hidden layer: e <- e - β (1 + ||W|| ||E||) e + const settles while β (1 + ||W|| ||E||) < 2."""
+    rate = settling_rates("error", [norm], [norm])[0]
+    assert 0.0 < rate * (1.0 + norm**2) < 2.0
