@@ -46,8 +46,9 @@ def train(folder: Path, n_steps: int, started: Connection) -> None:
     th.set_num_threads(1)
     env = VecNormalize(make_vec_env("SparseReacher-v5", n_envs=2, seed=0))
     model = ActPC(
-        "MlpPolicy", env, settling="scheduled", policy_kwargs={"net_arch": [16, 16]}, batch_size=16, buffer_size=500,
-        learning_starts=20, working_memory=True, seed=0, device="cpu",
+        "MlpPolicy", env, settling="scheduled", policy_kwargs={"net_arch": [16, 16], "memory_history": 7},
+        batch_size=16, buffer_size=500,
+        learning_starts=20, seed=0, device="cpu",
     )  # fmt: skip
     evaluation = EvalCallback(
         VecNormalize(make_vec_env("SparseReacher-v5", seed=9), training=False, norm_reward=False),

@@ -56,7 +56,8 @@ def main() -> int:
     since = 2 * args.buffer_size
     model = ActPC(
         "MlpPolicy", make_vec_env("SparseReacher-v5"), settling="scheduled", buffer_size=args.buffer_size, batch_size=16,
-        self_imitation_size=args.buffer_size, policy_kwargs={"net_arch": [16, 16]}, train_freq=args.train_freq, seed=0,
+        replay_buffer_kwargs={"self_imitation_size": args.buffer_size}, policy_kwargs={"net_arch": [16, 16]},
+        train_freq=args.train_freq, seed=0,
     )  # fmt: skip
     watch = Watch(since, args.steps)
     with tempfile.TemporaryDirectory() as folder:

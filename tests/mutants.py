@@ -237,8 +237,8 @@ MUTANTS = [
     Mutant(
         "the generator learns o_t",
         AGENT,
-        "batch.next_features[rows], None if batch.memory",
-        "batch.features[rows], None if batch.memory",
+        "dim=1), batch.next_features, batch.memory)",
+        "dim=1), batch.features, batch.memory)",
         f"{LEARNS} -k 'generator or one_step'",
     ),
     Mutant(
@@ -408,12 +408,12 @@ MUTANTS = [
     Mutant(
         "an equally good episode does not enter",
         IMITATION,
-        "episode_return < self.best_return",
-        "episode_return <= self.best_return",
+        "episode_return >= self.best_return",
+        "episode_return > self.best_return",
         f"{STORES} -k enters",
     ),
     Mutant(
-        "an unpaid episode enters", IMITATION, "episode_return <= 0.0 or", "episode_return < 0.0 or", f"{STORES} -k enters"
+        "an unpaid episode enters", IMITATION, "episode_return > 0.0 and", "episode_return >= 0.0 and", f"{STORES} -k enters"
     ),
     Mutant(
         "imitation forgets an episode's first step",

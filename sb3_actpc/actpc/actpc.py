@@ -2,10 +2,11 @@
 
 import warnings
 from collections.abc import Callable, Iterable
-from functools import reduce
+from functools import partial, reduce
 from os import PathLike
 from pathlib import Path
-from typing import Any, ClassVar, TypeVar
+from types import SimpleNamespace
+from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
 import numpy as np
 import torch as th
@@ -16,20 +17,37 @@ from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
-from sb3_actpc.actpc.arguments import check_keywords
-from sb3_actpc.actpc.buffers import _SignalReplay, combined_buffer_class
+from sb3_actpc.actpc.arguments import (
+    MAX_SEED,
+    Between,
+    Count,
+    Settings,
+    Share,
+    Size,
+    Weight,
+    check_actions,
+    check_computes,
+    check_env,
+    check_learning_rate,
+    check_noise,
+    check_nudge,
+    check_train_freq,
+    checked,
+)
+from sb3_actpc.actpc.buffers import SignalReplay, combined_buffer_class
 from sb3_actpc.actpc.demonstration_replay import DemonstrationReplay
 from sb3_actpc.actpc.diagnostics import Diagnostics
 from sb3_actpc.actpc.features import Batch, CircuitInputs
-from sb3_actpc.actpc.policies import ActPCActor, ActPCPolicy, CnnPolicy, Critics, MlpPolicy, MultiInputPolicy
+from sb3_actpc.actpc.policies import POLICIES, ActPCActor, ActPCPolicy, Critics, check_policy, check_policy_kwargs
 from sb3_actpc.actpc.reward_signals import make_normalizer, summed_squared_errors
-from sb3_actpc.actpc.self_imitation import Episodes, map_observations, sample_union
+from sb3_actpc.actpc.self_imitation import Episodes, Observations, map_observations, sample_union
 from sb3_actpc.checkpoints import Restored, between_updates, load_checkpoint, load_weights, save_weights
 from sb3_actpc.demonstrations import fit_demonstrations
 from sb3_actpc.demonstrations.dataset import Demonstrations
 from sb3_actpc.ngc import HebbianChanges, NGCCircuit, settle_coupled
-from sb3_actpc.utils.checks import check_finite, named_in_errors
+from sb3_actpc.utils.checks import check_finite, check_kinds, named_in_errors
 
 SelfActPC = TypeVar("SelfActPC", bound="ActPC")
 
@@ -46,31 +64,27 @@ class ActPC(OffPolicyAlgorithm):
     The actor acts; the critic values its actions; the generator's surprise is an epistemic reward; the prior, learned from
     demonstrations and then frozen, gives an instrumental one. Paper: https://arxiv.org/abs/2209.09174. Defaults are the
     paper's (its tables for HalfCheetah) except where a comment at the constructor says otherwise, and for the error synapses,
-    which are tied unless ``circuit_kwargs=dict(feedback="learned")`` asks for the paper's. Without demonstrations
-    there is no prior, and the task's reward takes its role.
+    which are tied unless ``policy_kwargs=dict(circuit_kwargs=dict(feedback="learned"))`` asks for the paper's. Without
+    demonstrations there is no prior, and the task's reward takes its role.
 
     :param policy: "MlpPolicy", "MultiInputPolicy", "CnnPolicy" (fixed random convolutions) or a class
     :param env: the environment, or its id
-    :param learning_rate: of all circuits, or a schedule; circuits can have their own (``actor_kwargs`` and so on)
+    :param learning_rate: of all circuits, or a schedule; circuits can have their own (``policy_kwargs``)
     :param buffer_size: transitions in the replay buffer
     :param learning_starts: environment steps with random actions before anything is learned
-    :param batch_size: of all circuits; circuits can have their own
-    :param tau: Polyak rate of the targets
+    :param batch_size: of all circuits; circuits can have their own (``policy_kwargs``)
+    :param tau: how far the target circuits move towards the circuits, of the whole way
     :param gamma: discount
     :param train_freq: environment steps (or episodes) between updates
     :param gradient_steps: updates each time; -1 for as many as steps were collected
     :param action_noise: exploration noise added to the action; the paper has none
     :param replay_buffer_class: None, or one of SB3's classes or its name (its ActPC counterpart is used)
-    :param replay_buffer_kwargs: keywords of the buffer
+    :param replay_buffer_kwargs: keywords of the buffer: ``combined`` (True: the newest transition of every environment is in
+        every batch) and ``self_imitation_size`` (100,000 transitions in the memory of the agent's own best episodes; 0 for
+        none), and those of SB3's class
     :param optimize_memory_usage: as in SB3
     :param n_steps: length of n-step returns
     :param settling: "iterative" (the paper) or "scheduled" (cheaper, numerically backprop without autograd)
-    :param circuit_kwargs: further keywords of every :class:`~sb3_actpc.ngc.NGCCircuit` (``n_settling_steps``, ``feedback``,
-        ``dynamics``, ``activation``, ``synaptic_scaling``, ...)
-    :param actor_kwargs: the same for the actor alone, and its ``net_arch``, ``learning_rate`` and ``batch_size``
-    :param critic_kwargs: the same for the critic
-    :param generator_kwargs: the same for the generator
-    :param prior_kwargs: the same for the prior
     :param demonstrations: a path, or a :class:`~sb3_actpc.demonstrations.dataset.Demonstrations`
     :param n_demonstrations: use only the first so many episodes of them
     :param n_demonstration_transitions: use only the first so many transitions (the paper's "300 samples")
@@ -79,7 +93,6 @@ class ActPC(OffPolicyAlgorithm):
     :param refresh_weight: weight of the actor's refresh from the demonstrations and its own best episodes
     :param refresh_noise: standard deviation of Gaussian noise on the features (normalised observations) that refresh and warm
         start imitate on, not on the working memory's; against overfitting to few demonstrations. 0 for none (the paper)
-    :param self_imitation_size: transitions in the memory of the agent's own best episodes; 0 for none
     :param demonstration_fraction: share of the critic's batch that comes from the demonstrations
     :param alpha_ep: weight of the epistemic signal
     :param alpha_in: weight of the instrumental signal
@@ -91,34 +104,30 @@ class ActPC(OffPolicyAlgorithm):
     :param nudge: scale of the critic's clamped error while actor and critic settle as one (the paper's is 1); None for an
         infinitesimal one, or 1 with ``dynamics="state"``
     :param critic_warmup: updates before the critic's pressure reaches the actor
-    :param n_critics: critic circuits; with two or more the smallest target value bootstraps
     :param bootstrap: "joint" (target critic at the target actor's next action, the appendix) or "literal" (at the action
         taken, the main text's equation)
     :param target_policy_noise: standard deviation of the noise on the target actor's action; 0 for none
     :param target_noise_clip: its bound
-    :param target_update: "polyak" (every update) or "hard" (a copy every ``target_update_interval`` transitions)
-    :param target_update_interval: C
-    :param combined_replay: the newest transition of every environment is in every batch
-    :param working_memory: feed actor, generator and prior the last ``memory_history`` observations
-    :param memory_history: H
+    :param target_update_interval: the targets move after every update (1), or every so many environment steps; hard copies
+        as in DQN are ``tau=1, target_update_interval=C``
     :param observation_normalization: "none" (the paper) or "demonstrations" (their mean and standard deviation, fixed)
-    :param policy_kwargs: further keywords of :class:`~sb3_actpc.actpc.policies.ActPCPolicy`
+    :param policy_kwargs: keywords of :class:`~sb3_actpc.actpc.policies.ActPCPolicy`: ``net_arch``, ``n_critics``,
+        ``memory_history`` (the working memory), ``circuit_kwargs`` (of every :class:`~sb3_actpc.ngc.NGCCircuit`:
+        ``n_settling_steps``, ``feedback``, ``dynamics``, ``activation``, ``synaptic_scaling``, ...), ``actor_kwargs``,
+        ``critic_kwargs``, ``generator_kwargs`` and ``prior_kwargs`` (of one, and its ``net_arch``, ``learning_rate`` and
+        ``batch_size``)
     :param stats_window_size: as in SB3
     :param tensorboard_log: as in SB3
-    :param verbose: as in SB3
+    :param verbose: as in SB3; from 1 on, ``learn`` also says what the reward is made of
     :param device: as in SB3
     :param seed: as in SB3
     :raises ValueError: for a keyword with a value that is not allowed, for action spaces that are not Boxes, for
         demonstrations that do not fit the environment
     """
 
-    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
-        "MlpPolicy": MlpPolicy,
-        "CnnPolicy": CnnPolicy,
-        "MultiInputPolicy": MultiInputPolicy,
-    }
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = POLICIES
     policy: ActPCPolicy
-    replay_buffer: _SignalReplay | None
+    replay_buffer: SignalReplay | None
     actor: ActPCActor
     critic: Critics
     critic_target: Critics
@@ -126,73 +135,62 @@ class ActPC(OffPolicyAlgorithm):
     prior: NGCCircuit
     actor_target: NGCCircuit
 
+    @checked
     def __init__(
         self,
-        policy: str | type[ActPCPolicy],
-        env: GymEnv | str,
-        learning_rate: float | Schedule = 4e-4,
-        buffer_size: int = 1_000_000,
-        learning_starts: int = 100,
-        batch_size: int = 256,
-        tau: float = 0.005,  # the paper's 0.05 to 0.15 chases its own tail when the task's reward counts
-        gamma: float = 0.99,
-        train_freq: int | tuple[int, str] = 1,
-        gradient_steps: int = 1,
-        action_noise: ActionNoise | None = None,
+        policy: Annotated[str | type[ActPCPolicy], check_policy],
+        env: Annotated[GymEnv | str, check_env],
+        learning_rate: Annotated[float | Schedule, check_learning_rate] = 4e-4,
+        buffer_size: Size = 1_000_000,
+        learning_starts: Weight = 100,
+        batch_size: Size = 256,
+        tau: Share = 0.005,  # the paper's 0.05 to 0.15 chases its own tail when the task's reward counts
+        gamma: Share = 0.99,
+        train_freq: Annotated[int | tuple[int, str], check_train_freq] = 1,
+        gradient_steps: Annotated[int, Between(-1)] = 1,
+        action_noise: Annotated[ActionNoise | None, check_noise] = None,
         replay_buffer_class: type[ReplayBuffer] | str | None = None,
-        replay_buffer_kwargs: dict[str, Any] | None = None,
+        replay_buffer_kwargs: Settings | None = None,
         optimize_memory_usage: bool = False,
-        n_steps: int = 1,
+        n_steps: Size = 1,
         *,
-        settling: str = "iterative",
-        circuit_kwargs: dict[str, Any] | None = None,
-        actor_kwargs: dict[str, Any] | None = None,
-        critic_kwargs: dict[str, Any] | None = None,
-        generator_kwargs: dict[str, Any] | None = None,
-        prior_kwargs: dict[str, Any] | None = None,
+        settling: Literal["iterative", "scheduled"] = "iterative",
         demonstrations: Demonstrations | str | Path | None = None,
-        n_demonstrations: int | None = None,
-        n_demonstration_transitions: int | None = None,
-        prior_updates: int = 2000,
-        actor_warm_start: int = 0,
-        refresh_weight: float = 1.0,
-        refresh_noise: float = 0.0,
-        self_imitation_size: int = 100_000,
-        demonstration_fraction: float = 0.0,
-        alpha_ep: float = 1.0,
-        alpha_in: float = 1.0,
+        n_demonstrations: Annotated[int | None, Between(1)] = None,
+        n_demonstration_transitions: Annotated[int | None, Between(1)] = None,
+        prior_updates: Count = 2000,
+        actor_warm_start: Count = 0,
+        refresh_weight: Weight = 1.0,
+        refresh_noise: Weight = 0.0,
+        demonstration_fraction: Share = 0.0,
+        alpha_ep: Weight = 1.0,
+        alpha_in: Weight = 1.0,
         alpha_ext: float | None = None,
-        signal_normalizer: str = "max",
-        signal_errors: str = "all",
-        actor_pressure: float = 1.0,
+        signal_normalizer: Literal["max", "saturating", "quantile"] = "max",
+        signal_errors: Literal["all", "output"] = "all",
+        actor_pressure: Weight = 1.0,
         scale_pressure: bool = False,
-        nudge: float | None = None,
-        critic_warmup: int = 0,
-        n_critics: int = 1,
-        bootstrap: str = "joint",
-        target_policy_noise: float = 0.0,
-        target_noise_clip: float = 0.5,
-        target_update: str = "polyak",
-        target_update_interval: int = 500,
-        combined_replay: bool = True,
-        working_memory: bool = False,
-        memory_history: int = 7,
-        observation_normalization: str = "none",
-        policy_kwargs: dict[str, Any] | None = None,
-        stats_window_size: int = 100,
+        nudge: Annotated[float | None, check_nudge] = None,
+        critic_warmup: Count = 0,
+        bootstrap: Literal["joint", "literal"] = "joint",
+        target_policy_noise: Weight = 0.0,
+        target_noise_clip: Weight = 0.5,
+        target_update_interval: Annotated[int, Between(1)] = 1,
+        observation_normalization: Literal["none", "demonstrations"] = "none",
+        policy_kwargs: Annotated[Settings | None, check_policy_kwargs] = None,
+        stats_window_size: Size = 100,
         tensorboard_log: str | None = None,
         verbose: int = 0,
-        device: th.device | str = "auto",
-        seed: int | None = None,
+        device: Annotated[th.device | str, check_computes] = "auto",
+        seed: Annotated[int | None, Between(0, MAX_SEED)] = None,
         _init_setup_model: bool = True,
     ) -> None:
-        check_keywords(locals(), self.policy_aliases)
         super().__init__(
             policy,
             env,
             learning_rate,
             buffer_size,
-            learning_starts,
+            learning_starts,  # type: ignore[arg-type]
             batch_size,
             tau,
             gamma,
@@ -214,20 +212,13 @@ class ActPC(OffPolicyAlgorithm):
             support_multi_env=True,
         )
         self.settling = settling
-        self.circuit_kwargs = circuit_kwargs
-        self.actor_kwargs = actor_kwargs
-        self.critic_kwargs = critic_kwargs
-        self.generator_kwargs = generator_kwargs
-        self.prior_kwargs = prior_kwargs
-        # a path is kept absolute, so that the saved agent finds its demonstrations from any folder
-        self.demonstrations = Path(demonstrations).absolute() if isinstance(demonstrations, (str, Path)) else demonstrations
+        self.demonstrations = demonstrations
         self.n_demonstrations = n_demonstrations
         self.n_demonstration_transitions = n_demonstration_transitions
         self.prior_updates = prior_updates
         self.actor_warm_start = actor_warm_start
         self.refresh_weight = refresh_weight
         self.refresh_noise = refresh_noise
-        self.self_imitation_size = self_imitation_size
         self.demonstration_fraction = demonstration_fraction
         self.alpha_ep = alpha_ep
         self.alpha_in = alpha_in
@@ -237,15 +228,10 @@ class ActPC(OffPolicyAlgorithm):
         self.scale_pressure = scale_pressure
         self.nudge = nudge
         self.critic_warmup = critic_warmup
-        self.n_critics = n_critics
         self.bootstrap = bootstrap
         self.target_policy_noise = target_policy_noise
         self.target_noise_clip = target_noise_clip
-        self.target_update = target_update
         self.target_update_interval = target_update_interval
-        self.combined_replay = combined_replay
-        self.working_memory = working_memory
-        self.memory_history = memory_history
         self.observation_normalization = observation_normalization
         self.signal_normalizer = signal_normalizer
         self.epistemic_normalizer = make_normalizer(signal_normalizer)
@@ -257,46 +243,57 @@ class ActPC(OffPolicyAlgorithm):
     # ------------------------------------------------------------------ setting up
 
     def _setup_model(self) -> None:
-        if not np.all(np.isfinite([self.action_space.low, self.action_space.high])):  # type: ignore[attr-defined]
-            raise ValueError(f"action_space={self.action_space} must have finite bounds; wrap the environment to rescale it")
-        asked = self.replay_buffer_class, self.replay_buffer_kwargs, self.policy_kwargs, self.n_steps
-        self.replay_buffer_class = combined_buffer_class(self.replay_buffer_class, self.observation_space, self.n_steps)
-        self.replay_buffer_kwargs = {
-            "combined": self.combined_replay,
-            "history": self.history,
-            "self_imitation_size": self.self_imitation_size,
-            "n_steps": self.n_steps,
-            "gamma": self.gamma,
-            **self.replay_buffer_kwargs,
-        }
-        self.policy_kwargs = self._merged_policy_kwargs()
-        self.n_steps = 1  # the buffer knows; SB3 would warn that a custom one does not
-        # SB3 checks by assertion what does not go together
-        with named_in_errors(f"buffer_size={self.buffer_size}, replay_buffer_kwargs={asked[1]!r}", ValueError, AssertionError):
-            super()._setup_model()
-        self.replay_buffer_kwargs, self.policy_kwargs, self.n_steps = asked[1:]
+        if self.action_space is None:
+            raise ValueError("env=None: an environment or the id of one is needed, such as 'Pendulum-v1'")
+        assert isinstance(self.action_space, spaces.Box)
+        check_actions(self.action_space, self.action_noise)
+        self._setup_lr_schedule()
+        self.set_random_seed(self.seed)
+        self.policy = self._make_policy().to(self.device)
+        if self.replay_buffer is None:
+            self.replay_buffer = self._make_replay_buffer()
+        self._convert_train_freq()
         self._create_aliases()
         self._setup_demonstrations()
         self.diagnostics = Diagnostics(self.policy)
 
-    def _merged_policy_kwargs(self) -> dict[str, Any]:
-        own = {
-            "n_critics": self.n_critics,
-            "memory_history": self.history,
-            **{f"{name}_kwargs": getattr(self, f"{name}_kwargs") for name in ("actor", "critic", "generator", "prior")},
-        }
-        merged = {**own, **self.policy_kwargs}
-        given = {**(self.circuit_kwargs or {}), **(merged.get("circuit_kwargs") or {})}
+    def _make_policy(self) -> ActPCPolicy:
+        given = self.policy_kwargs.get("circuit_kwargs") or {}
+        check_kinds({"circuit_kwargs": given}, mappings="circuit_kwargs")
         chosen = given.get("settling", self.settling)
         if not isinstance(chosen, str) or chosen != self.settling:
             raise ValueError(f"circuit_kwargs has settling={chosen!r} but the agent's is {self.settling!r}; pass settling=")
-        merged["circuit_kwargs"] = {**given, "settling": self.settling}
-        return merged
+        kwargs = {**self.policy_kwargs, "circuit_kwargs": {**given, "settling": self.settling}}
+        return self.policy_class(self.observation_space, self.action_space, self.lr_schedule, **kwargs)  # type: ignore[return-value]
+
+    def _make_replay_buffer(self) -> SignalReplay:
+        kind = combined_buffer_class(self.replay_buffer_class, self.observation_space, self.n_steps)
+        kwargs = {"history": self.memory_history, "n_steps": self.n_steps, "gamma": self.gamma, **self.replay_buffer_kwargs}
+        if issubclass(kind, HerReplayBuffer):
+            assert self.env is not None, "You must pass an environment when using `HerReplayBuffer`"  # as SB3 does
+            kwargs["env"] = self.env
+        # SB3 checks by assertion what does not go together
+        where = f"buffer_size={self.buffer_size}, replay_buffer_kwargs={self.replay_buffer_kwargs!r}"
+        with named_in_errors(where, ValueError, AssertionError):
+            return kind(
+                self.buffer_size,
+                self.observation_space,
+                self.action_space,
+                device=self.device,
+                n_envs=self.n_envs,
+                optimize_memory_usage=self.optimize_memory_usage,
+                **kwargs,
+            )
 
     @property
-    def history(self) -> int:
-        """Observations in the working memory; 0 without one."""
-        return self.memory_history if self.working_memory else 0
+    def memory_history(self) -> int:
+        """H, observations in the working memory; 0 without one."""
+        return self.policy.memory_history
+
+    @property
+    def n_critics(self) -> int:
+        """Critic circuits."""
+        return self.policy.n_critics
 
     def _create_aliases(self) -> None:
         self.actor = self.policy.actor
@@ -328,7 +325,7 @@ class ActPC(OffPolicyAlgorithm):
                 raise
             return  # a trained agent acts without them; ``learn`` says what is missing
         assert isinstance(self.action_space, spaces.Box)
-        self.expert = DemonstrationReplay(demonstrations, self.observation_space, self.action_space, self.history)
+        self.expert = DemonstrationReplay(demonstrations, self.observation_space, self.action_space, self.memory_history)
         if self.observation_normalization == "demonstrations" and not self.pretrained:
             observations = self.inputs.observations(self.expert.episodes.observations)
             self.actor.normalizer.fit(self.inputs.features(observations))
@@ -393,7 +390,8 @@ class ActPC(OffPolicyAlgorithm):
             if update < n_prior:
                 self._update_prior(self.policy.batch_size_of("prior", self.batch_size))
             else:
-                self.actor.circuit.apply_changes(self._refresh_changes(), self.actor.circuit.optimizer)
+                n = self.policy.batch_size_of("actor", self.batch_size)
+                self.actor.circuit.apply_changes(self._refresh_changes(n))
             self.n_pretraining_updates += 1
         self.actor_target.load_state_dict(self.actor.circuit.state_dict())
         self.pretrained = True
@@ -402,7 +400,7 @@ class ActPC(OffPolicyAlgorithm):
         assert self.expert is not None
         batch = self.expert.sample(batch_size, self.inputs, self.reward_weights, self.gamma)
         state = self.prior.settle(batch.features, batch.next_features, batch.memory)
-        self.prior.apply_changes(self.prior.hebbian_update(state), self.prior.optimizer)
+        self.prior.apply_changes(self.prior.hebbian_update(state))
 
     # ------------------------------------------------------------------ collecting
 
@@ -410,7 +408,7 @@ class ActPC(OffPolicyAlgorithm):
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
     ) -> tuple[np.ndarray, np.ndarray]:
         warming_up = self.num_timesteps < learning_starts
-        if self.history or not warming_up:  # the working memory follows random actions too
+        if self.memory_history or not warming_up:  # the working memory follows random actions too
             assert self._last_obs is not None
             unscaled, self._rollout_state = self.policy.predict(self._last_obs, self._rollout_state, self._rollout_starts)
         if warming_up:
@@ -435,29 +433,34 @@ class ActPC(OffPolicyAlgorithm):
             if "terminal_observation" in info:
                 self._check_observations(info["terminal_observation"])
         check_finite("environment", "rewards", reward, self.num_timesteps)
-        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+        score = self._score if any(self.reward_weights[1:]) else None
+        assert isinstance(replay_buffer, SignalReplay)
+        scored: Any = SimpleNamespace(add=partial(replay_buffer.add, score=score))  # SB3 calls ``add`` and nothing else
+        super()._store_transition(scored, buffer_action, new_obs, reward, dones, infos)
         self._rollout_starts = np.array(dones, dtype=bool)
-        self._compute_newest_signals()
 
     def _check_observations(self, observations: Any) -> None:
         map_observations(lambda array: check_finite("environment", "observations", array, self.num_timesteps), observations)
 
-    def _compute_newest_signals(self) -> None:
-        """The signals of the transitions just stored (Algorithm 1, lines 10 to 13)."""
-        _, alpha_ep, alpha_in = self.reward_weights
-        if not (alpha_ep or alpha_in):
-            return
-        assert self.replay_buffer is not None
-        newest = self.replay_buffer.newest_transitions(self._vec_normalize_env)
-        features, next_features = map(self.inputs.features, (newest.observations, newest.next_observations))
-        memory = self.inputs.memory(newest.history, newest.history_mask)
-        raw_ep, raw_in = self._raw_signals(features, newest.actions, next_features, memory)
+    def _score(
+        self,
+        observations: Observations,
+        actions: np.ndarray,
+        next_observations: Observations,
+        past: Observations | None,
+        mask: np.ndarray | None,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Both signals of new transitions (Algorithm 1, lines 10 to 13), (n_envs,) each; the normalisers follow them."""
+        inputs, (_, alpha_ep, alpha_in) = self.inputs, self.reward_weights
+        features, next_features = (inputs.features(inputs.observations(o)) for o in (observations, next_observations))
+        memory = inputs.memory(*inputs.past(past, mask))
+        raw_ep, raw_in = self._raw_signals(features, inputs.tensor(actions), next_features, memory)
         epistemic = self.epistemic_normalizer(raw_ep) if alpha_ep else raw_ep
         instrumental = -self.instrumental_normalizer(raw_in) if alpha_in else raw_in
         check_finite("generator", "signals", epistemic, self.num_timesteps)
         check_finite("prior", "signals", instrumental, self.num_timesteps)
-        self.replay_buffer.set_newest_signals(epistemic, instrumental)
         self.diagnostics.follow(epistemic_signal=epistemic.mean(), instrumental_signal=instrumental.mean())
+        return epistemic, instrumental
 
     def _raw_signals(
         self, features: th.Tensor, actions: th.Tensor, next_features: th.Tensor, memory: th.Tensor | None
@@ -478,23 +481,30 @@ class ActPC(OffPolicyAlgorithm):
 
     def train(self, gradient_steps: int, batch_size: int = 256) -> None:
         """
-        The updates of Algorithm 1 (lines 15 to 23), ``gradient_steps`` times.
+        The updates of Algorithm 1 (lines 17 to 26), ``gradient_steps`` times.
 
         :param gradient_steps: how many updates of every circuit
-        :param batch_size: B
+        :param batch_size: B, of the circuits without one of their own
         """
         self.policy.set_training_mode(True)
         self._update_learning_rate([circuit.optimizer for _, circuit in self.policy.named_circuits()])
+        n_actor, n_critic, n_generator = self._batch_sizes(batch_size)
         for _ in range(gradient_steps):
             self._n_updates += 1
             self.diagnostics.begin_update(self._n_updates, self.num_timesteps)
-            batch = self._sample_batch(batch_size)
-            self._update_actor(batch)
-            self._update_critic(batch)
-            self._update_generator(batch)
-            if self.target_update == "polyak":
+            self._rescore_demonstrations()
+            batch = self._sample_batch(batch_size)  # line 17
+            self._update_actor(batch.first(n_actor))  # lines 19 and 26
+            self._update_critic(batch.first(n_critic))  # lines 21 and 22
+            self._update_generator(batch.first(n_generator))  # line 24
+            if self.target_update_interval == 1:
                 self._update_targets(self.tau)
         self._log_training()
+
+    def _batch_sizes(self, batch_size: int) -> tuple[int, int, int]:
+        """Of actor, critic and generator."""
+        own = self.policy.batch_size_of
+        return own("actor", batch_size), own("critic", batch_size), own("generator", batch_size)
 
     def _update_learning_rate(self, optimizers: list[th.optim.Optimizer] | th.optim.Optimizer) -> None:
         """SB3's schedule, times what each parameter group asks for (γ_e, a circuit's own learning rate)."""
@@ -503,72 +513,56 @@ class ActPC(OffPolicyAlgorithm):
             for group in optimizer.param_groups:
                 group["lr"] *= group["lr_scale"]
 
+    def _rescore_demonstrations(self) -> None:
+        """Now and then: the signals of demonstrated transitions under the present generator; the normalisers stay."""
+        if self.expert is None or not self.demonstration_fraction or not any(self.reward_weights[1:]):
+            return
+        if self._n_updates % EXPERT_SIGNALS_INTERVAL == 1 or not self.expert.has_signals:
+            normalizers = self.epistemic_normalizer, self.instrumental_normalizer
+            self.expert.refresh_signals(self._raw_signals, self.inputs, *normalizers)
+
     def _sample_batch(self, batch_size: int) -> Batch:
         """Replayed transitions, the newest among them, then the share that comes from the demonstrations."""
         assert self.replay_buffer is not None
-        sizes = [self.policy.batch_size_of(name, batch_size) for name in ("actor", "critic", "generator")]
-        batch_size = max(sizes)
-        n_expert = round(self.demonstration_fraction * batch_size) if self.expert is not None else 0
-        replayed = self.replay_buffer.sample(batch_size - n_expert, env=self._vec_normalize_env)
-        inputs, weights = self.inputs, self.reward_weights
-        features = inputs.features(replayed.observations)
-        pasts = replayed.history, replayed.history_mask, features, replayed.next_history, replayed.next_history_mask
-        memory, next_memory = inputs.memories(*pasts)
-        next_features = bootstrap_features = inputs.features(replayed.next_observations)
-        if replayed.following_observations is not None:
-            next_features = inputs.features(replayed.following_observations)
-        internal = weights[1] * replayed.epistemic + weights[2] * replayed.instrumental
+        sizes = self._batch_sizes(batch_size)
+        largest, inputs, weights = max(sizes), self.inputs, self.reward_weights
+        n_expert = round(self.demonstration_fraction * largest) if self.expert is not None else 0
+        replayed = self.replay_buffer.sample(largest - n_expert, env=self._vec_normalize_env)
+        batch = inputs.replayed(replayed, weights, self.gamma)
+        internal = batch.rewards - weights[0] * replayed.rewards
         self.diagnostics.follow(internal_reward=internal.mean, task_reward=replayed.rewards.mean)
-        batch = Batch(
-            features=features,
-            actions=replayed.actions,
-            next_features=next_features,
-            bootstrap_features=bootstrap_features,
-            memory=memory,
-            next_memory=next_memory,
-            rewards=weights[0] * replayed.rewards + internal,
-            dones=replayed.dones,
-            discounts=th.full_like(replayed.dones, self.gamma) if replayed.discounts is None else replayed.discounts,
-        )
         if n_expert and self.expert is not None:
-            if any(weights[1:]) and (self._n_updates % EXPERT_SIGNALS_INTERVAL == 1 or not self.expert.has_signals):
-                normalizers = self.epistemic_normalizer, self.instrumental_normalizer
-                self.expert.refresh_signals(self._raw_signals, inputs, *normalizers)
             batch = batch.join(self.expert.sample(n_expert, inputs, weights, self.gamma, self.n_steps))
-        if min(sizes) == batch_size:
+        if min(sizes) == largest:
             return batch
         # circuits with a smaller batch take its first rows: the newest, then a fair mixture of the rest
-        return batch.shuffled(keep=self.n_envs if self.combined_replay else 0)
+        return batch.shuffled(keep=self.n_envs if self.replay_buffer.combined else 0)
 
     def _update_actor(self, batch: Batch) -> None:
-        """Motor-action circuit: pressure of the critic (line 17) plus refresh (line 23), in one step of the optimiser."""
-        changes = self._refresh_changes() if self.refresh_weight and self._imitated() else None
+        """Motor-action circuit: pressure of the critic (line 19) plus refresh (line 26), in one step of the optimiser."""
+        changes = self._refresh_changes(len(batch.features)) if self.refresh_weight and self._imitated() else None
         if changes is not None:
             self.diagnostics.change_norms("refresh", changes.scale_(self.refresh_weight))
         if self.actor_pressure and self._n_updates > self.critic_warmup:
-            rows = slice(self.policy.batch_size_of("actor", self.batch_size))
-            memory = None if batch.memory is None else batch.memory[rows]
-            coupled = settle_coupled(self.actor.circuit, self.critic.first(), batch.features[rows], memory, self.nudge)
+            coupled = settle_coupled(self.actor.circuit, self.critic.first(), batch.features, batch.memory, self.nudge)
             pressure = self.actor.circuit.hebbian_update(coupled.actor)
             weight: float | th.Tensor = self.actor_pressure
             if self.scale_pressure:
                 weight = weight / coupled.action_values.abs().mean().clamp_min(SMALLEST_VALUE_SCALE)
-            self.diagnostics.coupled(coupled, pressure, batch.features[rows], memory)
+            self.diagnostics.coupled(coupled, pressure, batch.features, batch.memory)
             if changes is None:
                 self.diagnostics.settled("actor", coupled.actor)
             self.diagnostics.change_norms("pressure", pressure.scale_(weight))
             changes = pressure if changes is None else changes.add_(pressure)
         if changes is not None:
-            self.actor.circuit.apply_changes(changes, self.actor.circuit.optimizer)
+            self.actor.circuit.apply_changes(changes)
 
     def _update_critic(self, batch: Batch) -> None:
-        """Policy circuit(s): settle on the bootstrapped targets (lines 19 and 20)."""
-        rows = slice(self.policy.batch_size_of("critic", self.batch_size))
-        inputs = th.cat([batch.features, batch.actions], dim=1)[rows]
-        targets = self._critic_targets(batch)[rows]
+        """Policy circuit(s): settle on the bootstrapped targets (lines 21 and 22)."""
+        inputs, targets = th.cat([batch.features, batch.actions], dim=1), self._critic_targets(batch)
         for index, critic in enumerate(self.critic):
             state = critic.settle(inputs, targets)
-            critic.apply_changes(critic.hebbian_update(state), critic.optimizer)
+            critic.apply_changes(critic.hebbian_update(state))
             self.diagnostics.settled(f"critic.{index}" if index else "critic", state)
 
     def _critic_targets(self, batch: Batch) -> th.Tensor:
@@ -586,13 +580,11 @@ class ActPC(OffPolicyAlgorithm):
         return batch.rewards + (1.0 - batch.dones) * batch.discounts * values
 
     def _update_generator(self, batch: Batch) -> None:
-        """World model: settle on the next observation (line 21). Without weight in the reward it has no role."""
+        """World model: settle on the next observation (line 24). Without weight in the reward it has no role."""
         if not self.alpha_ep:
             return
-        rows = slice(self.policy.batch_size_of("generator", self.batch_size))
-        inputs = th.cat([batch.features[rows], batch.actions[rows]], dim=1)
-        state = self.generator.settle(inputs, batch.next_features[rows], None if batch.memory is None else batch.memory[rows])
-        self.generator.apply_changes(self.generator.hebbian_update(state), self.generator.optimizer)
+        state = self.generator.settle(th.cat([batch.features, batch.actions], dim=1), batch.next_features, batch.memory)
+        self.generator.apply_changes(self.generator.hebbian_update(state))
         self.diagnostics.settled("generator", state)
 
     def _update_targets(self, tau: float) -> None:
@@ -603,11 +595,10 @@ class ActPC(OffPolicyAlgorithm):
                     th._foreach_lerp_(mine, theirs, tau)
 
     def _on_step(self) -> None:
-        """A hard copy of the targets every ``target_update_interval`` transitions."""
-        if self.target_update == "hard":
-            interval, now = self.target_update_interval, self.num_timesteps
-            if now // interval > (now - self.n_envs) // interval:
-                self._update_targets(1.0)
+        """Moves the targets where that goes by environment steps."""
+        interval, now = self.target_update_interval, self.num_timesteps
+        if interval > 1 and now // interval > (now - self.n_envs) // interval:
+            self._update_targets(self.tau)
 
     # ------------------------------------------------------------------ demonstrations and self-imitation
 
@@ -615,13 +606,13 @@ class ActPC(OffPolicyAlgorithm):
         """What refresh draws from: the demonstrations and the self-imitation memory."""
         assert self.replay_buffer is not None
         memory = self.replay_buffer.self_imitation
-        own = [memory.episodes] if memory is not None and len(memory) else []
+        own = [] if memory is None or memory.episodes is None else [memory.episodes]
         return own if self.expert is None else [self.expert.episodes, *own]
 
-    def _refresh_changes(self) -> HebbianChanges:
-        """Settle the actor on imitated actions."""
-        inputs, n = self.inputs, self.policy.batch_size_of("actor", self.batch_size)
-        samples = sample_union(self._imitated(), n, self.history)
+    def _refresh_changes(self, n: int) -> HebbianChanges:
+        """Settle the actor on ``n`` imitated actions."""
+        inputs = self.inputs
+        samples = sample_union(self._imitated(), n, self.memory_history)
         features = inputs.features(inputs.observations(samples.observations))
         if self.refresh_noise:
             features = features + self.refresh_noise * th.randn_like(features)

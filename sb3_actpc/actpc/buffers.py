@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
@@ -11,23 +11,65 @@ from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer
 from stable_baselines3.common.vec_env import VecNormalize
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
-from sb3_actpc.actpc.self_imitation import SelfImitationMemory, map_observations
-from sb3_actpc.actpc.type_aliases import Observations, SignalReplaySamples, TensorObservations
+from sb3_actpc.actpc.self_imitation import Observations, SelfImitationMemory, TensorObservations, map_observations
 from sb3_actpc.utils.checks import LARGEST_SIZE, check_kinds, check_range
 
+# (observations, actions, next observations, the working memory's past and which of it there was) of n_envs new transitions ->
+# their epistemic and instrumental signals, (n_envs,) each
+Score = Callable[
+    [Observations, np.ndarray, Observations, Observations | None, np.ndarray | None], tuple[np.ndarray, np.ndarray]
+]
 
-class _SignalReplay(ReplayBuffer):
+
+class SignalReplaySamples(NamedTuple):
+    """
+    SB3's replay samples with what ActPC keeps beside them. B transitions, the newest of every environment first.
+
+    :param observations: (B, *obs_shape), or a dict of such
+    :param actions: (B, A), scaled to [-1, 1]
+    :param next_observations: as ``observations``; with n-step returns those at the end of the n steps
+    :param dones: (B, 1), 1 where the episode truly ended (a time limit does not count)
+    :param rewards: (B, 1), the task's part alone (normalised or relabelled where asked for)
+    :param discounts: (B, 1) with n-step returns, else None
+    :param epistemic: (B, 1), the generator's signal, summed over n steps like the rewards
+    :param instrumental: (B, 1), the prior's signal, likewise
+    :param history: the observations before each transition in its episode, (B, H, *obs_shape), oldest first; None without
+        a working memory
+    :param history_mask: (B, H), 1 where there was such an observation, or None
+    :param following_observations: with n-step returns, those one step on; None where that is ``next_observations``
+    :param next_history: with n-step returns and a working memory, the observations before ``next_observations``, as
+        ``history``; else None
+    :param next_history_mask: likewise
+    """
+
+    observations: TensorObservations
+    actions: th.Tensor
+    next_observations: TensorObservations
+    dones: th.Tensor
+    rewards: th.Tensor
+    discounts: th.Tensor | None
+    epistemic: th.Tensor
+    instrumental: th.Tensor
+    history: TensorObservations | None
+    history_mask: th.Tensor | None
+    following_observations: TensorObservations | None = None
+    next_history: TensorObservations | None = None
+    next_history_mask: th.Tensor | None = None
+
+
+class SignalReplay(ReplayBuffer):
     """
     What all ActPC buffers add to SB3's; combine it with one of them.
 
     * Combined experience replay (Zhang & Sutton, 2017): the newest transition of every environment is always in the batch.
     * The epistemic and the instrumental signal of every transition, stored apart from the task's reward.
-    * Self-imitation: a finished episode is offered to :class:`~sb3_actpc.actpc.self_imitation.SelfImitationMemory`.
+    * Self-imitation: when an episode ends and is good enough, its rows are copied into a
+      :class:`~sb3_actpc.actpc.self_imitation.SelfImitationMemory`.
     * The working memory is not stored: the observations before a transition are gathered when it is sampled.
 
     :param combined: put the newest transitions into every batch
-    :param history: H, how many preceding observations come with a transition; 0 for none
     :param self_imitation_size: capacity of the self-imitation memory in transitions; 0 for none
+    :param history: H, how many preceding observations come with a transition; 0 for none
     :param n_steps: length of n-step returns
     :param gamma: their discount
     :raises ValueError: naming a value that is not allowed, or two that do not go together
@@ -37,13 +79,14 @@ class _SignalReplay(ReplayBuffer):
         self,
         *args: Any,
         combined: bool = True,
+        self_imitation_size: int = 100_000,
         history: int = 0,
-        self_imitation_size: int = 0,
         n_steps: int = 1,
         gamma: float = 0.99,
         **kwargs: Any,
     ) -> None:
-        given = locals()
+        given: dict[str, Any] = {"combined": combined, "self_imitation_size": self_imitation_size, "history": history}
+        given |= {"n_steps": n_steps, "gamma": gamma}
         check_kinds(given, whole="history self_imitation_size n_steps", numbers="gamma", flags="combined")
         check_range(given, "history self_imitation_size", 0, LARGEST_SIZE)
         check_range(given, "n_steps", 1, LARGEST_SIZE)
@@ -55,66 +98,88 @@ class _SignalReplay(ReplayBuffer):
         self.epistemic = np.zeros((self.buffer_size, self.n_envs), dtype=np.float32)
         self.instrumental = np.zeros((self.buffer_size, self.n_envs), dtype=np.float32)
         self.self_imitation = SelfImitationMemory(self_imitation_size) if self_imitation_size else None
-        self._running: list[list[tuple[Any, np.ndarray, float]]] = [[] for _ in range(self.n_envs)]
+        self._lengths = np.zeros(self.n_envs, dtype=np.int64)  # of the running episodes
 
     # ------------------------------------------------------------------ storing
 
     def add(
-        self, obs: Any, next_obs: Any, action: np.ndarray, reward: np.ndarray, done: np.ndarray, infos: list[dict[str, Any]]
+        self,
+        obs: Any,
+        next_obs: Any,
+        action: np.ndarray,
+        reward: np.ndarray,
+        done: np.ndarray,
+        infos: list[dict[str, Any]],
+        score: Score | None = None,
     ) -> None:
-        super().add(obs, next_obs, action, reward, done, infos)
-        if self.self_imitation is not None:
-            self._follow_episodes(obs, action, reward, done)
+        """
+        Store a transition of every environment, with its signals.
 
-    def _follow_episodes(self, obs: Observations, action: np.ndarray, reward: np.ndarray, done: np.ndarray) -> None:
-        assert self.self_imitation is not None
-        action = action.reshape(self.n_envs, self.action_dim)
-        for env, steps in enumerate(self._running):
-            row = {key: np.array(value[env]) for key, value in obs.items()} if isinstance(obs, dict) else np.array(obs[env])
-            steps.append((row, action[env].astype(np.float32), float(reward[env])))
-            if done[env]:
-                first = steps[0][0]
-                observations: Observations
-                if isinstance(first, dict):
-                    observations = {key: np.stack([step[0][key] for step in steps]) for key in first}
-                else:
-                    observations = np.stack([step[0] for step in steps])
-                self.self_imitation.offer(observations, np.stack([step[1] for step in steps]), sum(s[2] for s in steps))
-                steps.clear()
+        :param obs: (n_envs, *obs_shape), or a dict of such
+        :param next_obs: likewise
+        :param action: (n_envs, A), scaled to [-1, 1]
+        :param reward: (n_envs,), the task's
+        :param done: (n_envs,)
+        :param infos: one for each environment
+        :param score: gives the signals; None for zeros
+        """
+        super().add(obs, next_obs, action, reward, done, infos)
+        newest = self.newest
+        signals: tuple[Any, Any] = (0.0, 0.0)
+        if score is not None:
+            past, mask = self._past_at(np.full(self.n_envs, newest), np.arange(self.n_envs))
+            signals = score(self._as_stored(obs), self.actions[newest], self._as_stored(next_obs), past, mask)
+        self.epistemic[newest], self.instrumental[newest] = signals
+        self._lengths += 1
+        for env in np.flatnonzero(done):
+            self._offer_episode(int(env))
+            self._lengths[env] = 0
+
+    def _as_stored(self, observations: Any) -> Observations:
+        """Observations in the shape and precision in which they will be sampled."""
+        if isinstance(self.observations, dict):
+            rings = self.observations.items()
+            return {key: np.asarray(observations[key], ring.dtype).reshape(ring.shape[1:]) for key, ring in rings}
+        return np.asarray(observations, self.observations.dtype).reshape(self.observations.shape[1:])
+
+    def _offer_episode(self, env: int) -> None:
+        """Copy the episode that has just ended into the self-imitation memory, if it is good enough and all there."""
+        length = int(self._lengths[env])
+        if self.self_imitation is None or length > self.buffer_size - int(self.optimize_memory_usage):
+            return
+        rows = (self.newest + 1 + np.arange(-length, 0)) % self.buffer_size
+        episode_return = float(sum(self.rewards[rows, env].tolist()))
+        if self.self_imitation.takes(length, episode_return):
+            observations = map_observations(lambda ring: ring[rows, env], self.observations)
+            self.self_imitation.store(observations, self.actions[rows, env].astype(np.float32), episode_return)
 
     @property
     def newest(self) -> int:
         """Row of the newest transitions."""
         return (self.pos - 1) % self.buffer_size
 
-    def set_newest_signals(self, epistemic: np.ndarray, instrumental: np.ndarray) -> None:
-        """Store the signals, (n_envs,) each, of the transitions added last."""
-        self.epistemic[self.newest] = epistemic
-        self.instrumental[self.newest] = instrumental
-
     def cut_running_episodes(self) -> None:
         """The environments were reset in mid-episode: nothing bootstraps, sums or remembers across the cut."""
-        for env, steps in enumerate(self._running):
-            steps.clear()
-            if (self.full or self.pos > 0) and not self.dones[self.newest, env]:
-                self.dones[self.newest, env] = 1.0
-                self.timeouts[self.newest, env] = float(self.handle_timeout_termination)  # as a time limit does
+        self._lengths[:] = 0
+        if self.full or self.pos > 0:
+            cut = self.dones[self.newest] == 0
+            self.dones[self.newest, cut] = 1.0
+            self.timeouts[self.newest, cut] = float(self.handle_timeout_termination)  # as a time limit does
 
     def reset(self) -> None:
         super().reset()
-        self._running = [[] for _ in range(self.n_envs)]
+        self._lengths[:] = 0
 
     # ------------------------------------------------------------------ checkpoints
 
     def checkpoint_state(self) -> dict[str, Any]:
-        """What a checkpoint keeps beside the arrays with a row per step: the episodes begun and the self-imitation memory."""
-        running = [_joined_steps(steps) for steps in self._running]
+        """What a checkpoint keeps beside the arrays with a row per step: episodes begun and the self-imitation memory."""
         memory = None if self.self_imitation is None else self.self_imitation.checkpoint_state()
-        return {"running": running, "self_imitation": memory}
+        return {"lengths": self._lengths.copy(), "self_imitation": memory}
 
     def restore_checkpoint_state(self, state: dict[str, Any]) -> None:
         """:param state: what :meth:`checkpoint_state` returned"""
-        self._running = [_split_steps(steps) for steps in state["running"]]
+        self._lengths[:] = state["lengths"]
         if self.self_imitation is not None and state["self_imitation"] is not None:
             self.self_imitation.restore_checkpoint_state(state["self_imitation"])
 
@@ -183,11 +248,12 @@ class _SignalReplay(ReplayBuffer):
     def _to_tensors(self, observations: Observations, env: VecNormalize | None) -> TensorObservations:
         return map_observations(self.to_torch, self._normalize_obs(observations, env))
 
-    def _history_at(
-        self, rows: np.ndarray, envs: np.ndarray, env: VecNormalize | None, including: bool = False
-    ) -> tuple[TensorObservations | None, th.Tensor | None]:
+    def _past_at(
+        self, rows: np.ndarray, envs: np.ndarray, including: bool = False
+    ) -> tuple[Observations | None, np.ndarray | None]:
         """
-        The ``history`` observations before each row in its episode, oldest first, and which of them exist.
+        The ``history`` observations before each row in its episode, (B, H, *obs_shape), oldest first, and which of them
+        exist, (B, H); None and None without a history.
 
         :param including: those before the row's *next* observation: its own is the last of them
         """
@@ -200,22 +266,18 @@ class _SignalReplay(ReplayBuffer):
         earlier = (rows[:, None] - steps_back) % self.buffer_size
         unbroken = exists & ((steps_back == 0) | (self.dones[earlier, envs[:, None]] == 0))
         mask = np.flip(np.logical_and.accumulate(np.flip(unbroken, axis=1), axis=1), axis=1).astype(np.float32)
-        shape = (len(rows) * self.history,)
-        flat = map_observations(
-            lambda array: array[earlier, envs[:, None]].reshape(*shape, *array.shape[2:]), self.observations
-        )
-        past = map_observations(
-            lambda array: array.reshape(len(rows), self.history, *array.shape[1:]), self._to_tensors(flat, env)
-        )
-        return past, self.to_torch(mask)
+        return map_observations(lambda ring: ring[earlier, envs[:, None]], self.observations), mask
 
-    def newest_transitions(self, env: VecNormalize | None = None) -> SignalReplaySamples:
-        """The transitions added last, one per environment."""
-        n_steps, self.n_steps = self.n_steps, 1
-        try:
-            return self._gather(np.full(self.n_envs, self.newest), np.arange(self.n_envs), env)
-        finally:
-            self.n_steps = n_steps
+    def _history_at(
+        self, rows: np.ndarray, envs: np.ndarray, env: VecNormalize | None, including: bool = False
+    ) -> tuple[TensorObservations | None, th.Tensor | None]:
+        """:meth:`_past_at` as normalised tensors."""
+        past, mask = self._past_at(rows, envs, including)
+        if past is None or mask is None:
+            return None, None
+        flat = map_observations(lambda array: array.reshape(-1, *array.shape[2:]), past)
+        tensors = map_observations(lambda t: t.reshape(*mask.shape, *t.shape[1:]), self._to_tensors(flat, env))
+        return tensors, self.to_torch(mask)
 
     def _n_step_window(self, rows: np.ndarray, envs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Last row of each n-step window and which of its ``n_steps`` rows count, (B,) and (B, n_steps)."""
@@ -241,19 +303,19 @@ class _SignalReplay(ReplayBuffer):
         return (normalize(values[window, envs[:, None]]) * mask * discounts).sum(1, keepdims=True)
 
 
-class CombinedReplayBuffer(_SignalReplay):
-    """ActPC's replay buffer for Box observations; see :class:`_SignalReplay`."""
+class CombinedReplayBuffer(SignalReplay):
+    """ActPC's replay buffer for Box observations; see :class:`SignalReplay`."""
 
 
-class CombinedNStepReplayBuffer(_SignalReplay, NStepReplayBuffer):
+class CombinedNStepReplayBuffer(SignalReplay, NStepReplayBuffer):
     """The same as SB3's n-step class: chosen for ``n_steps`` above 1."""
 
 
-class CombinedDictReplayBuffer(_SignalReplay, DictReplayBuffer):  # type: ignore[misc]
-    """ActPC's replay buffer for Dict observations; see :class:`_SignalReplay`."""
+class CombinedDictReplayBuffer(SignalReplay, DictReplayBuffer):  # type: ignore[misc]
+    """ActPC's replay buffer for Dict observations; see :class:`SignalReplay`."""
 
 
-class CombinedHerReplayBuffer(_SignalReplay, HerReplayBuffer):  # type: ignore[misc]
+class CombinedHerReplayBuffer(SignalReplay, HerReplayBuffer):  # type: ignore[misc]
     """
     Hindsight experience replay with ActPC's signals: relabelling touches the task's reward and the goals alone.
 
@@ -271,8 +333,7 @@ class CombinedHerReplayBuffer(_SignalReplay, HerReplayBuffer):  # type: ignore[m
         return rows, envs
 
     def cut_running_episodes(self) -> None:
-        for steps in self._running:
-            steps.clear()
+        self._lengths[:] = 0
         if (self._current_ep_start != self.pos).any():
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # SB3 recommends an option that ``learn`` does not have
@@ -296,36 +357,7 @@ class CombinedHerReplayBuffer(_SignalReplay, HerReplayBuffer):  # type: ignore[m
         return batch
 
 
-def _joined_steps(steps: list[tuple[Any, np.ndarray, float]]) -> dict[str, Any] | None:
-    """The steps of an episode as arrays with a row each; None before its first."""
-    if not steps:
-        return None
-    first = steps[0][0]
-    if isinstance(first, dict):
-        observations: Observations = {key: np.stack([step[0][key] for step in steps]) for key in first}
-    else:
-        observations = np.stack([step[0] for step in steps])
-    return {
-        "observations": observations,
-        "actions": np.stack([step[1] for step in steps]),
-        "rewards": np.array([step[2] for step in steps]),
-    }
-
-
-def _split_steps(joined: dict[str, Any] | None) -> list[tuple[Any, np.ndarray, float]]:
-    """The inverse of :func:`_joined_steps`."""
-    if joined is None:
-        return []
-    rewards = joined["rewards"].tolist()
-    observations = joined["observations"]
-    if isinstance(observations, dict):
-        rows: list[Any] = [dict(zip(observations, parts, strict=True)) for parts in zip(*observations.values(), strict=True)]
-    else:
-        rows = list(observations)
-    return list(zip(rows, joined["actions"], rewards, strict=True))
-
-
-_COUNTERPARTS: dict[type[ReplayBuffer], type[ReplayBuffer]] = {
+_COUNTERPARTS: dict[type[ReplayBuffer], type[SignalReplay]] = {
     ReplayBuffer: CombinedReplayBuffer,
     NStepReplayBuffer: CombinedNStepReplayBuffer,
     DictReplayBuffer: CombinedDictReplayBuffer,
@@ -335,7 +367,7 @@ _COUNTERPARTS: dict[type[ReplayBuffer], type[ReplayBuffer]] = {
 
 def combined_buffer_class(
     given: type[ReplayBuffer] | str | None, observation_space: spaces.Space, n_steps: int = 1
-) -> type[ReplayBuffer]:
+) -> type[SignalReplay]:
     """
     :param given: the class the user asked for, or its name, or None
     :param observation_space: Dict or not
@@ -355,7 +387,7 @@ def combined_buffer_class(
         return CombinedDictReplayBuffer
     if given is None:
         return CombinedNStepReplayBuffer if n_steps > 1 else CombinedReplayBuffer
-    if issubclass(given, _SignalReplay):
+    if issubclass(given, SignalReplay):
         return given
     if given in _COUNTERPARTS:
         return _COUNTERPARTS[given]

@@ -6,9 +6,9 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.vec_env import VecNormalize
 
+from sb3_actpc.actpc.buffers import SignalReplaySamples
 from sb3_actpc.actpc.policies import ActPCActor
-from sb3_actpc.actpc.self_imitation import map_observations
-from sb3_actpc.actpc.type_aliases import Observations, TensorObservations
+from sb3_actpc.actpc.self_imitation import Observations, TensorObservations, map_observations
 
 
 class Batch(NamedTuple):
@@ -35,6 +35,10 @@ class Batch(NamedTuple):
     rewards: th.Tensor
     dones: th.Tensor
     discounts: th.Tensor
+
+    def first(self, n: int) -> "Batch":
+        """The first ``n`` rows, for a circuit with a batch size of its own."""
+        return self if n >= len(self.features) else Batch(*(None if column is None else column[:n] for column in self))  # type: ignore[arg-type]
 
     def join(self, other: "Batch") -> "Batch":
         """These rows, then those of ``other``."""
@@ -135,3 +139,28 @@ class CircuitInputs:
         if following is None:
             following = th.cat([past[:, 1:], features[:, None]], dim=1)
         return self.actor.memory(past), self.actor.memory(following)
+
+    def replayed(self, samples: SignalReplaySamples, weights: tuple[float, float, float], gamma: float) -> Batch:
+        """
+        :param samples: what the replay buffer drew
+        :param weights: (α_ext, α_ep, α_in)
+        :param gamma: discount of one step
+        :return: the transitions as the circuits see them
+        """
+        features = self.features(samples.observations)
+        pasts = samples.history, samples.history_mask, features, samples.next_history, samples.next_history_mask
+        memory, next_memory = self.memories(*pasts)
+        next_features = bootstrap_features = self.features(samples.next_observations)
+        if samples.following_observations is not None:
+            next_features = self.features(samples.following_observations)
+        return Batch(
+            features=features,
+            actions=samples.actions,
+            next_features=next_features,
+            bootstrap_features=bootstrap_features,
+            memory=memory,
+            next_memory=next_memory,
+            rewards=weights[0] * samples.rewards + (weights[1] * samples.epistemic + weights[2] * samples.instrumental),
+            dones=samples.dones,
+            discounts=th.full_like(samples.dones, gamma) if samples.discounts is None else samples.discounts,
+        )

@@ -4,7 +4,7 @@ import copy
 import inspect
 import warnings
 from collections.abc import Iterator
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch as th
@@ -15,9 +15,20 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, Combine
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
-from sb3_actpc.actpc.arguments import CIRCUITS, check_policy_keywords
+from sb3_actpc.actpc.arguments import (
+    CIRCUITS,
+    MAX_CRITICS,
+    Between,
+    Settings,
+    check_circuit,
+    check_extractor,
+    check_net_arch,
+    check_optimizer,
+    checked,
+)
 from sb3_actpc.ngc import NGCCircuit, WorkingMemory
-from sb3_actpc.utils.checks import named_in_errors
+from sb3_actpc.ngc.activations import ACTIVATIONS
+from sb3_actpc.utils.checks import LARGEST_SIZE, check_kinds, named_in_errors
 
 # what circuit_kwargs, actor_kwargs and so on may set; sizes follow from the task
 _SIZES = {"self", "n_inputs", "n_outputs", "hidden", "output_activation", "n_memory", "n_feedback_inputs"}
@@ -209,26 +220,28 @@ class ActPCPolicy(BasePolicy):
     actor: ActPCActor
     action_space: spaces.Box
 
+    @checked
     def __init__(
         self,
         observation_space: spaces.Space,
         action_space: spaces.Box,
         lr_schedule: Schedule,
-        net_arch: list[int] | dict[str, list[int]] | None = None,
-        n_critics: int = 1,
-        circuit_kwargs: dict[str, Any] | None = None,
-        actor_kwargs: dict[str, Any] | None = None,
-        critic_kwargs: dict[str, Any] | None = None,
-        generator_kwargs: dict[str, Any] | None = None,
-        prior_kwargs: dict[str, Any] | None = None,
-        memory_history: int = 0,
-        features_extractor_class: type[BaseFeaturesExtractor] = FlattenExtractor,
-        features_extractor_kwargs: dict[str, Any] | None = None,
+        net_arch: Annotated[list[int] | dict[str, list[int]] | None, check_net_arch] = None,
+        n_critics: Annotated[int, Between(1, MAX_CRITICS)] = 1,
+        circuit_kwargs: Settings | None = None,
+        actor_kwargs: Annotated[Settings | None, check_circuit] = None,
+        critic_kwargs: Annotated[Settings | None, check_circuit] = None,
+        generator_kwargs: Annotated[Settings | None, check_circuit] = None,
+        prior_kwargs: Annotated[Settings | None, check_circuit] = None,
+        memory_history: Annotated[int, Between(0, LARGEST_SIZE)] = 0,
+        features_extractor_class: Annotated[type[BaseFeaturesExtractor], check_extractor] = FlattenExtractor,
+        features_extractor_kwargs: Settings | None = None,
         normalize_images: bool = True,
-        optimizer_class: type[th.optim.Optimizer] = th.optim.Adam,
-        optimizer_kwargs: dict[str, Any] | None = None,
+        optimizer_class: Annotated[type[th.optim.Optimizer], check_optimizer] = th.optim.Adam,
+        optimizer_kwargs: Settings | None = None,
     ) -> None:
-        check_policy_keywords(locals())
+        if features_extractor_class is FlattenExtractor and isinstance(observation_space, spaces.Dict):
+            raise ValueError(f"{type(self).__name__} does not take Dict observations: use 'MultiInputPolicy'")
         if features_extractor_class is FlattenExtractor and is_image_space(observation_space):
             raise ValueError(
                 f"observations of shape {observation_space.shape} are images: ActPC learns no convolutions; use "
@@ -360,6 +373,28 @@ class ActPCPolicy(BasePolicy):
         return self.actor.predict(observation, state, episode_start, deterministic)
 
 
+def check_policy(name: str, policy: Any) -> None:
+    """:raises ValueError: when it is neither the name of a policy nor a subclass of :class:`ActPCPolicy`"""
+    is_name = isinstance(policy, str) and policy in POLICIES
+    if not is_name and not (isinstance(policy, type) and issubclass(policy, ActPCPolicy)):
+        raise ValueError(f"{name}={policy!r} must be one of {list(POLICIES)}, or a subclass of {ActPCPolicy.__name__}")
+
+
+def check_policy_kwargs(name: str, given: Any) -> None:
+    """:raises ValueError: naming the keywords that no policy has; the policy checks the values"""
+    check_kinds({name: given}, mappings=name)
+    known = set(inspect.signature(ActPCPolicy.__init__).parameters)
+    known -= {"self", "observation_space", "action_space", "lr_schedule"}
+    unknown = sorted(set(given or {}) - known)
+    if "activation_fn" in unknown:
+        raise ValueError(
+            f"{name} has activation_fn={given['activation_fn']!r}: activations are chosen by name, with "
+            f"policy_kwargs=dict(circuit_kwargs=dict(activation=...)), one of {sorted(ACTIVATIONS)}"
+        )
+    if unknown:
+        raise ValueError(f"{name} has unknown keys {unknown}; choose from {sorted(known)}")
+
+
 MlpPolicy = ActPCPolicy
 
 
@@ -377,3 +412,10 @@ class MultiInputPolicy(ActPCPolicy):
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         kwargs.setdefault("features_extractor_class", CombinedExtractor)
         super().__init__(*args, **kwargs)
+
+
+POLICIES: dict[str, type[BasePolicy]] = {
+    "MlpPolicy": MlpPolicy,
+    "CnnPolicy": CnnPolicy,
+    "MultiInputPolicy": MultiInputPolicy,
+}

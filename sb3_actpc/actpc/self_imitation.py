@@ -1,15 +1,35 @@
 """Whole episodes worth imitating: the demonstrations, and the agent's own best (self-imitation)."""
 
-from collections import deque
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+import torch as th
 from gymnasium import spaces
 
-from sb3_actpc.actpc.type_aliases import ImitationSamples, Observations
 from sb3_actpc.demonstrations.dataset import Demonstrations
+
+Observations = np.ndarray | dict[str, np.ndarray]
+TensorObservations = th.Tensor | dict[str, th.Tensor]
+PATIENCE = 20  # episodes, all with a negative return, after which the memory warns
+
+
+class ImitationSamples(NamedTuple):
+    """
+    Observations and actions worth imitating, B rows of successful episodes.
+
+    :param observations: (B, *obs_shape) numpy, unnormalised, or a dict of such
+    :param actions: (B, A), scaled to [-1, 1]
+    :param history: (B, H, *obs_shape), the observations before each row in its episode, oldest first; or None
+    :param history_mask: (B, H), 1 where there was such an observation, or None
+    """
+
+    observations: Observations
+    actions: np.ndarray
+    history: Observations | None
+    history_mask: np.ndarray | None
 
 
 def map_observations(function: Callable[[Any], Any], observations: Any) -> Any:
@@ -102,68 +122,73 @@ class Episodes:
 
 class SelfImitationMemory:
     """
-    The actor's memory of its own goal-reaching episodes (paper: M^actor, Algorithm 1 lines 25 to 27).
+    The actor's memory of its own goal-reaching episodes (paper: M^actor, Algorithm 1, line 30), laid end to end.
 
     An episode enters when its sparse return is positive and at least the best return now stored; the oldest leave when the
-    capacity is passed.
+    capacity is passed. A task that pays negative rewards alone never gets one in: the memory warns of it, once.
 
     :param capacity: most transitions kept (an episode longer than that is not stored)
     """
 
     def __init__(self, capacity: int = 100_000) -> None:
         self.capacity = capacity
-        self.returns: deque[float] = deque()
-        self._episodes: deque[Episodes] = deque()
-        self._joined: Episodes | None = None
+        self.returns: list[float] = []
+        self.lengths: list[int] = []
+        self.episodes: Episodes | None = None
+        self._n_ended, self._best_ended = 0, -np.inf
 
     def __len__(self) -> int:
-        return sum(map(len, self._episodes))
+        return sum(self.lengths)
 
     @property
     def best_return(self) -> float:
         """The best sparse return stored; 0 while empty."""
         return max(self.returns, default=0.0)
 
-    def offer(self, observations: Observations, actions: np.ndarray, episode_return: float) -> bool:
+    def takes(self, length: int, episode_return: float) -> bool:
+        """
+        :param length: transitions of an episode that has ended
+        :param episode_return: its sparse return
+        :return: whether it is good enough, and short enough
+        """
+        self._n_ended, self._best_ended = self._n_ended + 1, max(self._best_ended, episode_return)
+        if self._n_ended == PATIENCE and self._best_ended < 0.0:
+            warnings.warn(
+                f"all of the first {PATIENCE} episodes had a negative return: self-imitation takes episodes with a positive "
+                "one alone, and none will come in if the task never pays; shift the reward above 0, or leave the memory out "
+                "with replay_buffer_kwargs=dict(self_imitation_size=0)",
+                stacklevel=2,
+            )
+        return episode_return > 0.0 and episode_return >= self.best_return and length <= self.capacity
+
+    def store(self, observations: Observations, actions: np.ndarray, episode_return: float) -> None:
         """
         :param observations: (T, *obs_shape) of one whole episode, or a dict of such
         :param actions: (T, A)
-        :param episode_return: the episode's sparse return
-        :return: whether it was stored
+        :param episode_return: its sparse return
         """
-        if episode_return <= 0.0 or episode_return < self.best_return or len(actions) > self.capacity:
-            return False
-        self._episodes.append(Episodes(observations, actions, np.zeros(len(actions), dtype=np.int64)))
+        self.lengths.append(len(actions))
         self.returns.append(episode_return)
+        n_gone = 0
         while len(self) > self.capacity:
-            self._episodes.popleft()
-            self.returns.popleft()
-        self._joined = None
-        return True
+            n_gone += self.lengths.pop(0)
+            self.returns.pop(0)
+        if self.episodes is not None:
+            kept = map_observations(lambda array: array[n_gone:], self.episodes.observations)
+            observations = _concatenate([kept, observations])
+            actions = np.concatenate([self.episodes.actions[n_gone:], actions])
+        starts = np.repeat(np.cumsum([0, *self.lengths[:-1]]), self.lengths)
+        self.episodes = Episodes(observations, actions, starts)
 
     def checkpoint_state(self) -> dict[str, Any]:
         """The stored episodes and their returns, for a checkpoint."""
-        parts = [{"observations": episode.observations, "actions": episode.actions} for episode in self._episodes]
-        return {"returns": list(self.returns), "episodes": parts}
+        episodes = None if self.episodes is None else dict(vars(self.episodes))
+        return {"returns": list(self.returns), "lengths": list(self.lengths), "episodes": episodes}
 
     def restore_checkpoint_state(self, state: dict[str, Any]) -> None:
         """:param state: what :meth:`checkpoint_state` returned"""
-        self.returns = deque(state["returns"])
-        self._episodes = deque(
-            Episodes(part["observations"], part["actions"], np.zeros(len(part["actions"]), dtype=np.int64))
-            for part in state["episodes"]
-        )
-        self._joined = None
-
-    @property
-    def episodes(self) -> Episodes:
-        """All stored episodes laid end to end."""
-        if self._joined is None:
-            lengths = [len(episode) for episode in self._episodes]
-            starts = np.repeat(np.cumsum([0, *lengths[:-1]]), lengths)
-            observations = _concatenate([episode.observations for episode in self._episodes])
-            self._joined = Episodes(observations, np.concatenate([e.actions for e in self._episodes]), starts)
-        return self._joined
+        self.returns, self.lengths = list(state["returns"]), list(state["lengths"])
+        self.episodes = None if state["episodes"] is None else Episodes(**state["episodes"])
 
 
 def sample_union(parts: list[Episodes], n: int, history: int = 0) -> ImitationSamples:

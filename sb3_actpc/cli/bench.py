@@ -60,19 +60,18 @@ def run(args: argparse.Namespace) -> int:
 def _settings() -> dict[str, dict[str, Any]]:
     """The agents measured: the bare one, the shipped defaults and the paper's preset, with both schedules."""
     from sb3_actpc.experiments.runs import preset
+    from sb3_actpc.experiments.runs.presets import with_changes
 
-    bare = {"circuit_kwargs": {"feedback": "tied"}, "n_critics": 1}
+    bare: dict[str, Any] = {}
     presets = {"shipped defaults": "actpc", "paper preset": "actpc_paper"}
     with_data = {label: preset(TASK, name) for label, name in presets.items()}
     settings = {}
     for label, keywords in (("bare", bare), *with_data.items()):
         for settling in ("scheduled", "iterative"):
-            chosen = {**keywords, "settling": settling}
-            if settling == "scheduled":  # implies tied feedback
-                chosen["circuit_kwargs"] = {"activation": "relu6"}
-            elif label == "shipped defaults":
-                chosen["circuit_kwargs"] = {"feedback": "tied"}
-            settings[f"ActPC train(), {label}, {settling}"] = chosen
+            chosen: dict[str, Any] = {"settling": settling}
+            if settling == "scheduled" and label == "paper preset":  # implies tied feedback
+                chosen["policy_kwargs.circuit_kwargs"] = {"activation": "relu6"}
+            settings[f"ActPC train(), {label}, {settling}"] = with_changes(keywords, chosen)
     return settings
 
 

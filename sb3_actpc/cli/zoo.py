@@ -168,8 +168,11 @@ def convert_actpc_params(sampled: dict[str, Any]) -> dict[str, Any]:
         "alpha_in": sampled["alpha_in"],
         "gamma": 1.0 - sampled["one_minus_gamma"],
         "batch_size": 2 ** sampled["batch_size_pow"],
-        "policy_kwargs": {"net_arch": NET_ARCHS[sampled["net_arch"]]},
-        "circuit_kwargs": {"weight_decay": sampled["weight_decay"]},
+        "policy_kwargs": {
+            "net_arch": NET_ARCHS[sampled["net_arch"]],
+            "n_critics": 2,
+            "circuit_kwargs": {"weight_decay": sampled["weight_decay"]},
+        },
     }
 
 

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 import torch as th
 
 _LEAKY_SLOPE = 0.01
-_aten = th.ops.aten
 
 
 @dataclass(frozen=True)
@@ -25,36 +24,64 @@ class Activation:
     damp: Callable[[th.Tensor, th.Tensor, th.Tensor], th.Tensor]
 
 
+# Functions with names, so that a circuit can be pickled. z are latents, h = φ(z), f the signal that is damped.
+
+
+def _pass(z: th.Tensor, out: th.Tensor) -> th.Tensor:
+    return z
+
+
+def _pass_undamped(f: th.Tensor, z: th.Tensor, h: th.Tensor) -> th.Tensor:
+    return f
+
+
+def _relu(z: th.Tensor, out: th.Tensor) -> th.Tensor:
+    return th.clamp(z, min=0.0, out=out)
+
+
+def _damp_relu(f: th.Tensor, z: th.Tensor, h: th.Tensor) -> th.Tensor:
+    return th.ops.aten.threshold_backward.grad_input(f, z, 0.0, grad_input=f)
+
+
+def _relu6(z: th.Tensor, out: th.Tensor) -> th.Tensor:
+    return th.clamp(z, 0.0, 6.0, out=out)
+
+
+def _damp_relu6(f: th.Tensor, z: th.Tensor, h: th.Tensor) -> th.Tensor:
+    return th.ops.aten.hardtanh_backward.grad_input(f, z, 0.0, 6.0, grad_input=f)
+
+
+def _leaky_relu(z: th.Tensor, out: th.Tensor) -> th.Tensor:
+    return th.ops.aten.leaky_relu.out(z, _LEAKY_SLOPE, out=out)
+
+
+def _damp_leaky_relu(f: th.Tensor, z: th.Tensor, h: th.Tensor) -> th.Tensor:
+    return th.ops.aten.leaky_relu_backward.grad_input(f, z, _LEAKY_SLOPE, False, grad_input=f)
+
+
+def _elu(z: th.Tensor, out: th.Tensor) -> th.Tensor:
+    return th.ops.aten.elu.out(z, 1.0, 1.0, 1.0, out=out)
+
+
+def _damp_elu(f: th.Tensor, z: th.Tensor, h: th.Tensor) -> th.Tensor:
+    return th.ops.aten.elu_backward.grad_input(f, 1.0, 1.0, 1.0, False, z, grad_input=f)
+
+
+def _tanh(z: th.Tensor, out: th.Tensor) -> th.Tensor:
+    return th.tanh(z, out=out)
+
+
+def _damp_tanh(f: th.Tensor, z: th.Tensor, h: th.Tensor) -> th.Tensor:
+    return th.ops.aten.tanh_backward.grad_input(f, h, grad_input=f)
+
+
 ACTIVATIONS: dict[str, Activation] = {
-    activation.name: activation
-    for activation in (
-        Activation("identity", lambda z, out: z, lambda f, z, h: f),
-        Activation(
-            "relu",
-            lambda z, out: th.clamp(z, min=0.0, out=out),
-            lambda f, z, h: _aten.threshold_backward.grad_input(f, z, 0.0, grad_input=f),
-        ),
-        Activation(
-            "relu6",
-            lambda z, out: th.clamp(z, 0.0, 6.0, out=out),
-            lambda f, z, h: _aten.hardtanh_backward.grad_input(f, z, 0.0, 6.0, grad_input=f),
-        ),
-        Activation(
-            "leaky_relu",
-            lambda z, out: _aten.leaky_relu.out(z, _LEAKY_SLOPE, out=out),
-            lambda f, z, h: _aten.leaky_relu_backward.grad_input(f, z, _LEAKY_SLOPE, False, grad_input=f),
-        ),
-        Activation(
-            "elu",
-            lambda z, out: _aten.elu.out(z, 1.0, 1.0, 1.0, out=out),
-            lambda f, z, h: _aten.elu_backward.grad_input(f, 1.0, 1.0, 1.0, False, z, grad_input=f),
-        ),
-        Activation(
-            "tanh",
-            lambda z, out: th.tanh(z, out=out),
-            lambda f, z, h: _aten.tanh_backward.grad_input(f, h, grad_input=f),
-        ),
-    )
+    "identity": Activation("identity", _pass, _pass_undamped),
+    "relu": Activation("relu", _relu, _damp_relu),
+    "relu6": Activation("relu6", _relu6, _damp_relu6),
+    "leaky_relu": Activation("leaky_relu", _leaky_relu, _damp_leaky_relu),
+    "elu": Activation("elu", _elu, _damp_elu),
+    "tanh": Activation("tanh", _tanh, _damp_tanh),
 }
 
 

@@ -66,7 +66,7 @@ class NGCCircuit(nn.Module):
     """
 
     rates: th.Tensor
-    optimizer: th.optim.Optimizer  # set by whoever trains the circuit; ``apply_changes`` takes any
+    optimizer: th.optim.Optimizer  # of :meth:`parameter_groups`; set by whoever wants the circuit to learn
 
     def __init__(
         self,
@@ -295,13 +295,13 @@ class NGCCircuit(nn.Module):
             groups.append({"params": self.synapses.feedback, "lr": learning_rate * scale, "lr_scale": scale})
         return groups
 
-    def apply_changes(self, changes: HebbianChanges, optimizer: th.optim.Optimizer) -> None:
+    def apply_changes(self, changes: HebbianChanges) -> None:
         """
-        Hand the changes to the optimiser, bound the step it takes, and keep the settling rates stable.
+        Hand the changes to the circuit's ``optimizer``, bound the step it takes, and keep the settling rates stable.
 
         The one place where a change becomes minus a gradient.
         """
-        self._decay_synapses(optimizer)
+        self._decay_synapses()
         old = [parameter.clone() for parameter in self._scaled_synapses()] if self.synaptic_scaling == "soft_bound" else []
         targets = [*self.synapses.weights, *self.synapses.biases, *self.synapses.memory]
         for parameter, gradient in zip(targets, th._foreach_neg(changes.tensors()), strict=True):
@@ -311,13 +311,13 @@ class NGCCircuit(nn.Module):
         for parameter, weights in zip(self.synapses.feedback, above, strict=self.feedback == "learned"):
             assert weights.grad is not None
             parameter.grad = weights.grad[:, weights.shape[1] - parameter.shape[1] :].contiguous()
-        optimizer.step()
+        self.optimizer.step()
         self._scale_synapses(old)
         if self._keep_rates:
             self.update_settling_rates()
 
-    def _decay_synapses(self, optimizer: th.optim.Optimizer) -> None:
-        for group in optimizer.param_groups if self.weight_decay else ():
+    def _decay_synapses(self) -> None:
+        for group in self.optimizer.param_groups if self.weight_decay else ():
             matrices = [parameter for parameter in group["params"] if parameter.dim() > 1]
             if matrices:
                 th._foreach_mul_(matrices, max(0.0, 1.0 - group["lr"] * self.weight_decay))

@@ -15,29 +15,14 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_actpc import ActPC
+from tests.actpc.agents import SMALL, differ, make, weights_of
 from tests.actpc.envs import CountingEnv, demonstrations
 
-SMALL = {
-    "policy_kwargs": {"net_arch": [16, 16]},
-    "settling": "scheduled",
-    "learning_starts": 10,
-    "batch_size": 16,
-    "seed": 0,
-    "device": "cpu",
-}
+NO_MEMORY = {"self_imitation_size": 0}
 
 
-def make(env=None, n_envs=1, **keywords) -> ActPC:
-    env = env or DummyVecEnv([CountingEnv for _ in range(n_envs)])
-    return ActPC("MlpPolicy", env, **{**SMALL, "prior_updates": 5, **keywords})
-
-
-def weights_of(circuit) -> list[th.Tensor]:
-    return [p.clone() for p in circuit.parameters()]
-
-
-def differ(one, other) -> bool:
-    return any(not th.equal(a, b) for a, b in zip(one, other, strict=True))
+def remembering(history):
+    return {"net_arch": [16, 16], "memory_history": history}
 
 
 def test_the_tiny_environment_is_valid():
@@ -48,7 +33,9 @@ def test_the_tiny_environment_is_valid():
 
 
 def test_the_critic_target_is_the_weighted_sum_of_the_three_parts_plus_the_bootstrap():
-    model = make(demonstrations=demonstrations(), alpha_ext=0.7, alpha_ep=0.5, alpha_in=0.25, combined_replay=False)
+    model = make(
+        demonstrations=demonstrations(), alpha_ext=0.7, alpha_ep=0.5, alpha_in=0.25, replay_buffer_kwargs={"combined": False}
+    )
     model.learn(60)
     np.random.seed(1)
     replayed = model.replay_buffer.sample(32)
@@ -127,7 +114,7 @@ def test_refresh_pulls_the_actor_towards_the_demonstrations():
     data = demonstrations()
     distance = {}
     for weight in (0.0, 1.0):
-        model = make(demonstrations=data, refresh_weight=weight, actor_pressure=0.0, self_imitation_size=0)
+        model = make(demonstrations=data, refresh_weight=weight, actor_pressure=0.0, replay_buffer_kwargs=NO_MEMORY)
         before = weights_of(model.actor.circuit)
         model.learn(400)
         actions = model.actor.circuit.project(th.as_tensor(data.observations))
@@ -170,7 +157,12 @@ def test_scaled_pressure_is_divided_by_the_mean_absolute_action_value_or_by_one_
     steps = []
     for scale in (False, True):
         policy_kwargs = {"net_arch": [16, 16], "optimizer_class": th.optim.SGD}  # its steps are the changes themselves
-        options = {"policy_kwargs": policy_kwargs, "learning_rate": 1.0, "self_imitation_size": 0, "learning_starts": 100}
+        options = {
+            "policy_kwargs": policy_kwargs,
+            "learning_rate": 1.0,
+            "replay_buffer_kwargs": NO_MEMORY,
+            "learning_starts": 100,
+        }
         model = make(scale_pressure=scale, **options)
         model.learn(50)
         model.critic[0].synapses.biases[-1].add_(shift)
@@ -194,10 +186,10 @@ def test_soft_targets_move_by_tau_and_hard_ones_every_c_transitions():
         for p in model.critic.parameters():
             p.add_(1.0)
     before = weights_of(model.critic_target)
-    model._update_targets(0.25)
+    model._update_targets(model.tau)
     for old, new, source in zip(before, weights_of(model.critic_target), weights_of(model.critic), strict=True):
         assert th.allclose(new, 0.75 * old + 0.25 * source, atol=1e-6)
-    model = make(target_update="hard", target_update_interval=25, learning_starts=10)
+    model = make(tau=1.0, target_update_interval=25, learning_starts=10)
     model.learn(49)  # the copy of step 25 is in the target, the updates since are not
     assert differ(weights_of(model.critic_target), weights_of(model.critic))
     before = weights_of(model.critic_target)
@@ -206,7 +198,7 @@ def test_soft_targets_move_by_tau_and_hard_ones_every_c_transitions():
 
 
 def test_the_smallest_of_the_critics_bootstraps():
-    model = make(n_critics=3)
+    model = make(policy_kwargs={"net_arch": [16, 16], "n_critics": 3})
     model.learn(40)
     batch = model._sample_batch(16)
     inputs = th.cat([batch.next_features, model.actor_target.project(batch.next_features)], dim=1)
@@ -269,7 +261,13 @@ def test_noise_on_refreshed_observations_is_ridge_regression():
     slopes = []
     for noise in (0.0, 1.0):
         circuit = {"net_arch": [], "learning_rate": 2e-3}
-        model = make(demonstrations=data, actor_kwargs=circuit, actor_warm_start=600, refresh_noise=noise, batch_size=256)
+        model = make(
+            demonstrations=data,
+            policy_kwargs={"actor_kwargs": circuit},
+            actor_warm_start=600,
+            refresh_noise=noise,
+            batch_size=256,
+        )
         model.pretrain()
         slopes.append(model.actor.circuit.weights[0][:, :2].diagonal().mean().item())
     assert slopes == pytest.approx([0.1, 0.05], rel=0.1)
@@ -317,8 +315,8 @@ def test_with_n_step_returns_generator_and_prior_still_predict_one_step():
 
 def test_a_circuit_with_a_smaller_batch_takes_the_newest_and_a_fair_mixture_of_the_rest():
     data = demonstrations()
-    sizes = {"batch_size": 16, "critic_kwargs": {"batch_size": 64}, "generator_kwargs": {"batch_size": 32}}
-    model = make(demonstrations=data, demonstration_fraction=0.5, alpha_ext=1.0, **sizes)
+    sizes = {"critic_kwargs": {"batch_size": 64}, "generator_kwargs": {"batch_size": 32}}
+    model = make(demonstrations=data, demonstration_fraction=0.5, alpha_ext=1.0, policy_kwargs={"net_arch": [16, 16], **sizes})
     model.learn(40)
     rows = {tuple(row) for row in data.observations.tolist()}
     newest = tuple(model.replay_buffer.observations[model.replay_buffer.newest, 0].tolist())
@@ -377,7 +375,8 @@ def test_rebuilt_memory_equals_the_one_at_collection_across_episode_ends_and_rin
     env = DummyVecEnv([lambda n=n: CountingEnv(lengths=n, dict_observations=dict_observations) for n in lengths])
     policy = "MultiInputPolicy" if dict_observations else "MlpPolicy"
     keywords = {**SMALL, "learning_starts": 1000, "buffer_size": 30 * n_envs}
-    model = ActPC(policy, env, **keywords, working_memory=True, memory_history=4)
+    keywords["policy_kwargs"] = remembering(4)
+    model = ActPC(policy, env, **keywords)
     seen = []
     predict = type(model.actor).predict
 
@@ -408,7 +407,7 @@ def test_rebuilt_memory_equals_the_one_at_collection_across_episode_ends_and_rin
 
 
 def test_a_bare_predict_acts_with_an_empty_memory_and_warns_once():
-    model = make(working_memory=True)
+    model = make(policy_kwargs=remembering(7))
     obs = np.ones(3, np.float32)
     with pytest.warns(UserWarning, match="working memory"):
         first, state = model.predict(obs)
@@ -421,7 +420,7 @@ def test_a_bare_predict_acts_with_an_empty_memory_and_warns_once():
 
 
 def test_evaluate_policy_carries_the_memory():
-    model = make(working_memory=True)
+    model = make(policy_kwargs=remembering(7))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         evaluate_policy(model, DummyVecEnv([CountingEnv]), n_eval_episodes=2, warn=False)
@@ -445,15 +444,17 @@ def test_learning_never_backpropagates(settling, monkeypatch):
         actor_warm_start=3,
         observation_normalization="demonstrations",
         alpha_ext=1.0,
-        n_critics=2,
         target_policy_noise=0.2,
         scale_pressure=True,
-        working_memory=True,
         action_noise=NormalActionNoise(np.zeros(2), 0.1 * np.ones(2)),
-        circuit_kwargs={
-            "synaptic_scaling": "column_norm",
-            "weight_bound": 2.0,
-            "feedback": "learned" if settling == "iterative" else "tied",
+        policy_kwargs={
+            **remembering(7),
+            "n_critics": 2,
+            "circuit_kwargs": {
+                "synaptic_scaling": "column_norm",
+                "weight_bound": 2.0,
+                "feedback": "learned" if settling == "iterative" else "tied",
+            },
         },
     )
     assert not any(p.requires_grad for p in model.policy.parameters())
@@ -517,20 +518,23 @@ def test_discrete_actions_and_images_get_one_clear_line():
     [
         ({"bootstrap": "both"}, "bootstrap='both'"),
         ({"signal_normalizer": "mean"}, "signal_normalizer='mean'"),
-        ({"target_update": "never"}, "target_update='never'"),
+        ({"target_update_interval": 0}, "target_update_interval=0"),
         ({"demonstration_fraction": 1.5}, "demonstration_fraction=1.5"),
         ({"refresh_weight": -1.0}, "refresh_weight=-1.0"),
-        ({"n_critics": 0}, "n_critics=0"),
+        ({"policy_kwargs": {"n_critics": 0}}, "n_critics=0"),
         ({"nudge": 0.0}, "nudge=0.0"),
         ({"actor_warm_start": 10}, "actor_warm_start need demonstrations="),
         ({"n_demonstrations": 3}, "n_demonstrations need demonstrations="),
-        ({"circuit_kwargs": {"settling": "iterative"}}, "settling='iterative' but the agent's is 'scheduled'"),
+        (
+            {"policy_kwargs": {"circuit_kwargs": {"settling": "iterative"}}},
+            "settling='iterative' but the agent's is 'scheduled'",
+        ),
         ({"policy_kwargs": {"net_arch": {"vf": [8]}}}, "unknown keys"),
         ({"replay_buffer_class": HerReplayBuffer, "n_steps": 3}, "n_steps=3 does not work with hindsight"),
         ({"settling": "fast"}, "settling='fast'"),
-        ({"circuit_kwargs": {"activation": "gelu"}}, "activation='gelu'"),
-        ({"circuit_kwargs": {"n_steps": 3}}, "a circuit has no keywords"),
-        ({"critic_kwargs": {"hidden": [8]}}, "critic_kwargs: a circuit has no keywords"),
+        ({"policy_kwargs": {"circuit_kwargs": {"activation": "gelu"}}}, "activation='gelu'"),
+        ({"policy_kwargs": {"circuit_kwargs": {"n_steps": 3}}}, "a circuit has no keywords"),
+        ({"policy_kwargs": {"critic_kwargs": {"hidden": [8]}}}, "critic_kwargs: a circuit has no keywords"),
     ],
 )
 def test_a_wrong_keyword_is_named(keywords, named):
@@ -548,7 +552,9 @@ def test_demonstrations_of_another_task_are_refused():
 # ---------------------------------------------------------------------- saving, determinism
 
 
-@pytest.mark.parametrize("keywords", [{"settling": "iterative"}, {"n_envs": 1}, {"working_memory": True, "n_critics": 2}])
+@pytest.mark.parametrize(
+    "keywords", [{"settling": "iterative"}, {"n_envs": 1}, {"policy_kwargs": {**remembering(7), "n_critics": 2}}]
+)
 def test_save_and_load_predict_the_same_and_training_goes_on(keywords, tmp_path):
     model = make(demonstrations=demonstrations(), **keywords).learn(40)
     model.save(tmp_path / "agent")
@@ -570,8 +576,8 @@ def test_two_seeded_runs_are_bit_identical(settling):
 
 
 def test_learning_rates_of_circuits_and_error_synapses_follow_the_schedule():
-    circuits = {"settling": "iterative", "circuit_kwargs": {"feedback": "learned"}, "actor_kwargs": {"learning_rate": 5e-3}}
-    model = make(learning_rate=lambda left: 1e-3 * left, **circuits)
+    circuits = {"circuit_kwargs": {"feedback": "learned"}, "actor_kwargs": {"learning_rate": 5e-3}}
+    model = make(learning_rate=lambda left: 1e-3 * left, settling="iterative", policy_kwargs=circuits)
     model.learn(30)
     model._current_progress_remaining = 0.5
     model.train(1, 16)
@@ -602,7 +608,7 @@ def test_hindsight_relabels_goals_and_rewards_of_drawn_transitions_but_neither_s
 
 def test_the_memory_of_the_bootstrapped_step_is_the_one_that_the_same_step_has_as_a_first():
     """Returns of three steps: m_{t+3} of row t is m_t of row t + 3, in the replay buffer and in the demonstrations."""
-    model = make(working_memory=True, memory_history=4, n_steps=3, demonstrations=demonstrations(), demonstration_fraction=0.5)
+    model = make(policy_kwargs=remembering(4), n_steps=3, demonstrations=demonstrations(), demonstration_fraction=0.5)
     model.learn(60)
     rows = np.arange(40)
     zeros = np.zeros(len(rows), int)
@@ -619,19 +625,21 @@ def test_the_memory_of_the_bootstrapped_step_is_the_one_that_the_same_step_has_a
 
 
 def test_a_second_learn_cuts_the_episode_it_interrupts():
-    model = make(working_memory=True, memory_history=3, learning_starts=1000)
+    model = make(policy_kwargs=remembering(3), learning_starts=1000)
     model.learn(7)  # stops in the second episode, two steps in
     assert model.replay_buffer.dones[6, 0] == 0
     model.learn(2)  # resets the environment
     assert model.replay_buffer.dones[6, 0] == 1 and model.replay_buffer.timeouts[6, 0] == 1
     _, mask = model.replay_buffer._history_at(np.array([7, 8]), np.zeros(2, int), None)
     assert mask.tolist() == [[0, 0, 0], [0, 0, 1]]
-    assert len(model.replay_buffer._running[0]) == 2
+    assert model.replay_buffer._lengths.tolist() == [2]
 
 
 def test_vec_normalize_relabels_the_task_reward_alone():
     env = VecNormalize(DummyVecEnv([CountingEnv]))
-    model = make(env, demonstrations=demonstrations(), demonstration_fraction=0.25, alpha_ext=1.0, working_memory=True)
+    model = make(
+        env, demonstrations=demonstrations(), demonstration_fraction=0.25, alpha_ext=1.0, policy_kwargs=remembering(7)
+    )
     with pytest.warns(UserWarning, match="statistics drift under the frozen prior"):
         model.learn(60)
     np.random.seed(0)

@@ -69,8 +69,9 @@ def test_n_step_sums_equal_sb3s(n_envs, steps):
 def test_signals_are_summed_over_the_n_step_window_like_rewards():
     buffer = CombinedReplayBuffer(40, *SPACES, n_steps=3, gamma=0.9, device="cpu")
     for step in range(12):
-        fill(buffer, 1, 1, done_every=100)
-        buffer.set_newest_signals(np.array([step]), np.array([-step]))
+        obs, nothing = np.zeros((1, 2)), np.zeros(1)
+        signals = np.array([step]), np.array([-step])
+        buffer.add(obs, obs, np.zeros((1, 1)), nothing, nothing, [{}], score=lambda *transition, found=signals: found)
     batch = buffer._gather(np.array([2, 10]), np.zeros(2, int), None)
     assert np.allclose(batch.epistemic.ravel(), [2 + 0.9 * 3 + 0.81 * 4, 10 + 0.9 * 11])
     assert np.allclose(batch.instrumental, -batch.epistemic)
@@ -98,7 +99,10 @@ def test_an_unknown_buffer_class_is_named():
 
 
 def offer(memory, length, episode_return):
-    return memory.offer(np.full((length, 2), episode_return), np.zeros((length, 1)), episode_return)
+    taken = memory.takes(length, episode_return)
+    if taken:
+        memory.store(np.full((length, 2), episode_return), np.zeros((length, 1)), episode_return)
+    return taken
 
 
 def test_an_episode_enters_when_its_return_is_positive_and_at_least_the_best():

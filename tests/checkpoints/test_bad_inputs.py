@@ -22,6 +22,7 @@ from hypothesis.extra import numpy as hypothesis_numpy
 from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_actpc import ActPC
+from sb3_actpc.actpc.arguments import CIRCUITS
 from sb3_actpc.actpc.policies import CIRCUIT_KEYWORDS, ActPCPolicy
 from sb3_actpc.cli import main
 from sb3_actpc.demonstrations.dataset import Demonstrations
@@ -87,17 +88,27 @@ KEYWORDS = sorted(set(inspect.signature(ActPC.__init__).parameters) - {"self", "
 
 def keyword_values(name: str) -> st.SearchStrategy[Any]:
     """Values for one keyword of the constructor, most of them bad."""
-    if name.endswith("_kwargs") and name not in ("policy_kwargs", "replay_buffer_kwargs"):
-        parts = {key: ARCHITECTURES if key == "net_arch" else CIRCUIT_VALUES for key in OF_ONE_CIRCUIT}
-        return st.one_of(VALUES, st.sampled_from(OF_ONE_CIRCUIT).flatmap(lambda key: st.fixed_dictionaries({key: parts[key]})))
+    if name == "net_arch":
+        return ARCHITECTURES
+    if name in ("circuit_kwargs", *(f"{circuit}_kwargs" for circuit in CIRCUITS)):
+        values = {key: ARCHITECTURES if key == "net_arch" else CIRCUIT_VALUES for key in OF_ONE_CIRCUIT}
+        return st.one_of(
+            VALUES, st.sampled_from(OF_ONE_CIRCUIT).flatmap(lambda key: st.fixed_dictionaries({key: values[key]}))
+        )
     if name == "policy_kwargs":
         keys = st.sampled_from(OF_THE_POLICY)
-        some = keys.flatmap(lambda key: st.fixed_dictionaries({key: ARCHITECTURES if key == "net_arch" else VALUES}))
-        return st.one_of(VALUES, some)
+        return st.one_of(VALUES, keys.flatmap(lambda key: st.fixed_dictionaries({key: keyword_values(key)})))
     if name == "replay_buffer_kwargs":
-        keys = st.sampled_from(["n_sampled_goal", "handle_timeout_termination", "history", "n_steps", "x", "buffer_size"])
+        known = ["combined", "self_imitation_size", "n_sampled_goal", "handle_timeout_termination", "history", "n_steps"]
+        keys = st.sampled_from([*known, "x", "buffer_size"])
         return st.one_of(VALUES, st.dictionaries(keys, SCALARS, min_size=1, max_size=2))
     return VALUES
+
+
+def keys_of(value: Any) -> list[str]:
+    """Those of nested mappings."""
+    parts = value.items() if isinstance(value, dict) else ()
+    return [name for key, part in parts for name in (str(key), *keys_of(part))]
 
 
 def is_long(name: str, value: Any) -> bool:
@@ -115,7 +126,7 @@ def test_the_constructor_names_what_is_wrong(keyword: tuple[str, Any]) -> None:
     if is_long(name, value):
         return
     keywords = {"policy": "MlpPolicy", "env": make_vec_env(CountingEnv), **ACTPC, "demonstrations": demonstrations()}
-    inner = [str(key) for key in value] if isinstance(value, dict) else []
+    inner = keys_of(value)
     try:
         ActPC(**{**keywords, name: value}).learn(14)
     except ValueError as error:

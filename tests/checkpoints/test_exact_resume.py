@@ -57,14 +57,18 @@ def test_actpc(tmp_path: Path, n_envs: int, normalize: bool, stop_at: int) -> No
 @pytest.mark.parametrize(
     "keywords",
     [
-        {"working_memory": True, "memory_history": 3},
+        {"policy_kwargs": {"net_arch": [16, 16], "memory_history": 3}},
         {"buffer_size": 20},
-        {"settling": "iterative", "n_critics": 2, "target_policy_noise": 0.2, "circuit_kwargs": {"feedback": "learned"}},
+        {
+            "settling": "iterative",
+            "policy_kwargs": {"net_arch": [16, 16], "n_critics": 2, "circuit_kwargs": {"feedback": "learned"}},
+            "target_policy_noise": 0.2,
+        },
         {"n_steps": 3, "signal_normalizer": "quantile"},
-        {"n_steps": 4, "working_memory": True, "memory_history": 3},
+        {"n_steps": 4, "policy_kwargs": {"net_arch": [16, 16], "memory_history": 3}},
         {"optimize_memory_usage": True, "replay_buffer_kwargs": {"handle_timeout_termination": False}},
         {"demonstration_fraction": 0.25, "actor_warm_start": 3, "observation_normalization": "demonstrations"},
-        {"target_update": "hard", "target_update_interval": 7, "train_freq": (3, "step"), "gradient_steps": -1},
+        {"tau": 1.0, "target_update_interval": 7, "train_freq": (3, "step"), "gradient_steps": -1},
         {"train_freq": (1, "episode"), "gradient_steps": 2},
         {"action_noise": OrnsteinUhlenbeckActionNoise(np.zeros(2), 0.1 * np.ones(2))},
     ],

@@ -94,5 +94,5 @@ def test_the_command_trains_with_the_shipped_settings(n_envs: int, tmp_path: Pat
     assert result["timesteps"] == 60
     assert result["success_rate"] in (0.0, 1.0)
     recorded = json.loads((tmp_path / "run" / "config.json").read_text())
-    assert (recorded["n_envs"], recorded["settings"]["self_imitation_size"]) == (n_envs, 200_000)
+    assert (recorded["n_envs"], recorded["settings"]["replay_buffer_kwargs"]) == (n_envs, {"self_imitation_size": 200_000})
     assert result["versions"]["robosuite"].startswith("1.5")

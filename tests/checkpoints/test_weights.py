@@ -21,12 +21,15 @@ from tests.actpc.envs import CountingEnv, demonstrations
 from tests.checkpoints.runs import assert_same, make_actpc
 
 KEYWORDS: dict[str, Any] = {
-    "working_memory": True,
-    "n_critics": 2,
     "train_freq": (2, "step"),
     "action_noise": NormalActionNoise(np.zeros(2), 0.1 * np.ones(2)),
-    "policy_kwargs": {"net_arch": {"pi": [8], "qf": [12, 12]}, "optimizer_class": th.optim.SGD},
-    "circuit_kwargs": {"activation": "tanh"},
+    "policy_kwargs": {
+        "net_arch": {"pi": [8], "qf": [12, 12]},
+        "optimizer_class": th.optim.SGD,
+        "memory_history": 7,
+        "n_critics": 2,
+        "circuit_kwargs": {"activation": "tanh"},
+    },
     "learning_rate": lambda progress: 1e-3 * progress,
 }
 
@@ -134,7 +137,7 @@ def test_files_that_do_not_fit_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="VecNormalize"):
         ActPC.from_weights(path, VecNormalize(make_vec_env(CountingEnv)))
     with pytest.raises(ValueError, match="does not fit its own settings"):
-        ActPC.from_weights(path, make_vec_env(CountingEnv), n_critics=2)
+        ActPC.from_weights(path, make_vec_env(CountingEnv), policy_kwargs={"net_arch": [16, 16], "n_critics": 2})
     (tmp_path / "bad.safetensors").write_bytes(path.read_bytes()[:100])
     with pytest.raises(ValueError, match="not a file of save_weights"):
         ActPC.from_weights(tmp_path / "bad.safetensors", make_vec_env(CountingEnv))

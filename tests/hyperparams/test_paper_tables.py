@@ -48,7 +48,8 @@ def look_up(settings: Mapping[str, Any], path: str, algorithm: Any) -> Any:
         return node
     if first == "policy_kwargs":
         policy = next(iter(algorithm.policy_aliases.values()))
-        return inspect.signature(policy.__init__).parameters[rest].default
+        defaults = inspect.signature(policy.__init__).parameters
+        return defaults[rest].default if rest in defaults else UNSET
     return UNSET if rest else inspect.signature(algorithm).parameters[first].default
 
 

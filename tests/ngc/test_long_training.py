@@ -51,7 +51,7 @@ def energies_while_settling(circuit, x, target):
 def test_energy_still_falls_after_20k_updates_on_unnormalised_transitions(transitions, dynamics):
     """A fixed rate of 0.1, fine at the start, blows up here (checked at the end)."""
     circuit = NGCCircuit(23, 17, dynamics=dynamics)
-    optimizer = th.optim.Adam(circuit.parameter_groups(4e-4), **ADAM)
+    circuit.optimizer = th.optim.Adam(circuit.parameter_groups(4e-4), **ADAM)
     for update in range(N_UPDATES + 1):
         o, a, _, n = batch_of(transitions)
         x = th.cat([o, a], dim=1)
@@ -62,7 +62,7 @@ def test_energy_still_falls_after_20k_updates_on_unnormalised_transitions(transi
             print(f"{update} updates: rates {circuit.rates.tolist()}, ||W|| {norms}")
             print(f"    energy {energies[0]:.3f} -> {energies[-1]:.3f}")
             assert all(new <= old for old, new in pairwise(energies))
-        circuit.apply_changes(circuit.hebbian_update(circuit.settle(x, n)), optimizer)
+        circuit.apply_changes(circuit.hebbian_update(circuit.settle(x, n)))
     assert energies[-1] < 0.9 * energies[0]
     circuit._keep_rates = False
     circuit.rates.fill_(0.1)
@@ -90,7 +90,8 @@ def test_the_coupled_pair_follows_the_policy_gradient_at_the_start_and_after_20k
     """Default iterative settings (tied feedback): cosine at least 0.9 in every layer at the start, 0.7 at the end."""
     actor = NGCCircuit(17, 6, output_activation="tanh")
     critic = NGCCircuit(23, 6, n_feedback_inputs=6)
-    optimizers = [th.optim.Adam(circuit.parameter_groups(4e-4), **ADAM) for circuit in (actor, critic)]
+    for circuit in (actor, critic):
+        circuit.optimizer = th.optim.Adam(circuit.parameter_groups(4e-4), **ADAM)
     for update in range(N_UPDATES + 1):
         o, a, r, n = batch_of(transitions)
         if update % 5000 == 0:
@@ -98,7 +99,7 @@ def test_the_coupled_pair_follows_the_policy_gradient_at_the_start_and_after_20k
             print(f"{update} updates: cosine {np.round(cosines, 3)}, norm ratio {np.round(ratios, 3)}")
             assert min(cosines) > (0.9 if update == 0 else 0.7)
         changes = actor.hebbian_update(settle_coupled(actor, critic, o).actor)
-        actor.apply_changes(changes, optimizers[0])
+        actor.apply_changes(changes)
         target = r + 0.9 * critic.project(th.cat([n, actor.project(n)], dim=1))
         state = critic.settle(th.cat([o, a], dim=1), target)
-        critic.apply_changes(critic.hebbian_update(state), optimizers[1])
+        critic.apply_changes(critic.hebbian_update(state))

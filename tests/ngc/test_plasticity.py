@@ -13,24 +13,26 @@ def teacher_batch(n=128):
 
 
 def train(circuit, optimizer, n_updates, batch=teacher_batch):
+    circuit.optimizer = optimizer
     for _ in range(n_updates):
-        circuit.apply_changes(circuit.hebbian_update(circuit.settle(*batch())), optimizer)
+        circuit.apply_changes(circuit.hebbian_update(circuit.settle(*batch())))
 
 
 def apply_nothing(circuit, memory=None):
     """Changes of zero, at a learning rate of 0.1: what is left is what the circuit does on its own."""
     changes = circuit.hebbian_update(circuit.settle(*teacher_batch(), memory=memory))
     th._foreach_zero_(changes.tensors())
-    circuit.apply_changes(changes, th.optim.SGD(circuit.parameter_groups(0.1)))
+    circuit.optimizer = th.optim.SGD(circuit.parameter_groups(0.1))
+    circuit.apply_changes(changes)
 
 
 def test_plain_sgd_adds_the_change():
     circuit = NGCCircuit(8, 3, (16, 16), feedback="learned")
-    optimizer = th.optim.SGD(circuit.parameter_groups(0.1))
+    circuit.optimizer = th.optim.SGD(circuit.parameter_groups(0.1))
     before = [p.clone() for p in (*circuit.weights, *circuit.biases)]
     error_synapses = [p.clone() for p in circuit.feedback_weights]
     changes = circuit.hebbian_update(circuit.settle(*teacher_batch()))
-    circuit.apply_changes(changes, optimizer)
+    circuit.apply_changes(changes)
     for old, new, change in zip(before, (*circuit.weights, *circuit.biases), changes.tensors(), strict=True):
         assert change.abs().max() > 0 and th.allclose(new, old + 0.1 * change, atol=1e-7)
     for old, new, change in zip(error_synapses, circuit.feedback_weights, changes.weights[1:], strict=True):
@@ -171,10 +173,10 @@ def test_auto_rates_follow_the_spectral_norms():
 
 def test_working_memory_changes_its_own_synapses_and_the_output():
     circuit = NGCCircuit(8, 3, (16, 16), n_memory=6)
-    optimizer = th.optim.SGD(circuit.parameter_groups(0.1))
+    circuit.optimizer = th.optim.SGD(circuit.parameter_groups(0.1))
     (x, target), memory = teacher_batch(), th.randn(128, 6)
     before = [m.clone() for m in circuit.memory_weights]
-    circuit.apply_changes(circuit.hebbian_update(circuit.settle(x, target, memory)), optimizer)
+    circuit.apply_changes(circuit.hebbian_update(circuit.settle(x, target, memory)))
     assert all((m - b).norm() > 1e-4 for m, b in zip(circuit.memory_weights, before, strict=True))
     assert not th.allclose(circuit.project(x, memory), circuit.project(x, 2 * memory))
     circuit.memory_weight = 0.0

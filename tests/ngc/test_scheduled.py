@@ -68,9 +68,9 @@ def test_the_actor_change_raises_the_action_values():
     """The paper prints -1/A for the clamped error; with changes that are added that would lower Q."""
     for keywords in ({"settling": "scheduled"}, {}):
         actor, critic, x = make_pair(**keywords)
-        optimizer = th.optim.SGD(actor.parameter_groups(0.5))
+        actor.optimizer = th.optim.SGD(actor.parameter_groups(0.5))
         before = settle_coupled(actor, critic, x)
-        actor.apply_changes(actor.hebbian_update(before.actor), optimizer)
+        actor.apply_changes(actor.hebbian_update(before.actor))
         assert settle_coupled(actor, critic, x).action_values.mean() > before.action_values.mean() + 1e-4
 
 
