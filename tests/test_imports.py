@@ -111,6 +111,19 @@ def test_demonstrations_know_neither_torch_nor_the_agent(forbidden: str) -> None
     assert [entry for entry in imports_in("sb3_actpc.demonstrations") if is_within(entry.target, forbidden)] == []
 
 
+@pytest.mark.parametrize("forbidden", ["actpc", "baselines", "demonstrations", "experiments", "ngc", "ActPC"])
+def test_checkpoints_know_no_class_of_an_algorithm(forbidden: str) -> None:
+    assert [entry for entry in imports_in("sb3_actpc.checkpoints") if is_within(entry.target, f"sb3_actpc.{forbidden}")] == []
+
+
+def test_what_a_package_keeps_to_itself_is_imported_by_no_other() -> None:
+    def package(name: str) -> list[str]:
+        return name.split(".")[:2]
+
+    private = [entry for entry in IMPORTS if entry.target.startswith("sb3_actpc.") and "._" in entry.target.replace("__", "")]
+    assert [entry for entry in private if package(entry.module) != package(entry.target)] == []
+
+
 @pytest.mark.parametrize("package", ["sb3_actpc.actpc", "sb3_actpc.ngc"])
 def test_the_agent_does_not_import_the_training_runs(package: str) -> None:
     assert [entry for entry in imports_in(package) if is_within(entry.target, "sb3_actpc.experiments.runs")] == []

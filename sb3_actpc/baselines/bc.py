@@ -11,10 +11,9 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv
 from torch import nn
 
-from sb3_actpc.actpc.self_imitation import Episodes
 from sb3_actpc.baselines.bc_policies import BCPolicy, BCRNNPolicy, CloningPolicy
 from sb3_actpc.baselines.offline_algorithm import OfflineAlgorithm
-from sb3_actpc.demonstrations.dataset import Demonstrations
+from sb3_actpc.demonstrations import Demonstrations, scaled_actions
 from sb3_actpc.utils.checks import check_kinds, check_range
 
 
@@ -67,7 +66,7 @@ class BC(OfflineAlgorithm):
 
     def _take(self, shown: Demonstrations) -> None:
         assert isinstance(self.action_space, spaces.Box)
-        actions = Episodes.from_demonstrations(shown, self.observation_space, self.action_space).actions
+        actions = scaled_actions(shown, self.action_space)
         rows = th.as_tensor(shown.observations, device=self.device)
         self.policy.fit_normalization(rows)
         self._observations, self._actions = self.policy.normalized(rows), th.as_tensor(actions, device=self.device)

@@ -18,13 +18,12 @@ from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
-from sb3_actpc.actpc.self_imitation import Episodes
 from sb3_actpc.baselines.bc_policies import LARGEST_INPUT, SMALLEST_SPREAD
 from sb3_actpc.baselines.offline.installation import environment_python
 from sb3_actpc.baselines.offline.process import ServerProcess
 from sb3_actpc.baselines.offline.servers.frames import Arrays
 from sb3_actpc.baselines.offline_algorithm import OfflineAlgorithm
-from sb3_actpc.demonstrations.dataset import Demonstrations
+from sb3_actpc.demonstrations import Demonstrations, scaled_actions
 from sb3_actpc.utils.checks import check_kinds, check_range
 
 SERVERS = Path(__file__).resolve().parent / "servers"
@@ -151,11 +150,10 @@ class ServedAlgorithm(OfflineAlgorithm):
             spread = np.maximum(shown.observations.std(axis=0), SMALLEST_SPREAD)
             self.normalization = th.from_numpy(np.stack([shown.observations.mean(axis=0), spread]))
         bounds = shown.episode_bounds
-        actions = Episodes.from_demonstrations(shown, self.observation_space, self.action_space).actions
         self._shown = {
             "observations": shown.observations,
             "next_observations": shown.next_observations,
-            "actions": actions.astype(np.float32),
+            "actions": scaled_actions(shown, self.action_space),
             "rewards": shown.rewards,
             "terminations": shown.terminations,
             "last_rows": np.repeat(bounds[:, 1] - 1, bounds[:, 1] - bounds[:, 0]),
