@@ -2,20 +2,18 @@
 
 import argparse
 import shlex
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-from sb3_actpc.envs import ROBOSUITE_IDS, SPARSE_IDS
+from sb3_actpc.envs import ROBOSUITE_IDS
 
 if TYPE_CHECKING:
-    from sb3_actpc.demonstrations.dataset import Demonstrations
+    from sb3_actpc.demonstrations import Demonstrations
 
 Subparsers = Any  # argparse's own type is private
 
 HDF5_SUFFIXES = (".hdf5", ".h5")
-MIXED = "mixed"
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -35,35 +33,44 @@ def add_parser(subparsers: Subparsers) -> None:
 def _add_collect(commands: Subparsers) -> None:
     collect = commands.add_parser(
         "collect",
-        help="record an expert's successful episodes of a sparse task",
-        description="MuJoCo tasks: train an expert on the dense task and record its successful episodes of the sparse one. "
-        "A stopped training goes on from its newest checkpoint when the same command is given again. "
-        "Robosuite tasks: record scripted operators (--expert scripted).",
+        help="record a demonstrator's episodes",
+        description="Train a demonstrator (a sparse MuJoCo task by its dense base task, any other by its own rewards) and "
+        "record its successful episodes. A finished training is not repeated, a stopped one of sac or td3 goes on. Robosuite "
+        "tasks: record scripted demonstrators.",
     )
-    collect.add_argument("--env", required=True, metavar="ID", help=f"one of {', '.join(SPARSE_IDS)}")
+    collect.add_argument("--env", required=True, metavar="ID", help="Gymnasium id, such as SparseHopper-v5")
     collect.add_argument(
-        "--expert", metavar="{trained,scripted}", help="who demonstrates (default: scripted for robosuite tasks, else trained)"
+        "--demonstrator",
+        choices=["trained", "scripted"],
+        help="who demonstrates (default: scripted for robosuite tasks, else trained)",
     )
-    collect.add_argument(
-        "--proficiency",
-        metavar="P",
-        help="of scripted operators, from 0 to 1, or 'mixed' for six operators of three levels (default: 1)",
-    )
-    collect.add_argument("--obs", metavar="LAYOUT", help="of a robosuite task, paper or robomimic (default: paper)")
-    collect.add_argument("--algo", default="ppo", metavar="{ppo,td3,sac}", help="the expert's algorithm (default: ppo)")
-    collect.add_argument("--steps", type=int, help="the expert's training steps (default: 2000 full episodes)")
-    collect.add_argument("--target-return", type=float, help="stop training at this mean dense return (default: never)")
-    collect.add_argument(
-        "--episodes", type=int, help="successful episodes to record (default: 20; scripted 50, or 6 times 50 when mixed)"
-    )
+    collect.add_argument("--episodes", type=int, help="episodes to record (default: 20; scripted 50, or 300 when mixed)")
     collect.add_argument("--max-tries", type=int, help="episodes to play at most (default: ten times --episodes)")
-    collect.add_argument("--output", type=Path, metavar="FILE", help="file to write (default: sparse_<task>.npz)")
-    collect.add_argument("--seed", type=int, default=0, help="seed of the expert and of the recording (default: 0)")
     collect.add_argument(
-        "--work-dir", type=Path, metavar="DIR", help="the expert's checkpoints (default: experts/<task>_<algo>_<seed>)"
+        "--mixed",
+        action="store_true",
+        help="several demonstrators in turn: a trained one and itself when it stood at half the return, or six scripted ones "
+        "of three proficiencies",
     )
-    collect.add_argument("--save-every", type=int, default=50_000, help="steps between two checkpoints (default: 50000)")
-    collect.add_argument("--n-envs", type=int, default=1, help="parallel environments of the training (default: 1)")
+    collect.add_argument("--seed", type=int, default=0, help="of the demonstrator and of the recording (default: 0)")
+    collect.add_argument("--output", type=Path, metavar="FILE", help="file to write (default: sparse_<task>.npz)")
+    trained = collect.add_argument_group("trained demonstrators")
+    trained.add_argument("--algo", default="ppo", metavar="{ppo,sac,td3,trpo}", help="algorithm (default: ppo)")
+    trained.add_argument("--steps", type=float, help="training steps (default: 2000 full episodes)")
+    trained.add_argument("--target-return", type=float, help="stop training at this mean dense return (default: never)")
+    trained.add_argument(
+        "--quality", type=float, help="stop training at this share of the dense return of the package's demonstrations"
+    )
+    trained.add_argument("--stochastic", action="store_true", help="sample the actions, not the most likely ones")
+    trained.add_argument(
+        "--work-dir", type=Path, metavar="DIR", help="folder of the training run (default: demonstrators/<task>_<algo>_<seed>)"
+    )
+    trained.add_argument("--save-every", type=int, default=50_000, help="steps between two evaluations (default: 50000)")
+    trained.add_argument("--n-envs", type=int, default=1, help="parallel environments of the training (default: 1)")
+    trained.add_argument("--gym-packages", nargs="+", default=[], metavar="MODULE", help="modules that register the task")
+    scripted = collect.add_argument_group("scripted demonstrators")
+    scripted.add_argument("--proficiency", type=float, metavar="P", help="from 0 (clumsy) to 1 (sure, the default)")
+    scripted.add_argument("--obs", metavar="LAYOUT", help="of the task, paper or robomimic (default: paper)")
 
 
 def _add_convert(commands: Subparsers) -> None:
@@ -100,7 +107,7 @@ def run(args: argparse.Namespace) -> int:
     """Run the sub-command chosen by the arguments of :func:`add_parser`.
 
     :return: the exit code, 0
-    :raises ValueError: for an unknown task, algorithm or expert, an expert that does not succeed often enough, or a bad file
+    :raises ValueError: for a wrong option, a demonstrator that does not succeed often enough, or a bad file
     :raises FileNotFoundError: if the file to look at or convert does not exist
     :raises OSError: if a file cannot be fetched
     :raises ImportError: if robosuite or h5py is needed and not installed
@@ -115,15 +122,24 @@ def _report(line: str) -> None:
 
 def _collect(args: argparse.Namespace) -> int:
     """Record and save."""
-    expert = args.expert or ("scripted" if args.env in ROBOSUITE_IDS else "trained")
-    if expert not in ("trained", "scripted"):
-        raise ValueError(f"--expert {expert} is unknown: choose trained or scripted")
-    if expert == "trained" and (args.proficiency is not None or args.obs is not None):
-        raise ValueError("--proficiency and --obs are for scripted operators of robosuite tasks: leave them out")
-    output = args.output or Path(args.env.split("-")[0].lower().replace("sparse", "sparse_") + ".npz")
-    demonstrations = _collect_scripted(args) if expert == "scripted" else _collect_trained(args)
+    demonstrator = args.demonstrator or ("scripted" if args.env in ROBOSUITE_IDS else "trained")
+    if demonstrator == "trained" and (args.proficiency is not None or args.obs is not None):
+        raise ValueError("--proficiency and --obs are for scripted demonstrators of robosuite tasks: leave them out")
+    if demonstrator == "scripted" and (args.stochastic or args.quality is not None or args.target_return is not None):
+        raise ValueError("--stochastic, --quality and --target-return are for trained demonstrators: give --proficiency")
+    output = args.output or _default_output(args.env)
+    demonstrations = _collect_scripted(args) if demonstrator == "scripted" else _collect_trained(args)
+    return _save(demonstrations, output)
+
+
+def _default_output(env_id: str, suffix: str = "") -> Path:
+    name = env_id.rpartition(":")[2].split("-v")[0].lower().replace("/", "_")
+    return Path(f"{name.replace('sparse', 'sparse_', 1)}{suffix}.npz")
+
+
+def _save(demonstrations: "Demonstrations", output: Path) -> int:
     demonstrations.save(output)
-    _report_returns(demonstrations)
+    _report(repr(demonstrations))
     _report(f"wrote {output} ({output.stat().st_size / 1e6:.2f} MB)")
     return 0
 
@@ -131,70 +147,82 @@ def _collect(args: argparse.Namespace) -> int:
 def _collect_scripted(args: argparse.Namespace) -> "Demonstrations":
     from sb3_actpc.demonstrations import MIXED_DEMONSTRATORS, collect_scripted
 
-    proficiency = _proficiency(args.proficiency)
-    n_episodes = args.episodes or (50 * len(MIXED_DEMONSTRATORS) if proficiency == MIXED else 50)
-    words = {"env": args.env, "expert": "scripted", "proficiency": proficiency, "obs": args.obs, "episodes": n_episodes}
-    metadata = {"command": _command({**words, "max_tries": args.max_tries, "seed": args.seed})}
-    _report(f"scripted operators of proficiency {proficiency} in {args.env}")
+    if args.mixed and args.proficiency is not None:
+        raise ValueError(f"--proficiency {args.proficiency} and --mixed, which has six of them: give one of the two")
+    proficiency = 1.0 if args.proficiency is None else args.proficiency
+    n_episodes = args.episodes or 50 * (len(MIXED_DEMONSTRATORS) if args.mixed else 1)
+    _report(f"scripted demonstrators{' of three levels' if args.mixed else f' of proficiency {proficiency}'} in {args.env}")
+    options = ("env", "demonstrator", "proficiency", "mixed", "obs", "episodes", "max_tries", "seed")
     return collect_scripted(
-        args.env, proficiency, n_episodes, args.seed, args.max_tries, metadata, _report, obs=args.obs or "paper"
+        args.env,
+        "mixed" if args.mixed else proficiency,
+        n_episodes,
+        args.seed,
+        args.max_tries,
+        {"command": command_line(args, options)},
+        _report,
+        obs=args.obs or "paper",
     )
-
-
-def _proficiency(text: str | None) -> float | str:
-    if text == MIXED:
-        return MIXED
-    try:
-        return 1.0 if text is None else float(text)
-    except ValueError:
-        raise ValueError(f"--proficiency {text} must be a number from 0 (clumsy) to 1 (sure), or {MIXED}") from None
 
 
 def _collect_trained(args: argparse.Namespace) -> "Demonstrations":
     """Train and roll out."""
-    from sb3_actpc.demonstrations.experts import ExpertTraining, collect_demonstrations, default_expert_steps, train_expert
+    from sb3_actpc.experiments import demonstrators
 
+    target = args.target_return
+    if args.quality is not None:
+        if target is not None:
+            raise ValueError(f"--quality {args.quality} and --target-return {target} both say when to stop: give one")
+        target = demonstrators.share_of(demonstrators.reference_return(args.env), args.quality)
+    if args.stochastic and args.algo == "td3":
+        raise ValueError("--stochastic: the policy of td3 has nothing to sample: choose ppo, sac or trpo")
+    options = {"seed": args.seed, "n_envs": args.n_envs, "eval_freq": args.save_every, "progress": False}
+    run = demonstrators.demonstrator_run(args.env, args.algo, args.steps, target, args.gym_packages, **options)
+    folder = args.work_dir or Path("demonstrators") / f"{run.env.replace('/', '_')}_{args.algo}_{args.seed}"
+    _report(f"demonstrator: {args.algo} on {run.env} for {run.n_timesteps} steps at most, in {folder}")
+    if args.mixed:
+        trained = demonstrators.train_mixed(run, folder, _report)
+    else:
+        trained = [demonstrators.train_demonstrator(run, folder, _report)]
+    for one in trained:
+        _report(f"demonstrator of {one.n_steps} steps: mean dense return {one.mean_return:.1f}")
+    words = ("env", "algo", "steps", "target_return", "quality", "stochastic", "mixed", "episodes", "max_tries", "seed")
+    metadata = {"command": command_line(args, (*words, "save_every", "n_envs", "gym_packages")), "algorithm": args.algo}
     n_episodes = 20 if args.episodes is None else args.episodes
-    training = ExpertTraining(args.env, args.algo, args.seed, args.n_envs)
-    n_steps = default_expert_steps(args.env) if args.steps is None else args.steps
-    work_dir = args.work_dir or Path("experts") / f"{training.dense_id}_{args.algo}_{args.seed}"
-    _report(f"expert: {args.algo} on {training.dense_id} for {n_steps} steps; checkpoints in {work_dir}")
-    expert = train_expert(training, n_steps, work_dir, args.save_every, args.target_return, _report)
-    _report(f"expert of {expert.n_steps} steps: mean dense return {expert.mean_return:.1f}")
-    metadata = {"command": command_line(args), "algorithm": args.algo}
-    return collect_demonstrations(expert, args.env, n_episodes, args.seed, args.max_tries, metadata, _report)
+    return demonstrators.record_demonstrators(
+        trained, args.env, n_episodes, args.stochastic, args.seed, args.max_tries, metadata, _report
+    )
 
 
-def command_line(args: argparse.Namespace) -> str:
-    """The command that repeats a collection from a trained expert, without the paths of the machine it ran on."""
-    options = ("env", "algo", "steps", "target_return", "episodes", "max_tries", "seed", "save_every", "n_envs")
-    return _command({option: getattr(args, option) for option in options})
-
-
-def _command(options: dict[str, Any]) -> str:
+def command_line(args: argparse.Namespace, options: Sequence[str]) -> str:
+    """
+    :param args: of ``demos collect``
+    :param options: names of those that matter
+    :return: the command that repeats it, without the paths of the machine it ran on
+    """
     words = ["sb3-actpc", "demos", "collect"]
-    for option, value in options.items():
-        if value is not None:
-            words += ["--" + option.replace("_", "-"), str(value)]
+    for option in options:
+        value = getattr(args, option)
+        if value is True:
+            words.append("--" + option)
+        elif value is not None and value is not False and value != []:
+            values = value if isinstance(value, list) else [f"{value:g}" if option == "steps" else value]
+            words += ["--" + option.replace("_", "-"), *map(str, values)]
     return shlex.join(words)
 
 
 def _convert(args: argparse.Namespace) -> int:
     """Between .npz and HDF5."""
-    from sb3_actpc.demonstrations import write_robomimic
-    from sb3_actpc.demonstrations.dataset import Demonstrations
+    from sb3_actpc.demonstrations import Demonstrations, write_robomimic
 
-    if args.file.suffix == ".npz":
-        output = args.output or args.file.with_suffix(".hdf5")
-        if output.suffix not in HDF5_SUFFIXES:
-            raise ValueError(f"--output {output} must end in {' or '.join(HDF5_SUFFIXES)}: it will be a robomimic file")
-        demonstrations = Demonstrations.load(args.file)
-        write_robomimic(demonstrations, output)
-    else:
-        output = args.output or args.file.with_suffix(".npz")
-        demonstrations = _read_hdf5(args)
-        demonstrations.save(output)
-    _report_size(demonstrations)
+    if args.file.suffix != ".npz":
+        return _save(_read_hdf5(args), args.output or args.file.with_suffix(".npz"))
+    output = args.output or args.file.with_suffix(".hdf5")
+    if output.suffix not in HDF5_SUFFIXES:
+        raise ValueError(f"--output {output} must end in {' or '.join(HDF5_SUFFIXES)}: it will be a robomimic file")
+    demonstrations = Demonstrations.load(args.file)
+    write_robomimic(demonstrations, output)
+    _report(repr(demonstrations))
     _report(f"wrote {output} ({output.stat().st_size / 1e6:.2f} MB)")
     return 0
 
@@ -219,36 +247,24 @@ def _download(args: argparse.Namespace) -> int:
     from sb3_actpc.demonstrations.download import download_robomimic, robomimic_url
 
     url = args.url or robomimic_url(args.env, args.kind)
-    output = args.output or Path(f"{args.env.split('-')[0].lower().replace('sparse', 'sparse_')}_{args.kind}.npz")
-    demonstrations = download_robomimic(args.env, output.with_suffix(".hdf5"), url, args.obs, _report)
-    demonstrations.save(output)
-    _report_size(demonstrations)
-    _report(f"wrote {output} ({output.stat().st_size / 1e6:.2f} MB)")
-    return 0
+    output = args.output or _default_output(args.env, f"_{args.kind}")
+    return _save(download_robomimic(args.env, output.with_suffix(".hdf5"), url, args.obs, _report), output)
 
 
 def _info(args: argparse.Namespace) -> int:
     """Print what a file holds."""
-    from sb3_actpc.demonstrations.dataset import Demonstrations
+    from sb3_actpc.demonstrations import Demonstrations
 
     if not args.file.is_file():
         raise FileNotFoundError(f"no demonstration file {args.file}: make one with `sb3-actpc demos collect`")
     demonstrations = Demonstrations.load(args.file)
     _report(f"env: {demonstrations.env_id}")
-    _report_size(demonstrations)
+    _report(f"episodes: {demonstrations.n_episodes}")
+    _report(f"transitions: {len(demonstrations)}")
     _report(f"observations: {demonstrations.observations.shape[1:]}, actions: {demonstrations.actions.shape[1:]}")
-    _report_returns(demonstrations)
+    for name, returns in (("sparse", demonstrations.episode_returns), ("dense", demonstrations.dense_returns)):
+        if returns is not None:
+            _report(f"{name} return: mean {returns.mean():.1f}, min {returns.min():.1f}, max {returns.max():.1f}")
     for key, value in demonstrations.metadata.items():
         _report(f"{key}: {value}")
     return 0
-
-
-def _report_size(demonstrations: "Demonstrations") -> None:
-    _report(f"episodes: {demonstrations.n_episodes}")
-    _report(f"transitions: {len(demonstrations.rewards)}")
-
-
-def _report_returns(demonstrations: "Demonstrations") -> None:
-    for name, returns in (("sparse", demonstrations.episode_returns), ("dense", demonstrations.dense_returns)):
-        if returns is not None:
-            _report(f"{name} return: mean {np.mean(returns):.1f}, min {np.min(returns):.1f}, max {np.max(returns):.1f}")

@@ -1,0 +1,174 @@
+"""Demonstrators of the sparse tasks: runs on the dense task, the best agent of which is then recorded in the sparse one.
+
+So were those of Ororbia & Mali (arXiv 2209.09174): PPO, trained for 2000 episodes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+from stable_baselines3.common.utils import set_random_seed
+
+from sb3_actpc.demonstrations import Demonstrations, shipped_demonstrations
+from sb3_actpc.demonstrations.recording import Report, silent
+from sb3_actpc.envs import ROBOSUITE_IDS, SPARSE_MUJOCO_IDS, dense_env_id, sparse_env_id
+from sb3_actpc.experiments.runs.environments import check_env_id
+from sb3_actpc.experiments.runs.evaluation import Predictor
+from sb3_actpc.experiments.runs.run import finish_run, load_run
+from sb3_actpc.experiments.runs.schema import Run
+
+DEMONSTRATOR_ALGORITHMS = ("ppo", "sac", "td3", "trpo")
+N_TRAINING_EPISODES = 2000  # of the paper's demonstrators
+N_EVALUATION_EPISODES = 10  # enough to notice a policy that falls over now and then
+EARLIER = 0.5  # share of the return at which the weaker half of a mixed set stood
+
+
+@dataclass(frozen=True)
+class Demonstrator:
+    """A trained agent.
+
+    :param policy: has SB3's ``predict``, for raw observations
+    :param n_steps: environment steps it was trained for
+    :param mean_return: mean dense return of its deterministic policy
+    """
+
+    policy: Predictor
+    n_steps: int
+    mean_return: float
+
+
+def demonstrator_run(
+    env_id: str,
+    algo: str = "ppo",
+    n_timesteps: int | None = None,
+    target_return: float | None = None,
+    gym_packages: Sequence[str] = (),
+    **options: Any,
+) -> Run:
+    """The run that trains a demonstrator, with the settings of ``hyperparams/<algo>_demonstrator.yml``.
+
+    :param env_id: Gymnasium id of the task to demonstrate. A sparse MuJoCo task is learned by its dense base task, any other
+        by its own rewards
+    :param algo: one of ``DEMONSTRATOR_ALGORITHMS``
+    :param n_timesteps: environment steps; None for 2000 full episodes
+    :param target_return: stop at the first evaluation whose mean dense return reaches it, None for never
+    :param gym_packages: modules that register the environment
+    :param options: further fields of a :class:`~sb3_actpc.experiments.runs.schema.Run`
+    :return: the run
+    :raises ValueError: for an unknown algorithm, a task of robosuite, or one without a time limit and ``n_timesteps``
+    :raises gymnasium.error.Error: when the environment is unknown
+    """
+    if algo not in DEMONSTRATOR_ALGORITHMS:
+        raise ValueError(f"algo={algo!r} is not one of {', '.join(DEMONSTRATOR_ALGORITHMS)}: choose one of these")
+    if env_id in ROBOSUITE_IDS:
+        raise ValueError(f"env_id={env_id!r} has no dense reward to learn by: use its scripted demonstrators")
+    learned_id = dense_env_id(sparse_env_id(env_id)) if sparse_env_id(env_id) in SPARSE_MUJOCO_IDS else env_id
+    if n_timesteps is None:
+        check_env_id(learned_id, gym_packages)
+        limit = gym.spec(learned_id).max_episode_steps
+        if limit is None:
+            raise ValueError(f"{learned_id} has no time limit: say with --steps how long to train")
+        n_timesteps = N_TRAINING_EPISODES * limit
+    return Run(
+        env=learned_id,
+        algo=algo,
+        preset=f"{algo}_demonstrator",
+        n_timesteps=n_timesteps,
+        target_return=target_return,
+        demonstrations="none",
+        keep="best",
+        eval_episodes=N_EVALUATION_EPISODES,
+        gym_packages=tuple(gym_packages),
+        **options,
+    )
+
+
+def train_demonstrator(run: Run, folder: Path, report: Report = silent) -> Demonstrator:
+    """Train a demonstrator, go on with a training that was stopped, or take the one that is there.
+
+    :param run: see :func:`demonstrator_run`
+    :param folder: run folder
+    :param report: takes lines of progress
+    :return: the agent of the best evaluation
+    :raises ValueError: if the folder holds another run, or a setting is wrong
+    """
+    result = finish_run(run.model_copy(update={"output": str(folder)}), report)
+    return Demonstrator(load_run(folder)[1], result["timesteps"], result["dense_return"])
+
+
+def train_mixed(run: Run, folder: Path, report: Report = silent) -> list[Demonstrator]:
+    """A demonstrator, and one as it was earlier: trained alike, but stopped at half the return.
+
+    :param run: see :func:`demonstrator_run`
+    :param folder: run folder of the first; that of the second has ``_earlier`` at its end
+    :param report: takes lines of progress
+    :return: both
+    :raises ValueError: as :func:`train_demonstrator`
+    """
+    final = train_demonstrator(run, folder, report)
+    early_run = run.model_copy(update={"target_return": share_of(final.mean_return, EARLIER)})
+    return [final, train_demonstrator(early_run, folder.with_name(f"{folder.name}_earlier"), report)]
+
+
+def share_of(reference: float, share: float) -> float:
+    """
+    :param reference: a mean return
+    :param share: between 0 and 1
+    :return: the return of a demonstrator of that quality: the share of a positive one, that many times a negative one's loss
+    :raises ValueError: for a share out of range
+    """
+    if not 0.0 < share <= 1.0:
+        raise ValueError(f"quality={share} must be above 0 and at most 1: a share of the reference return")
+    return reference * share if reference >= 0.0 else reference / share
+
+
+def reference_return(env_id: str) -> float:
+    """Mean dense return of the demonstrations that come with the package.
+
+    :param env_id: a sparse MuJoCo task, for example ``"SparseHopper-v5"``
+    :raises FileNotFoundError: when there are none
+    """
+    try:
+        returns = Demonstrations.load(shipped_demonstrations(sparse_env_id(env_id))).dense_returns
+    except FileNotFoundError:
+        returns = None
+    if returns is None:
+        raise FileNotFoundError(f"no reference return of {env_id} comes with the package: give --target-return, not --quality")
+    return float(returns.mean())
+
+
+def record_demonstrators(
+    demonstrators: Sequence[Demonstrator],
+    env_id: str,
+    n_episodes: int = 20,
+    stochastic: bool = False,
+    seed: int = 0,
+    max_tries: int | None = None,
+    metadata: dict[str, Any] | None = None,
+    report: Report = silent,
+) -> Demonstrations:
+    """Record demonstrators, who take turns, in the task itself.
+
+    :param demonstrators: at least one
+    :param env_id: Gymnasium id of the task
+    :param n_episodes: successful episodes wanted
+    :param stochastic: sample the actions instead of taking the most likely ones
+    :param seed: of the sampling; try number i is reset with the seed ``seed + i``
+    :param max_tries: episodes played at most, None for ``10 * n_episodes``
+    :param metadata: JSON values to keep with the demonstrations
+    :param report: takes one line of progress per kept episode
+    :return: the demonstrations
+    :raises ValueError: if fewer than ``n_episodes`` of ``max_tries`` episodes succeed, or ``n_episodes`` is below 1
+    """
+    set_random_seed(seed)
+    kept = {
+        "demonstrator_steps": [one.n_steps for one in demonstrators],
+        "demonstrator_returns": [one.mean_return for one in demonstrators],
+        **(metadata or {}),
+    }
+    policies = [one.policy for one in demonstrators]
+    return Demonstrations.record(policies, env_id, n_episodes, None, not stochastic, seed, max_tries, kept, report)

@@ -1,0 +1,239 @@
+"""Demonstrators are runs on the dense task; what is recorded of them is what was asked for."""
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from sb3_actpc.cli import demos
+from sb3_actpc.demonstrations import Demonstrations, shipped_demonstrations
+from sb3_actpc.envs import SPARSE_MUJOCO_IDS
+from sb3_actpc.experiments import demonstrators
+from sb3_actpc.experiments.demonstrators import (
+    DEMONSTRATOR_ALGORITHMS,
+    Demonstrator,
+    demonstrator_run,
+    record_demonstrators,
+    reference_return,
+    share_of,
+    train_demonstrator,
+    train_mixed,
+)
+from sb3_actpc.experiments.runs.presets import resolve
+from sb3_actpc.experiments.runs.schema import Run
+
+FEW: dict[str, dict[str, Any]] = {
+    "ppo": {"n_steps": 64, "batch_size": 64, "n_epochs": 1},
+    "trpo": {"n_steps": 64, "batch_size": 64, "n_critic_updates": 1},
+    "sac": {"learning_starts": 50, "batch_size": 8},
+    "td3": {"learning_starts": 50, "batch_size": 8},
+}
+
+
+def run_demos(*words: str) -> int:
+    parser = argparse.ArgumentParser()
+    demos.add_parser(parser.add_subparsers(dest="command", required=True))
+    return demos.run(parser.parse_args(["demos", *words]))
+
+
+def short_run(algo: str = "ppo", n_timesteps: int = 128, **options: Any) -> Run:
+    return demonstrator_run(
+        "SparseReacher-v5", algo, n_timesteps, settings=FEW[algo], eval_freq=64, progress=False, **{"seed": 1, **options}
+    )
+
+
+class Reaching:
+    """Stands in for a trained agent: turns the Reacher's arm towards its target, and notes what it is asked for."""
+
+    def __init__(self) -> None:
+        self.deterministic: list[bool] = []
+
+    def predict(
+        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = False
+    ) -> tuple[np.ndarray, None]:
+        self.deterministic.append(deterministic)
+        cos, sin, _, velocity, offset = np.split(observation, [2, 4, 6, 8])
+        first, elbow = np.arctan2(sin, cos)
+        ends = np.array([[-0.1 * np.sin(first), 0.1 * np.cos(first)], [0.0, 0.0]])
+        ends[1] = 0.11 * np.array([-np.sin(first + elbow), np.cos(first + elbow)])
+        jacobian = np.stack([ends[0] + ends[1], ends[1]], axis=1)
+        return np.clip(-20.0 * jacobian.T @ offset[:2] - 0.05 * velocity, -1.0, 1.0).astype(np.float32), None
+
+
+@pytest.mark.parametrize("algo", DEMONSTRATOR_ALGORITHMS)
+def test_every_task_is_learned_by_its_dense_base_task(algo: str) -> None:
+    for env_id in SPARSE_MUJOCO_IDS:
+        run = resolve(demonstrator_run(env_id, algo))
+        assert run.env == env_id.removeprefix("Sparse") and run.policy == "MlpPolicy"
+        assert (run.normalize is not None) is (algo in ("ppo", "trpo")), "the others are tuned without"
+        assert run.demonstrations == "none"
+
+
+def test_the_default_training_is_2000_full_episodes() -> None:
+    assert demonstrator_run("SparseHalfCheetah-v5").n_timesteps == 2_000_000
+    assert demonstrator_run("GoalReacher-v4").n_timesteps == 100_000
+
+
+@pytest.mark.parametrize("algo", DEMONSTRATOR_ALGORITHMS)
+def test_the_agent_of_the_best_evaluation_demonstrates(algo: str, tmp_path: Path) -> None:
+    trained = train_demonstrator(short_run(algo), tmp_path)
+    rows = np.genfromtxt(tmp_path / "progress.csv", delimiter=",", names=True)
+    assert trained.mean_return == rows["dense_return"].max()
+    assert trained.n_steps == rows["timesteps"][-1] >= 128
+    env = gym.make("Reacher-v5")
+    observation, _ = env.reset(seed=0)
+    action, _ = trained.policy.predict(observation, deterministic=True)
+    assert env.action_space.contains(action)
+    again = train_demonstrator(short_run(algo), tmp_path)
+    np.testing.assert_array_equal(again.policy.predict(observation, deterministic=True)[0], action)
+    assert len(np.genfromtxt(tmp_path / "progress.csv", delimiter=",", names=True)) == len(rows), "not trained again"
+    env.close()
+
+
+def test_training_stops_at_the_target_return(tmp_path: Path) -> None:
+    assert train_demonstrator(short_run(n_timesteps=100_000, target_return=-1e9), tmp_path).n_steps <= 64
+
+
+def test_a_folder_of_another_run_is_refused(tmp_path: Path) -> None:
+    train_demonstrator(short_run(), tmp_path)
+    with pytest.raises(ValueError, match="holds another run"):
+        train_demonstrator(short_run(seed=2), tmp_path)
+
+
+def test_a_mixed_set_is_by_a_demonstrator_and_itself_at_half_the_return(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: dict[str, float | None] = {}
+
+    def finish(run: Run, report: Any) -> dict[str, Any]:
+        asked[run.folder.name] = run.target_return
+        return {"timesteps": 10, "dense_return": 3000.0 if run.target_return is None else run.target_return}
+
+    monkeypatch.setattr(demonstrators, "finish_run", finish)
+    monkeypatch.setattr(demonstrators, "load_run", lambda folder: (None, folder.name))
+    both = train_mixed(demonstrator_run("SparseHopper-v5"), tmp_path / "hopper")
+    assert asked == {"hopper": None, "hopper_earlier": 1500.0}
+    assert [one.policy for one in both] == ["hopper", "hopper_earlier"]
+
+
+@pytest.mark.parametrize(("reference", "share", "expected"), [(3000.0, 0.5, 1500.0), (-4.0, 0.5, -8.0), (10.0, 1.0, 10.0)])
+def test_a_share_of_a_return_is_never_better_than_all_of_it(reference: float, share: float, expected: float) -> None:
+    assert share_of(reference, share) == expected
+
+
+def test_the_reference_is_what_the_packages_demonstrators_reach() -> None:
+    shipped = Demonstrations.load(shipped_demonstrations("SparseHopper-v5")).dense_returns
+    assert shipped is not None
+    assert reference_return("SparseHopper-v5") == reference_return("GoalHopper-v4") == pytest.approx(shipped.mean())
+    with pytest.raises(FileNotFoundError, match=r"no reference return of Pendulum-v1 .* give --target-return"):
+        reference_return("Pendulum-v1")
+
+
+@pytest.mark.parametrize("stochastic", [False, True])
+def test_only_successful_episodes_are_kept_and_replay_in_the_sparse_task(stochastic: bool) -> None:
+    policy = Reaching()
+    reaching = Demonstrator(policy, 7, -3.0)
+    shown = record_demonstrators([reaching], "SparseReacher-v5", 2, stochastic, seed=4, metadata={"note": "x"})
+    assert set(policy.deterministic) == {not stochastic}
+    assert shown.n_episodes == 2 and len(shown) == 100
+    assert not shown.terminations.any(), "a time limit is not a termination"
+    assert (shown.rewards[49::50] == 1.0).all(), "a Reacher's success is its last step"
+    assert shown.metadata["note"] == "x" and shown.metadata["demonstrator_returns"] == [-3.0]
+    assert shown.dense_rewards is not None
+    env = gym.make("SparseReacher-v5")
+    first = next(i for i in range(100) if np.allclose(env.reset(seed=4 + i)[0], shown.observations[0]))
+    env.reset(seed=4 + first)
+    for row in range(50):
+        observation, reward, _, _, info = env.step(shown.actions[row])
+        np.testing.assert_allclose(observation, shown.next_observations[row], atol=1e-5)
+        assert reward == shown.rewards[row]
+        assert info["dense_reward"] == pytest.approx(shown.dense_rewards[row], abs=1e-5)
+    env.close()
+
+
+class TestCommand:
+    def test_collect_writes_a_file_that_info_describes(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        monkeypatch.setattr(demonstrators, "train_demonstrator", lambda *_: Demonstrator(Reaching(), 7, -3.0))
+        output = tmp_path / "reacher.npz"
+        words = ["collect", "--env", "SparseReacher-v5", "--episodes", "2", "--output", str(output)]
+        assert run_demos(*words, "--stochastic", "--steps", "1e5") == 0
+        shown = Demonstrations.load(output)
+        command = shown.metadata["command"]
+        assert command.startswith("sb3-actpc demos collect --env SparseReacher-v5 --algo ppo --steps 100000 --stochastic")
+        assert str(tmp_path) not in command
+        capsys.readouterr()
+        assert run_demos("info", str(output)) == 0
+        printed = capsys.readouterr().out
+        for line in (
+            "env: SparseReacher-v5",
+            "episodes: 2",
+            "transitions: 100",
+            "observations: (10,), actions: (2,)",
+            command,
+        ):
+            assert line in printed
+        assert f"sparse return: mean {shown.episode_returns.mean():.1f}" in printed
+
+    @pytest.mark.parametrize(
+        ("words", "target"),
+        [([], None), (["--target-return", "5"], 5.0), (["--quality", "0.5"], reference_return("SparseHopper-v5") / 2)],
+    )
+    def test_quality_is_a_target_return(
+        self, words: list[str], target: float | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        asked: list[Run] = []
+
+        def train(run: Run, *_: Any) -> Demonstrator:
+            asked.append(run)
+            return Demonstrator(Reaching(), 7, -3.0)
+
+        monkeypatch.setattr(demonstrators, "train_demonstrator", train)
+        monkeypatch.setattr(
+            demonstrators, "record_demonstrators", lambda *_: Demonstrations.load(shipped_demonstrations("SparseReacher-v5"))
+        )
+        run_demos("collect", "--env", "SparseHopper-v5", "--algo", "trpo", "--output", str(tmp_path / "x.npz"), *words)
+        assert [(run.target_return, run.algo, run.env) for run in asked] == [(target, "trpo", "Hopper-v5")]
+
+    def test_an_environment_of_ones_own(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.chdir(tmp_path)
+        module = "own_pendulum_for_demonstrations"
+        entry_point = "gymnasium.envs.classic_control:PendulumEnv"
+        source = f"import gymnasium\ngymnasium.register('{module}-v0', '{entry_point}', max_episode_steps=20)"
+        Path(f"{module}.py").write_text(source, encoding="utf-8")
+        words = ["--gym-packages", module, "--steps", "2048", "--episodes", "2", "--output", "own.npz", "--save-every", "1000"]
+        assert run_demos("collect", "--env", f"{module}-v0", *words) == 0
+        shown = Demonstrations.load("own.npz")
+        assert shown.env_id == f"{module}-v0" and len(shown) == 40
+        config = json.loads(next(Path("demonstrators").rglob("config.json")).read_text(encoding="utf-8"))
+        assert config["gym_packages"] == [module]
+        del gym.registry[f"{module}-v0"], sys.modules[module]
+
+    @pytest.mark.parametrize(
+        ("words", "message"),
+        [
+            (["--algo", "dqn"], "algo='dqn' is not one of ppo, sac, td3, trpo"),
+            (["--algo", "td3", "--stochastic"], "the policy of td3 has nothing to sample"),
+            (["--quality", "0.5", "--target-return", "3"], "both say when to stop"),
+            (["--quality", "1.5"], "quality=1.5 must be above 0 and at most 1"),
+            (["--proficiency", "0.5"], "are for scripted demonstrators"),
+            (["--demonstrator", "scripted", "--quality", "0.5"], "are for trained demonstrators: give --proficiency"),
+            (["--demonstrator", "scripted", "--mixed", "--proficiency", "0.5"], "give one of the two"),
+            (["--env", "SparseLift-v0", "--demonstrator", "trained"], "use its scripted demonstrators"),
+        ],
+    )
+    def test_options_that_do_not_go_together_are_named(self, words: list[str], message: str) -> None:
+        with pytest.raises(ValueError, match=message):
+            run_demos("collect", "--env", "SparseHopper-v5", *words)
+
+    def test_an_unknown_task_and_a_missing_file_are_named(self, tmp_path: Path) -> None:
+        with pytest.raises(gym.error.Error, match="SparseAnt"):
+            run_demos("collect", "--env", "SparseAnt-v5")
+        with pytest.raises(FileNotFoundError, match=r"no demonstration file .*absent\.npz: make one"):
+            run_demos("info", str(tmp_path / "absent.npz"))
