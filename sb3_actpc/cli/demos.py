@@ -158,10 +158,10 @@ def _collect_scripted(args: argparse.Namespace) -> "Demonstrations":
         "mixed" if args.mixed else proficiency,
         n_episodes,
         args.seed,
-        args.max_tries,
+        args.obs or "paper",
         {"command": command_line(args, options)},
-        _report,
-        obs=args.obs or "paper",
+        max_tries=args.max_tries,
+        report=_report,
     )
 
 
@@ -190,7 +190,7 @@ def _collect_trained(args: argparse.Namespace) -> "Demonstrations":
     metadata = {"command": command_line(args, (*words, "save_every", "n_envs", "gym_packages")), "algorithm": args.algo}
     n_episodes = 20 if args.episodes is None else args.episodes
     return demonstrators.record_demonstrators(
-        trained, args.env, n_episodes, args.stochastic, args.seed, args.max_tries, metadata, _report
+        trained, args.env, n_episodes, args.stochastic, args.seed, metadata, max_tries=args.max_tries, report=_report
     )
 
 

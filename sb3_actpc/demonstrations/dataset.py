@@ -17,7 +17,7 @@ from gymnasium import spaces
 
 from sb3_actpc.demonstrations.minari import read_minari, write_minari
 from sb3_actpc.demonstrations.npz import read_npz, write_npz
-from sb3_actpc.demonstrations.recording import Report, env_name, record_episodes, silent, trajectory_columns
+from sb3_actpc.demonstrations.recording import env_name, record_episodes, trajectory_columns
 from sb3_actpc.demonstrations.rows import field_error, flat_size, unchained_indices
 
 if TYPE_CHECKING:
@@ -63,18 +63,21 @@ class Demonstrations:
     source: str = ""
 
     def __post_init__(self) -> None:
-        observations = self._float_rows("observations")
-        n_transitions = len(observations)
-        self._float_rows("actions", n_transitions)
-        next_observations = self._float_rows("next_observations", n_transitions)
-        if next_observations.shape != observations.shape:
-            raise self._error("next_observations", f"shape {observations.shape}", f"shape {next_observations.shape}")
-        self._float_column("rewards", n_transitions)
+        n_transitions, obs_dim = self._convert("observations", None, None).shape
+        self._convert("actions", n_transitions, None)
+        self._convert("next_observations", n_transitions, obs_dim)
+        self._convert("rewards", n_transitions)
         if self.dense_rewards is not None:
-            self._float_column("dense_rewards", n_transitions)
-        self._convert_terminations(n_transitions)
-        self._convert_episode_starts(n_transitions)
-        self._check_terminations_end_episodes()
+            self._convert("dense_rewards", n_transitions)
+        terminations = self._convert("terminations", n_transitions, dtype=np.bool_)
+        starts = self._convert("episode_starts", None, dtype=np.int64)
+        if starts[0] != 0 or np.any(np.diff(starts) <= 0) or starts[-1] >= n_transitions:
+            expected = f"strictly increasing indices from 0 and below {n_transitions}, the number of transitions"
+            raise self._error("episode_starts", expected, np.array2string(starts, threshold=8))
+        misplaced = np.setdiff1d(np.flatnonzero(terminations), self.episode_bounds[:, 1] - 1)
+        if len(misplaced) > 0:
+            expected = "true only at the last transition of an episode (see episode_starts)"
+            raise self._error("terminations", expected, f"true at transition {misplaced[0]}, inside an episode")
         if not isinstance(self.env_id, str) or not self.env_id:
             raise self._error("env_id", "a Gymnasium environment id", repr(self.env_id))
         object.__setattr__(self, "metadata", self._json_metadata())
@@ -156,39 +159,32 @@ class Demonstrations:
         env: gym.Env[Any, Any] | str,
         n_episodes: int = 20,
         only_successes: bool | None = None,
-        deterministic: bool = True,
-        seed: int = 0,
-        max_tries: int | None = None,
+        *,
         metadata: Mapping[str, Any] | None = None,
-        report: Report = silent,
+        **options: Any,
     ) -> Demonstrations:
         """Let someone who can do a task show it.
 
-        :param demonstrator: an object with SB3's ``predict`` (its ``VecNormalize`` is heeded), a function from an observation
-            to an action in the environment's units, or a list of such, who take turns
+        :param demonstrator: an object with SB3's ``predict`` (a model's ``VecNormalize`` is heeded), a function from an
+            observation to an action in the environment's units, or a list of such, who take turns. One with a method
+            ``start(seed)`` is told of every new episode
         :param env: any Gymnasium environment with Box actions and Box observations, or a Dict of such; or its id
         :param n_episodes: episodes wanted
-        :param only_successes: keep only episodes that end with a true ``info["is_success"]``; None: all but those that end
-            with a false one
-        :param deterministic: of ``predict``; False samples the actions of a stochastic policy (from SB3's generators)
-        :param seed: try number i is reset with the seed ``seed + i``
-        :param max_tries: episodes played at most, None for ``10 * n_episodes``
+        :param only_successes: keep only episodes that end with a true ``info["is_success"]`` (or ``"success"``); None: all but
+            those that end with a false one
         :param metadata: JSON values to keep with the demonstrations
-        :param report: takes one line of progress per kept episode
+        :param options: ``deterministic`` (of ``predict``, true by default), ``seed``, ``max_tries`` and ``report``, see
+            :func:`~sb3_actpc.demonstrations.recording.record_episodes`
         :return: the episodes. ``dense_rewards`` are ``info["dense_reward"]``, or the rewards where there is none
         :raises ValueError: when too few of the tries succeed, or an argument is not allowed
         """
         if isinstance(env, str):
             with gym.make(env) as made:
-                return cls.record(
-                    demonstrator, made, n_episodes, only_successes, deterministic, seed, max_tries, metadata, report
-                )
+                return cls.record(demonstrator, made, n_episodes, only_successes, metadata=metadata, **options)
         if not isinstance(env, gym.Env):
             raise ValueError(f"env must be a Gymnasium environment or the id of one, found {env!r}")
         demonstrators = demonstrator if isinstance(demonstrator, list | tuple) else [demonstrator]
-        episodes, made_by = record_episodes(
-            demonstrators, env, n_episodes, only_successes, deterministic, seed, max_tries, report
-        )
+        episodes, made_by = record_episodes(demonstrators, env, n_episodes, only_successes, **options)
         recorded = cls.from_episodes(episodes, env_name(env), {**made_by, **(metadata or {})})
         recorded.check(env.observation_space, env.action_space)
         return recorded
@@ -346,8 +342,7 @@ class Demonstrations:
         if env is None and self.env_id in gym.registry:
             with gym.make(self.env_id) as made:
                 return self.to_minari(dataset_id, made, **options)
-        sizes = (self.observations.shape[1], self.actions.shape[1])
-        observation_space, action_space = (spaces.Box(-np.inf, np.inf, (size,), np.float32) for size in sizes)
+        observation_space, action_space = map(_unbounded_box, (self.observations.shape[1], self.actions.shape[1]))
         if env is not None:
             observation_space, action_space = env.observation_space, env.action_space
             self.check(observation_space, action_space, None if env.spec is None else env.spec.id)
@@ -362,70 +357,28 @@ class Demonstrations:
     def _error(self, name: str, expected: str, found: str) -> ValueError:
         return field_error(self.source, name, expected, found)
 
-    def _numbers(self, name: str) -> np.ndarray:
+    def _convert(self, name: str, *shape: int | None, dtype: type[np.generic] = np.float32) -> np.ndarray:
+        """Give a field its type, if every value allows it and its shape is this one (None: any length but 0)."""
         try:
-            values = np.asarray(getattr(self, name))
+            given = np.asarray(getattr(self, name))
         except ValueError:
             raise self._error(name, "an array of numbers", "rows of unequal length") from None
-        if values.size == 0:
-            raise self._error(name, "at least one value", f"an empty array of shape {values.shape}")
-        if values.dtype.kind not in "biuf":
-            raise self._error(name, "numbers", f"type {values.dtype}")
-        return values
-
-    def _floats(self, name: str) -> np.ndarray:
+        if given.dtype.kind not in ("iu" if dtype is np.int64 else "biuf"):
+            expected = "whole numbers" if dtype is np.int64 else "numbers"
+            raise self._error(name, expected, f"type {given.dtype}, shape {given.shape}")
+        fits = [size in (None, found) for found, size in zip(given.shape, shape, strict=False)]
+        if given.ndim != len(shape) or given.size == 0 or not all(fits):
+            expected = ", ".join("1 or more" if size is None else str(size) for size in shape)
+            raise self._error(name, f"an array of shape ({expected})", f"shape {given.shape}")
         with np.errstate(over="ignore", invalid="ignore"):
-            values = np.asarray(self._numbers(name), dtype=np.float32, order="C")
-        finite = np.isfinite(values)
-        if not finite.all():
-            where = tuple(int(index) for index in np.argwhere(~finite)[0])
-            raise self._error(name, "finite float32 values", f"{values[where]} at index {where}")
+            values = np.asarray(given, dtype=dtype, order="C")
+        wrong = ~np.isfinite(values) if dtype is np.float32 else values != given
+        if wrong.any():
+            where = tuple(int(index) for index in np.argwhere(wrong)[0])
+            expected = "finite float32 values" if dtype is np.float32 else "true or false"
+            raise self._error(name, expected, f"{given[where]} at index {where}")
         object.__setattr__(self, name, values)
         return values
-
-    def _float_rows(self, name: str, n_transitions: int | None = None) -> np.ndarray:
-        values = self._floats(name)
-        if values.ndim != 2 or (n_transitions is not None and len(values) != n_transitions):
-            expected = "(N, size)" if n_transitions is None else f"({n_transitions}, size), a row per observation"
-            raise self._error(name, f"shape {expected}", f"shape {values.shape}")
-        return values
-
-    def _float_column(self, name: str, n_transitions: int) -> np.ndarray:
-        values = self._floats(name)
-        if values.shape != (n_transitions,):
-            raise self._error(name, f"shape ({n_transitions},), a value per observation", f"shape {values.shape}")
-        return values
-
-    def _convert_terminations(self, n_transitions: int) -> None:
-        values = self._numbers("terminations")
-        if values.shape != (n_transitions,):
-            raise self._error("terminations", f"shape ({n_transitions},), a value per observation", f"shape {values.shape}")
-        other = values[(values != 0) & (values != 1)]
-        if len(other) > 0:
-            raise self._error("terminations", "true or false", f"{other[0]}")
-        object.__setattr__(self, "terminations", values.astype(bool))
-
-    def _convert_episode_starts(self, n_transitions: int) -> None:
-        values = self._numbers("episode_starts")
-        if values.dtype.kind not in "iu" or values.ndim != 1:
-            raise self._error("episode_starts", "a row of whole numbers", f"type {values.dtype}, shape {values.shape}")
-        values = values.astype(np.int64)
-        if values[0] != 0:
-            raise self._error("episode_starts", "0 first", f"{values[0]}")
-        wrong = np.flatnonzero(np.diff(values) <= 0)
-        if len(wrong) > 0:
-            pair = f"{values[wrong[0]]} and then {values[wrong[0] + 1]}"
-            raise self._error("episode_starts", "strictly increasing indices", pair)
-        if values[-1] >= n_transitions:
-            raise self._error("episode_starts", f"indices below {n_transitions}, the number of transitions", f"{values[-1]}")
-        object.__setattr__(self, "episode_starts", values)
-
-    def _check_terminations_end_episodes(self) -> None:
-        last = self.episode_bounds[:, 1] - 1
-        misplaced = np.setdiff1d(np.flatnonzero(self.terminations), last)
-        if len(misplaced) > 0:
-            expected = "true only at the last transition of an episode (see episode_starts)"
-            raise self._error("terminations", expected, f"true at transition {misplaced[0]}, inside an episode")
 
     def _json_metadata(self) -> dict[str, Any]:
         """A copy of the metadata as a JSON file would give it back."""
@@ -469,6 +422,10 @@ def shipped_demonstrations(env_id: str, weak: bool = False) -> Path:
             f"{env_id}) and pass --demonstrations FILE, or train without (--demonstrations none)"
         )
     return path
+
+
+def _unbounded_box(size: int) -> spaces.Space[Any]:
+    return spaces.Box(-np.inf, np.inf, (size,), np.float32)
 
 
 def base_name(env_id: str) -> str:

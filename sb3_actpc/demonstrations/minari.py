@@ -25,13 +25,8 @@ def read_minari(
     dataset: Any, env_id: str | None = None, observation_space: spaces.Space[Any] | None = None
 ) -> tuple[list[dict[str, np.ndarray]], dict[str, Any]]:
     """
-    :param dataset: a ``minari.MinariDataset``, or the id of one in the local Minari folder
-    :param env_id: environment id; None for the one recorded in the dataset
-    :param observation_space: whose order a Dict is flattened in; None for the recorded order
-    :return: the columns of each episode, and the further fields of a ``Demonstrations``
-    :raises ImportError: when Minari is not installed
-    :raises FileNotFoundError: when no local dataset has this id
-    :raises ValueError: when the dataset has no episodes, other spaces, or episodes of wrong lengths
+    :return: the columns of each episode, and the further arguments of ``Demonstrations.from_episodes``; for the parameters and
+        the errors see ``Demonstrations.from_minari``
     """
     if isinstance(dataset, str):
         dataset = _load(dataset)
@@ -67,16 +62,9 @@ def write_minari(
     options: dict[str, Any],
 ) -> Any:
     """
-    :param dataset_id: Minari id that does not exist yet
     :param episodes: the columns of each episode
-    :param observation_space: of the environment
-    :param action_space: of the environment
-    :param env: environment whose specification is recorded, if JSON can hold it; None for none
     :param metadata: further entries, JSON values
-    :param options: further keywords of ``minari.create_dataset_from_buffers``
-    :return: the ``minari.MinariDataset``
-    :raises ImportError: when Minari is not installed
-    :raises ValueError: when the id exists or is malformed
+    :return: the ``minari.MinariDataset``; for the other parameters and the errors see ``Demonstrations.to_minari``
     """
     dataset = import_minari().create_dataset_from_buffers(
         dataset_id,

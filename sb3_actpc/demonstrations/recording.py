@@ -31,21 +31,18 @@ def record_episodes(
     max_tries: int | None = None,
     report: Report = silent,
 ) -> tuple[list[Columns], dict[str, Any]]:
-    """Play until enough episodes are kept. The demonstrators take turns; one who fails tries again.
+    """Play until enough episodes are kept.
 
-    :param demonstrators: episode i is by number ``i % len(demonstrators)``; each an object with SB3's ``predict`` (a model's
-        ``VecNormalize`` is heeded) or a function from an observation to an action. One with a method ``start(seed)`` is told
-        of every new episode
+    :param demonstrators: as of ``Demonstrations.record``; episode i is by number ``i % len(demonstrators)``, who tries again
+        after a failure
     :param env: environment with Box actions and Box observations, or a Dict of such
-    :param n_episodes: episodes wanted
-    :param only_successes: keep only episodes whose last ``info`` has a true ``is_success`` (or ``success``); None: those that
-        do not say otherwise
-    :param deterministic: of ``predict``; False samples the actions of a stochastic policy
+    :param n_episodes: as of ``Demonstrations.record``, as the next
+    :param only_successes: which episodes to keep
+    :param deterministic: of ``predict``; False samples the actions of a stochastic policy, from SB3's generators
     :param seed: try number i is reset with the seed ``seed + i``
     :param max_tries: episodes played at most, None for ``10 * n_episodes``
     :param report: takes one line of progress per kept episode
-    :return: the columns of each episode (floats float32; ``dense_rewards`` is ``info["dense_reward"]`` or the reward), and
-        how they were made
+    :return: the columns of each episode (floats float32), and how they were made
     :raises ValueError: if too few of the tries succeed, or an argument is not allowed
     """
     if n_episodes < 1:
@@ -165,7 +162,7 @@ def _is_kept(info: Mapping[str, Any], only_successes: bool | None) -> bool:
 
 def _versions() -> dict[str, str]:
     """Of the simulators in use."""
-    versions = {}
+    versions: dict[str, str] = {}
     for name in ("gymnasium", "mujoco", "robosuite"):
         if name in sys.modules:
             try:

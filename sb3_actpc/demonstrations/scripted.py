@@ -7,6 +7,7 @@ six people, two worse, two okay and two better, 50 demonstrations each) can be m
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,7 +15,6 @@ import gymnasium as gym
 import numpy as np
 
 from sb3_actpc.demonstrations.dataset import Demonstrations
-from sb3_actpc.demonstrations.recording import Report, silent
 from sb3_actpc.envs.robosuite_layouts import (
     ACTION_DIM,
     CAN_BIN_HIGH,
@@ -296,21 +296,19 @@ def collect_scripted(
     proficiency: float | str = 1.0,
     n_episodes: int = 50,
     seed: int = 0,
-    max_tries: int | None = None,
-    metadata: dict[str, Any] | None = None,
-    report: Report = silent,
     obs: str = "paper",
+    metadata: dict[str, Any] | None = None,
+    **options: Any,
 ) -> Demonstrations:
     """Record successful episodes of scripted demonstrators.
 
     :param env_id: ``SparseLift-v0`` or ``SparsePickPlaceCan-v0``
     :param proficiency: in [0, 1], or ``"mixed"`` for the six of ``MIXED_DEMONSTRATORS``, who take turns
     :param n_episodes: successful episodes wanted
-    :param seed: try number i is reset with the seed ``seed + i``
-    :param max_tries: episodes played at most, None for ``10 * n_episodes``
-    :param metadata: JSON values to keep with the demonstrations
-    :param report: takes one line of progress per kept episode
+    :param seed: of the demonstrators and of the episodes
     :param obs: the environment's ``obs``
+    :param metadata: JSON values to keep with the demonstrations
+    :param options: further ones of :func:`~sb3_actpc.demonstrations.recording.record_episodes`
     :return: the episodes; ``metadata["filter_keys"]`` has robomimic's filter keys of each one (``"better"``,
         ``"better_operator_1"``, ...) when the set is mixed
     :raises ValueError: when an argument is not allowed, or too few episodes succeed
@@ -326,10 +324,9 @@ def collect_scripted(
         kept["filter_keys"] = [keys[i % len(keys)] for i in range(n_episodes)]
     else:
         demonstrators = [ScriptedDemonstrator(env_id, obs, proficiency, seed)]  # type: ignore[arg-type]
-    with gym.make(env_id, obs=obs) as env:
-        return Demonstrations.record(
-            demonstrators, env, n_episodes, True, True, seed, max_tries, {**kept, **(metadata or {})}, report
-        )
+    with closing(gym.make(env_id, obs=obs)) as env:
+        kept |= metadata or {}
+        return Demonstrations.record(demonstrators, env, n_episodes, True, seed=seed, metadata=kept, **options)
 
 
 def multiply(first: np.ndarray, second: np.ndarray) -> np.ndarray:

@@ -147,9 +147,8 @@ def record_demonstrators(
     n_episodes: int = 20,
     stochastic: bool = False,
     seed: int = 0,
-    max_tries: int | None = None,
     metadata: dict[str, Any] | None = None,
-    report: Report = silent,
+    **options: Any,
 ) -> Demonstrations:
     """Record demonstrators, who take turns, in the task itself.
 
@@ -157,18 +156,15 @@ def record_demonstrators(
     :param env_id: Gymnasium id of the task
     :param n_episodes: successful episodes wanted
     :param stochastic: sample the actions instead of taking the most likely ones
-    :param seed: of the sampling; try number i is reset with the seed ``seed + i``
-    :param max_tries: episodes played at most, None for ``10 * n_episodes``
+    :param seed: of the sampling and of the episodes
     :param metadata: JSON values to keep with the demonstrations
-    :param report: takes one line of progress per kept episode
+    :param options: further ones of :func:`~sb3_actpc.demonstrations.recording.record_episodes`
     :return: the demonstrations
-    :raises ValueError: if fewer than ``n_episodes`` of ``max_tries`` episodes succeed, or ``n_episodes`` is below 1
+    :raises ValueError: if too few of the tries succeed, or ``n_episodes`` is below 1
     """
     set_random_seed(seed)
-    kept = {
-        "demonstrator_steps": [one.n_steps for one in demonstrators],
-        "demonstrator_returns": [one.mean_return for one in demonstrators],
-        **(metadata or {}),
-    }
+    steps, returns = [one.n_steps for one in demonstrators], [one.mean_return for one in demonstrators]
+    kept = {"demonstrator_steps": steps, "demonstrator_returns": returns, **(metadata or {})}
     policies = [one.policy for one in demonstrators]
-    return Demonstrations.record(policies, env_id, n_episodes, None, not stochastic, seed, max_tries, kept, report)
+    options = {"deterministic": not stochastic, "seed": seed, **options}
+    return Demonstrations.record(policies, env_id, n_episodes, metadata=kept, **options)

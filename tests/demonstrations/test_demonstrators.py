@@ -9,6 +9,8 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from sb3_actpc.experiments.runs.presets import resolve
+from sb3_actpc.experiments.runs.schema import Run
 
 from sb3_actpc.cli import demos
 from sb3_actpc.demonstrations import Demonstrations, shipped_demonstrations
@@ -24,8 +26,6 @@ from sb3_actpc.experiments.demonstrators import (
     train_demonstrator,
     train_mixed,
 )
-from sb3_actpc.experiments.runs.presets import resolve
-from sb3_actpc.experiments.runs.schema import Run
 
 FEW: dict[str, dict[str, Any]] = {
     "ppo": {"n_steps": 64, "batch_size": 64, "n_epochs": 1},
@@ -196,7 +196,9 @@ class TestCommand:
 
         monkeypatch.setattr(demonstrators, "train_demonstrator", train)
         monkeypatch.setattr(
-            demonstrators, "record_demonstrators", lambda *_: Demonstrations.load(shipped_demonstrations("SparseReacher-v5"))
+            demonstrators,
+            "record_demonstrators",
+            lambda *_, **options: Demonstrations.load(shipped_demonstrations("SparseReacher-v5")),
         )
         run_demos("collect", "--env", "SparseHopper-v5", "--algo", "trpo", "--output", str(tmp_path / "x.npz"), *words)
         assert [(run.target_return, run.algo, run.env) for run in asked] == [(target, "trpo", "Hopper-v5")]
