@@ -385,7 +385,7 @@ def test_a_recording_can_be_repeated_and_played_again() -> None:
 @pytest.mark.usefixtures("with_robosuite")
 def test_a_mixed_set_has_six_demonstrators_of_three_levels(tmp_path: Path) -> None:
     output = tmp_path / "mixed.npz"
-    command = ["demos", "collect", "--env", LIFT, "--expert", "scripted", "--proficiency", "mixed"]
+    command = ["demos", "collect", "--env", LIFT, "--mixed"]
     assert main([*command, "--episodes", "6", "--output", str(output)]) == 0
     mixed = Demonstrations.load(output)
     assert mixed.n_episodes == 6
