@@ -21,7 +21,8 @@ from sb3_actpc.experiments.runs.evaluation import Predictor
 from sb3_actpc.experiments.runs.run import finish_run, load_run
 from sb3_actpc.experiments.runs.schema import Run
 
-DEMONSTRATOR_ALGORITHMS = ("ppo", "sac", "td3", "trpo")
+# name of the algorithm -> its settings in hyperparams/
+DEMONSTRATOR_ALGORITHMS = {"ppo": "ppo_demonstrator", "sac": "sac", "td3": "td3_demonstrator", "trpo": "trpo"}
 N_TRAINING_EPISODES = 2000  # of the paper's demonstrators
 N_EVALUATION_EPISODES = 10  # enough to notice a policy that falls over now and then
 EARLIER = 0.5  # share of the return at which the weaker half of a mixed set stood
@@ -49,7 +50,7 @@ def demonstrator_run(
     gym_packages: Sequence[str] = (),
     **options: Any,
 ) -> Run:
-    """The run that trains a demonstrator, with the settings of ``hyperparams/<algo>_demonstrator.yml``.
+    """The run that trains a demonstrator, with the settings in ``DEMONSTRATOR_ALGORITHMS``.
 
     :param env_id: Gymnasium id of the task to demonstrate. A sparse MuJoCo task is learned by its dense base task, any other
         by its own rewards
@@ -76,7 +77,7 @@ def demonstrator_run(
     return Run(
         env=learned_id,
         algo=algo,
-        preset=f"{algo}_demonstrator",
+        preset=DEMONSTRATOR_ALGORITHMS[algo],
         n_timesteps=n_timesteps,
         target_return=target_return,
         demonstrations="none",

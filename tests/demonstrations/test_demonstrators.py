@@ -9,8 +9,6 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from sb3_actpc.experiments.runs.presets import resolve
-from sb3_actpc.experiments.runs.schema import Run
 
 from sb3_actpc.cli import demos
 from sb3_actpc.demonstrations import Demonstrations, shipped_demonstrations
@@ -26,6 +24,8 @@ from sb3_actpc.experiments.demonstrators import (
     train_demonstrator,
     train_mixed,
 )
+from sb3_actpc.experiments.runs.presets import resolve
+from sb3_actpc.experiments.runs.schema import Run
 
 FEW: dict[str, dict[str, Any]] = {
     "ppo": {"n_steps": 64, "batch_size": 64, "n_epochs": 1},
@@ -65,7 +65,7 @@ class Reaching:
         return np.clip(-20.0 * jacobian.T @ offset[:2] - 0.05 * velocity, -1.0, 1.0).astype(np.float32), None
 
 
-@pytest.mark.parametrize("algo", DEMONSTRATOR_ALGORITHMS)
+@pytest.mark.parametrize("algo", sorted(DEMONSTRATOR_ALGORITHMS))
 def test_every_task_is_learned_by_its_dense_base_task(algo: str) -> None:
     for env_id in SPARSE_MUJOCO_IDS:
         run = resolve(demonstrator_run(env_id, algo))
@@ -79,7 +79,7 @@ def test_the_default_training_is_2000_full_episodes() -> None:
     assert demonstrator_run("GoalReacher-v4").n_timesteps == 100_000
 
 
-@pytest.mark.parametrize("algo", DEMONSTRATOR_ALGORITHMS)
+@pytest.mark.parametrize("algo", sorted(DEMONSTRATOR_ALGORITHMS))
 def test_the_agent_of_the_best_evaluation_demonstrates(algo: str, tmp_path: Path) -> None:
     trained = train_demonstrator(short_run(algo), tmp_path)
     rows = np.genfromtxt(tmp_path / "progress.csv", delimiter=",", names=True)

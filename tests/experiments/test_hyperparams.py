@@ -19,11 +19,10 @@ from tests.recordings import record_file
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*out of date.*", "ignore:.*infinity.*", "ignore:.*mini-batch size.*")
 FOLDER = next(folder for folder in HYPERPARAMS_FOLDERS if folder.is_dir())
-# settings of a preset that is no algorithm's, and files that hold other things
-ALGO_OF = {"actpc_paper": "actpc"}
-OTHER_FILES = {"experts"}
+# settings of a preset that is no algorithm's
+ALGO_OF = {"actpc_paper": "actpc", "ppo_demonstrator": "ppo", "td3_demonstrator": "td3"}
 N_EPISODES = 26  # of 12 steps: the paper's preset asks for 300 transitions
-DEFAULT_ENV = {"her": "GoalHopper-v5", "ppo": "Hopper-v5"}
+DEFAULT_ENV = {"her": "GoalHopper-v5", **dict.fromkeys(("ppo", "sac", "trpo"), "Hopper-v5")}
 # what would take long, and nothing else
 OFF_POLICY = {"learning_starts": 0, "buffer_size": 1000, "batch_size": 8}
 FEWER: dict[str, dict[str, Any]] = {
@@ -32,18 +31,20 @@ FEWER: dict[str, dict[str, Any]] = {
     "her": {**OFF_POLICY, "demonstration_fraction": 1.0},
     "bc": {"batch_size": 8},
     "bc_rnn": {"batch_size": 8},
-    "td3": OFF_POLICY,
+    **dict.fromkeys(("sac", "td3"), OFF_POLICY),
     "ddpg": OFF_POLICY,
     "sac_rlpd": OFF_POLICY,
     "logo": {"n_steps": 16, "batch_size": 8, "n_critic_updates": 1},
     "ppo": {"n_steps": 16, "batch_size": 8, "n_epochs": 1},
+    "trpo": {"n_steps": 16, "batch_size": 8, "n_critic_updates": 1},
 }
 
 
 def entries() -> list[tuple[str, str]]:
     """(preset, key) of every entry."""
-    presets = sorted(path for path in FOLDER.glob("*.yml") if path.stem not in OTHER_FILES)
-    return [(path.stem, key) for path in presets for key in yaml.safe_load(path.read_text(encoding="utf-8"))]
+    return [
+        (path.stem, key) for path in sorted(FOLDER.glob("*.yml")) for key in yaml.safe_load(path.read_text(encoding="utf-8"))
+    ]
 
 
 def values(node: object) -> list[object]:
@@ -74,7 +75,7 @@ def test_every_entry_builds_its_agent_which_trains(
         pytest.importorskip("robosuite", reason="robosuite is an extra")
     sparse = sparse_env_id(env_id)
     demonstrations = str(record_file(recordings, sparse, N_EPISODES)) if sparse.startswith("Sparse") else "none"
-    n_steps = 16 if algo in ("logo", "ppo") else 3
+    n_steps = 16 if algo in ("logo", "ppo", "trpo") else 3
     settings = dict(FEWER[algo])
     if algo in ("her", "actpc") and demonstrations == "none":  # nothing to learn from but an episode of its own
         settings["learning_starts"], n_steps = 50, 52

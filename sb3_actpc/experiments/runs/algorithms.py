@@ -29,6 +29,7 @@ ALGORITHMS = {
     "sac": "stable_baselines3:SAC",
     "sac_rlpd": "sb3_actpc.baselines:RLPD",
     "td3": "sb3_actpc.baselines:TD3Demo",
+    "trpo": "sb3_contrib:TRPO",
 }
 # constructor keywords that have an option of their own
 _OPTION_OF = {
