@@ -10,6 +10,7 @@ from torch import nn
 
 from sb3_actpc.ngc.activations import ACTIVATIONS, get_activation
 from sb3_actpc.ngc.dynamics import DYNAMICS, ChainSettings, SettledState, SettlingChain
+from sb3_actpc.ngc.krylov import settle_krylov
 from sb3_actpc.ngc.plasticity import SYNAPTIC_SCALINGS, HebbianChanges, bound_columns_, hebbian_changes, mirrored, soft_bound_
 from sb3_actpc.ngc.stability import arrival_fractions, power_iteration_, settling_rates
 from sb3_actpc.ngc.synapses import Synapses, predict
@@ -38,9 +39,11 @@ class NGCCircuit(nn.Module):
         taken when the error first reaches it, one ordered sweep; the zero-divergence schedule, Z-IL, of the predictive-coding
         literature; about K times cheaper). Scheduled with tied feedback is, numerically, the gradient of the output's loss;
         with learned error synapses it is where the error neurons rest under an infinitesimal error that is held (no W^T)
-    :param n_settling_steps: K (paper: 10 to 25)
-    :param dynamics: "error" (error neurons integrate, states follow their predictions) or "state" (eq. 1 to the letter);
-        same fixed points, see :class:`~sb3_actpc.ngc.dynamics.SettlingChain`
+    :param n_settling_steps: K (paper: 10 to 25); with ``dynamics="krylov"`` the most steps
+    :param settling_tolerance: "krylov" stops when this share of the output's equation is left (the others take all K steps)
+    :param dynamics: how iterative settling comes to rest: "krylov" (minimal residuals, two to four steps:
+        :mod:`~sb3_actpc.ngc.krylov`), "error" (error neurons integrate, states follow their predictions) or "state" (eq. 1 to
+        the letter); same fixed points, "krylov" to first order: see :class:`~sb3_actpc.ngc.dynamics.SettlingChain`
     :param settling_rate: β, a number in (0, 1], or "auto": kept inside the stable range as the synapses grow
     :param compensate_arrival: divide every layer's error by the share of the output's error that K steps had time to
         bring there (:func:`~sb3_actpc.ngc.stability.arrival_fractions`; 1 for large K). Without it the first layers' changes
@@ -78,7 +81,8 @@ class NGCCircuit(nn.Module):
         output_activation: str = "identity",
         settling: str = "iterative",
         n_settling_steps: int = 10,
-        dynamics: str = "error",
+        settling_tolerance: float = 0.3,
+        dynamics: str = "krylov",
         settling_rate: float | str = "auto",
         compensate_arrival: bool = True,
         leak: float = 0.0,
@@ -111,6 +115,7 @@ class NGCCircuit(nn.Module):
             raise ValueError(f"n_feedback_inputs={n_feedback_inputs} must lie between 0 and n_inputs={n_inputs}")
         _check_not_negative(
             leak=leak,
+            settling_tolerance=settling_tolerance,
             feedback_rate=feedback_rate,
             weight_bound=weight_bound,
             weight_decay=weight_decay,
@@ -119,6 +124,9 @@ class NGCCircuit(nn.Module):
         )
         _check_rate(settling_rate)
         _check_flags(compensate_arrival=compensate_arrival, derivative_free=derivative_free)
+        if settling == "iterative" and dynamics == "krylov" and (leak or settling_rate != "auto"):
+            given = f"leak={leak!r}" if leak else f"settling_rate={settling_rate!r}"
+            raise ValueError(f"{given} needs dynamics='error' or 'state': 'krylov' knows neither leak nor rates")
         if settling == "scheduled":
             _check_scheduled(
                 feedback_scale=feedback_scale,
@@ -130,6 +138,7 @@ class NGCCircuit(nn.Module):
         self.activation = get_activation(activation)
         self.output_activation = get_activation(output_activation)
         self.settling, self.n_settling_steps, self.dynamics = settling, n_settling_steps, dynamics
+        self.settling_tolerance = settling_tolerance
         self.compensate_arrival = compensate_arrival
         self.settling_rate, self.leak, self.derivative_free = settling_rate, leak, derivative_free
         self.feedback, self.feedback_scale, self.feedback_rate = feedback, feedback_scale, feedback_rate
@@ -164,7 +173,8 @@ class NGCCircuit(nn.Module):
 
     def _create_rates(self) -> None:
         self.register_buffer("rates", th.zeros(max(1, self.n_hidden)))
-        self._keep_rates = self.settling == "iterative" and self.settling_rate == "auto" and self.n_hidden > 0
+        moves_by_rates = self.settling == "iterative" and self.dynamics != "krylov"
+        self._keep_rates = moves_by_rates and self.settling_rate == "auto" and self.n_hidden > 0
         if self._keep_rates:
             for name, matrix in self._coupling_matrices():
                 self.register_buffer(name, th.nn.functional.normalize(th.ones(matrix.shape[1]), dim=0))
@@ -229,9 +239,14 @@ class NGCCircuit(nn.Module):
             chain.sweep()
             return chain.state()
         chain.start_settling()
+        if not self.n_hidden:
+            return chain.state()
+        if self.dynamics == "krylov":
+            chain.n_steps = settle_krylov(chain, self.n_settling_steps, self.settling_tolerance)
+            return chain.state()
         rates = self.rates.tolist()[: self.n_hidden]
         chain.arrived = arrival_fractions(tuple(rates), self.n_settling_steps)
-        for _ in range(self.n_settling_steps if self.n_hidden else 0):
+        for chain.n_steps in range(1, self.n_settling_steps + 1):
             chain.integrate(rates)
             chain.predict()
         return chain.state()

@@ -36,8 +36,8 @@ def settle_coupled(
 
     The clamped error is applied as ``nudge`` / A and the actor's errors are divided by ``nudge`` afterwards: the smaller the
     nudge, the closer the actor's change comes to the deterministic policy gradient (tied feedback). The paper's is 1. In the
-    limit the states stand still and only the error neurons settle, which costs half the products: ``dynamics="error"`` can do
-    that, ``dynamics="state"`` cannot, and a small nudge there drowns in the rounding of z - z̄.
+    limit the states stand still and only the error neurons settle: ``dynamics="krylov"`` is at rest after one sweep,
+    ``dynamics="error"`` gets there in steps; ``dynamics="state"`` cannot, as a small nudge drowns in the rounding of z - z̄.
 
     :param actor: observation (and memory) -> action
     :param critic: [observation, action] -> action-values; its last A inputs are the action
@@ -54,15 +54,17 @@ def settle_coupled(
             f"the critic has n_inputs={critic.sizes[0]} and n_feedback_inputs={critic.n_feedback_inputs}; under this actor it "
             f"needs {x.shape[1] + n_actions} and {n_actions}"
         )
-    for name in ("settling", "n_settling_steps"):
+    for name in ("settling", "n_settling_steps", "dynamics"):
         if getattr(actor, name) != getattr(critic, name):
             raise ValueError(f"actor {name}={getattr(actor, name)!r} and critic {name}={getattr(critic, name)!r} must agree")
     motor = actor.chain(x, memory)
     value = critic.chain(th.cat([x, motor.output], dim=1))
-    infinitesimal = nudge is None and all(c.dynamics == "error" and not c.leak for c in (actor, critic))
+    infinitesimal = nudge is None and all(c.dynamics != "state" and not c.leak for c in (actor, critic))
     scale = 1.0 if nudge is None or actor.settling == "scheduled" else nudge
     value.clamp_output_drive(_damped(value, th.full_like(value.output, scale / value.output.shape[1])))
     if actor.settling == "scheduled":
+        _sweep_both(motor, value, critic.input_feedback())
+    elif actor.dynamics == "krylov" and infinitesimal:
         _sweep_both(motor, value, critic.input_feedback())
     else:
         _settle_both(actor, critic, motor, value, states_move=not infinitesimal)
@@ -96,6 +98,8 @@ def _sweep_both(motor: SettlingChain, value: SettlingChain, to_action: th.Tensor
 def _settle_both(actor: NGCCircuit, critic: NGCCircuit, motor: SettlingChain, value: SettlingChain, states_move: bool) -> None:
     value.start_settling()
     motor.start_settling()
+    if actor.dynamics == "krylov":
+        return _sweep_repeatedly(actor, critic, motor, value)
     value_rates, motor_rates = _coupled_rates(critic), _coupled_rates(actor)
     to_action, n_steps = critic.input_feedback(), critic.n_settling_steps
     motor.arrived = arrival_fractions((*motor_rates, *value_rates), n_steps)[: motor.n_hidden + 1]
@@ -108,6 +112,20 @@ def _settle_both(actor: NGCCircuit, critic: NGCCircuit, motor: SettlingChain, va
             motor.predict(output=False)
             value.predict(output=False)
     _clamp_actor(motor, value, to_action)
+
+
+def _sweep_repeatedly(actor: NGCCircuit, critic: NGCCircuit, motor: SettlingChain, value: SettlingChain) -> None:
+    """Under a held error nothing answers at the output: only the slopes change as the states move, sweep by sweep."""
+    to_action = critic.input_feedback()
+    for _ in range(critic.n_settling_steps):
+        before = motor.drive
+        _sweep_both(motor, value, to_action)
+        motor.n_steps += 1
+        if float((motor.drive - before).norm()) <= actor.settling_tolerance * float(motor.drive.norm()) and motor.n_steps > 1:
+            break
+        for chain in (motor, value):
+            chain.lowest_reached = 1
+            chain.predict(output=False)
 
 
 def _coupled_rates(circuit: NGCCircuit) -> list[float]:

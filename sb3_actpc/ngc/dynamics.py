@@ -8,7 +8,7 @@ import torch as th
 from sb3_actpc.ngc.activations import Activation
 from sb3_actpc.ngc.synapses import Synapses, predict
 
-DYNAMICS = ("error", "state")
+DYNAMICS = ("krylov", "error", "state")
 
 
 @dataclass
@@ -23,6 +23,7 @@ class SettledState:
     :param output_drive: the output's error times g', what reaches the synapses and the layer above (B, n_outputs)
     :param memory: the working memory m_t, (B, n_memory), or None
     :param arrived: the share of the output's error that has had time to reach each layer, L numbers in (0, 1]
+    :param n_steps: settling steps taken; 0 for a sweep
     """
 
     latents: list[th.Tensor]
@@ -31,6 +32,7 @@ class SettledState:
     output_drive: th.Tensor
     memory: th.Tensor | None
     arrived: tuple[float, ...]
+    n_steps: int = 0
 
     @property
     def postsynaptic(self) -> list[th.Tensor]:
@@ -47,7 +49,7 @@ class ChainSettings(NamedTuple):
 
     activation: Activation
     output_activation: Activation
-    dynamics: str = "error"
+    dynamics: str = "krylov"
     leak: float = 0.0
     derivative_free: bool = False
     feedback_scale: float = 1.0
@@ -62,6 +64,7 @@ class SettlingChain:
     :meth:`predict` brings predictions and errors up to date. ``dynamics="state"`` is eq. 1 to the letter (states integrate,
     errors follow); ``dynamics="error"`` lets the error neurons integrate the same right-hand side while the states ride
     on their predictions (z = z̄ + e). Both rest where the right-hand side vanishes, so they have the same fixed points.
+    "krylov" goes there in a few steps: see :mod:`~sb3_actpc.ngc.krylov`.
 
     Layers that no error has reached yet stand still and cost nothing.
 
@@ -88,6 +91,7 @@ class SettlingChain:
         self.lowest_reached = self.n_hidden + 1
         self.target: th.Tensor | None = None
         self.arrived = (1.0,) * (self.n_hidden + 1)
+        self.n_steps = 0
         self.drive = self.output_prediction  # replaced as soon as the output is clamped
         self.errors: list[th.Tensor] = []
 
@@ -95,7 +99,7 @@ class SettlingChain:
         """Give every hidden layer its error neurons (at rest: 0) and its buffers."""
         hidden = self.latents[1:]
         self.errors = [th.zeros_like(z) for z in hidden]
-        self.feedback = [th.empty_like(z) for z in hidden]
+        self.signals = [th.empty_like(z) for z in hidden]
         self.first_prediction = hidden[0].clone() if hidden else self.output_prediction
 
     def clamp_output(self, target: th.Tensor) -> None:
@@ -123,10 +127,14 @@ class SettlingChain:
 
         With ``exact`` through W^T and with φ', whatever the circuit uses.
         """
-        settings = self.settings
         below = self.drive if layer == self.n_hidden else self.errors[layer]
+        return self.feedback(layer, below, exact, out=self.signals[layer - 1])
+
+    def feedback(self, layer: int, below: th.Tensor, exact: bool = False, out: th.Tensor | None = None) -> th.Tensor:
+        """:meth:`feedback_to` from any error ``below`` of the layer that ``layer`` predicts, (B, n_below)."""
+        settings = self.settings
         matrix = self.synapses.feedback_matrix(layer, settings.feedback_scale, tied=exact)
-        signal = th.mm(below, matrix, out=self.feedback[layer - 1])
+        signal = th.mm(below, matrix, out=out)
         if exact or not settings.derivative_free:
             settings.activation.damp(signal, self.latents[layer], self.activations[layer])
         return signal
@@ -139,7 +147,7 @@ class SettlingChain:
             signal, error, rate = self.feedback_to(layer), self.errors[layer - 1], rates[layer - 1]
             if settings.leak:
                 signal.sub_(self.latents[layer], alpha=settings.leak)
-            if settings.dynamics == "error" or layer == 1:  # the first layer's prediction is constant: both are the same
+            if settings.dynamics != "state" or layer == 1:  # the first layer's prediction is constant: both are the same
                 error.lerp_(signal, rate)
             else:
                 self.latents[layer].add_(signal.sub_(error), alpha=rate)
@@ -155,7 +163,7 @@ class SettlingChain:
             latents, error = self.latents[layer], self.errors[layer - 1]
             if layer == 1:
                 th.add(self.first_prediction, error, out=latents)
-            elif settings.dynamics == "error":
+            elif settings.dynamics != "state":
                 th.add(error, self.biases[layer - 1], out=latents)
                 latents.addmm_(self.activations[layer - 1], self.synapses.weights[layer - 1].t())
             else:
@@ -163,10 +171,19 @@ class SettlingChain:
                 error.addmm_(self.activations[layer - 1], self.synapses.weights[layer - 1].t(), alpha=-1.0)
             self.activations[layer] = settings.activation.apply(latents, self.activations[layer])
         if output:
-            th.addmm(self.biases[-1], self.activations[-1], self.synapses.weights[-1].t(), out=self.output_prediction)
-            self.output = settings.output_activation.apply(self.output_prediction, self.output)
-            if self.target is not None:
-                self._refresh_output_error()
+            self._predict_output()
+
+    def activate(self) -> None:
+        """Bring activations and output up to date after the hidden latents were set."""
+        for layer in range(1, self.n_hidden + 1):
+            self.activations[layer] = self.settings.activation.apply(self.latents[layer], self.activations[layer])
+        self._predict_output()
+
+    def _predict_output(self) -> None:
+        th.addmm(self.biases[-1], self.activations[-1], self.synapses.weights[-1].t(), out=self.output_prediction)
+        self.output = self.settings.output_activation.apply(self.output_prediction, self.output)
+        if self.target is not None:
+            self._refresh_output_error()
 
     def sweep(self, exact: bool = False) -> None:
         """
@@ -178,8 +195,7 @@ class SettlingChain:
         the step when the error first reaches it. With tied feedback it is, numerically, the gradient of the output's loss;
         with learned error synapses no W^T is used anywhere. With ``exact`` it is that gradient for every circuit.
         """
-        self.feedback = [th.empty_like(z) for z in self.latents[1:]]
-        self.errors = self.feedback
+        self.errors = self.signals = [th.empty_like(z) for z in self.latents[1:]]
         for layer in range(self.n_hidden, 0, -1):
             self.feedback_to(layer, exact)
 
@@ -193,4 +209,5 @@ class SettlingChain:
             output_drive=self.drive,
             memory=self.memory,
             arrived=self.arrived,
+            n_steps=self.n_steps,
         )

@@ -6,6 +6,7 @@ import pytest
 import torch as th
 
 from sb3_actpc.ngc import ACTIVATIONS, NGCCircuit
+from sb3_actpc.ngc.dynamics import DYNAMICS
 from sb3_actpc.ngc.stability import arrival_fractions
 from tests.ngc import oracle
 
@@ -13,7 +14,7 @@ ITERATIVE = {"feedback": "tied", "n_settling_steps": 1}
 
 
 def make(hidden=(12, 9), dtype=th.float64, **keywords) -> tuple[NGCCircuit, th.Tensor, th.Tensor]:
-    circuit = NGCCircuit(5, 3, hidden, **keywords).to(dtype)
+    circuit = NGCCircuit(5, 3, hidden, **{"dynamics": "error", **keywords}).to(dtype)
     return circuit, th.randn(7, 5, dtype=dtype), 0.5 * th.randn(7, 3, dtype=dtype)
 
 
@@ -79,12 +80,12 @@ def test_both_dynamics_rest_at_the_same_fixed_point(leak):
     assert float(circuit.residual(states[0])) < 1e-8
 
 
-@pytest.mark.parametrize("dynamics", ["error", "state"])
+@pytest.mark.parametrize("dynamics", DYNAMICS)
 @pytest.mark.parametrize("hidden", [(8,), (8, 6), (8, 6, 7)])
 def test_a_linear_circuit_settles_to_the_solution_of_its_linear_system(dynamics, hidden):
     """Stationarity of the quadratic energy, (I + W_below^T W_below) z = z̄ + W_below^T (z_below - b), solved at once."""
     circuit, x, target = make(hidden=hidden, activation="identity", dynamics=dynamics, **ITERATIVE)
-    circuit.n_settling_steps = 4000
+    circuit.n_settling_steps, circuit.settling_tolerance = (3 if dynamics == "krylov" else 4000), 0.0  # 3 outputs
     sizes, n = list(hidden), len(x)
     weights, biases = list(circuit.weights), list(circuit.biases)
     offsets = [sum(sizes[:i]) for i in range(len(sizes) + 1)]
@@ -102,6 +103,57 @@ def test_a_linear_circuit_settles_to_the_solution_of_its_linear_system(dynamics,
     solution = th.linalg.solve(matrix, right.t()).t()
     state = circuit.settle(x, target)
     assert th.allclose(th.cat(state.latents[1:-1], dim=1), solution, atol=1e-8)
+
+
+@pytest.mark.parametrize("feedback", ["tied", "learned"])
+@pytest.mark.parametrize("hidden", [(8,), (8, 6), (8, 6, 7)])
+def test_krylov_settling_rests_where_eq_1_does_while_states_move_little(hidden, feedback):
+    """Any E, tanh at both ends, an output error of 1e-5: what is left is of second order."""
+    circuit, x, _ = make(hidden, activation="tanh", output_activation="tanh", feedback=feedback, dynamics="krylov")
+    circuit.n_settling_steps, circuit.settling_tolerance = 3, 0.0
+    target = circuit.project(x) + 1e-5 * th.randn(7, 3, dtype=x.dtype)
+    mine = circuit.settle(x, target)
+    circuit.dynamics, circuit.n_settling_steps = "error", 3000
+    circuit.rates.fill_(0.1)
+    rest = circuit.settle(x, target)
+    assert mine.n_steps == 3 and float(circuit.residual(mine)) < 1e-3 < 0.01 < float(circuit.residual(_swept(circuit, x, target)))
+    for a, b in zip([*mine.errors, *mine.latents], [*rest.errors, *rest.latents], strict=True):
+        assert th.allclose(a, b, atol=1e-9)
+
+
+def _swept(circuit, x, target):
+    chain = circuit.chain(x)
+    chain.clamp_output(target)
+    chain.start_settling()
+    chain.sweep()
+    chain.lowest_reached = 1
+    chain.predict()
+    return chain.state()
+
+
+def test_krylov_settling_stops_at_its_tolerance():
+    circuit, x, _ = make(hidden=(64, 64), activation="tanh", dynamics="krylov", feedback="tied")
+    target = circuit.project(x) + 1e-5 * th.randn(7, 3, dtype=x.dtype)
+    steps, residuals = [], []
+    for tolerance in (0.9, 0.3, 0.01, 0.0):
+        circuit.settling_tolerance = tolerance
+        state = circuit.settle(x, target)
+        steps.append(state.n_steps)
+        residuals.append(float(circuit.residual(state)))
+    assert steps[0] == 1 and steps == sorted(steps) and steps[-1] == circuit.n_settling_steps
+    assert residuals[0] > residuals[2]
+
+
+def test_two_krylov_steps_lower_the_energy_more_than_twenty_of_eq_1():
+    circuit, x, target = make(hidden=(64, 64), feedback="tied", dynamics="krylov", settling_tolerance=0.0)
+    for weights in circuit.weights:
+        weights.mul_(2.0)  # as trained circuits have them: eq. 1 must then take small steps
+    circuit.n_settling_steps = 2
+    mine = circuit.energy(circuit.settle(x, target)).mean()
+    circuit.dynamics, circuit.n_settling_steps = "error", 20
+    norm = max(float(th.linalg.matrix_norm(w, 2)) for w in circuit.weights)
+    circuit.rates.fill_(1.0 / (1.0 + norm**2))
+    assert mine < circuit.energy(circuit.settle(x, target)).mean()
 
 
 @pytest.mark.parametrize("dynamics", ["error", "state"])
@@ -194,6 +246,9 @@ def test_circuits_without_hidden_layers_work():
         ({"hidden": (0,)}, "hidden"),
         ({"leak": -1.0}, "leak"),
         ({"synaptic_scaling": "l2"}, "l2"),
+        ({"leak": 0.1}, "leak=0.1 needs dynamics"),
+        ({"settling_rate": 0.1}, "settling_rate=0.1 needs dynamics"),
+        ({"settling_tolerance": -1.0}, "settling_tolerance=-1.0"),
         ({"settling": "scheduled", "leak": 0.1}, "leak=0.1 conflicts"),
         ({"settling": "scheduled", "settling_rate": 0.5}, "settling_rate=0.5 conflicts"),
         ({"settling": "scheduled", "feedback_scale": 0.5}, "feedback_scale=0.5 conflicts"),
