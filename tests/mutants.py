@@ -85,8 +85,8 @@ MUTANTS = [
     Mutant(
         "one step of settling too many",
         CIRCUIT,
-        "range(self.n_settling_steps if self.n_hidden else 0)",
-        "range(self.n_settling_steps + 1 if self.n_hidden else 0)",
+        "in range(1, self.n_settling_steps + 1):",
+        "in range(1, self.n_settling_steps + 2):",
         f"{SETTLING} -k 'one_step or arriv'",
     ),
     Mutant(
@@ -158,6 +158,34 @@ MUTANTS = [
         "in range(self.n_hidden, 0, -1):",
         "in range(1, self.n_hidden + 1):",
         f"{SCHEDULED} -k equal_backprop",
+    ),
+    Mutant(
+        "learned sweeps go back through the weights",
+        "ngc/synapses.py",
+        "if self.feedback and not tied:",
+        "if self.feedback and tied:",
+        f"{SCHEDULED} -k 'transposed or equation'",
+    ),
+    Mutant(
+        "krylov settling without the states' answer",
+        "ngc/krylov.py",
+        "return answer.add_(drive)",
+        "return drive.clone()",
+        f"{SETTLING} -k krylov",
+    ),
+    Mutant(
+        "krylov directions overlap",
+        "ngc/krylov.py",
+        "theirs, value=-1.0)",
+        "theirs, value=-0.5)",
+        f"{SETTLING} -k linear_circuit",
+    ),
+    Mutant(
+        "noise is mirrored from the wrong side",
+        PLASTICITY,
+        "(noise @ weights.t()).t(), noise,",
+        "noise.t()[: len(weights)], noise,",
+        f"{LEARNING} -k mirrored",
     ),
     Mutant("energy without the half", DYNAMICS, "return 0.5 * th.stack", "return 1.0 * th.stack", CLOSED),
     Mutant(

@@ -50,6 +50,7 @@ class Diagnostics:
         """Energy (batch mean) and settling residual of a circuit."""
         if self.active:
             self.values[f"{name}_energy"] = float(state.total_discrepancy().mean())
+            self.values[f"{name}_settling_steps"] = state.n_steps
             self.values[f"{name}_residual"] = float(self.circuits[_key(name)].residual(state))
 
     def coupled(self, state: CoupledState, changes: HebbianChanges, features: th.Tensor, memory: th.Tensor | None) -> None:
