@@ -100,7 +100,7 @@ def load_results(folder: Path) -> Results:
         return Results(_labelled(runs), pd.read_csv(folder / CURVES), _NO_ROWS, _NO_ROWS)
     found = sorted({path.parent for name in (CONFIG, ERROR) for path in folder.glob(f"*/*/seed[0-9]*_*/{name}")})
     if not found:
-        raise FileNotFoundError(f"no runs in {folder}: make some with sb3-actpc compare --out {folder}")
+        raise FileNotFoundError(f"no runs in {folder}: make some with sb3-actpc compare --output {folder}")
     rows = []
     tables: dict[str, list[pd.DataFrame]] = {PROGRESS: [], EPISODES: [], DIAGNOSTICS: []}
     for path in found:

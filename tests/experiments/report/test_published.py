@@ -68,7 +68,7 @@ def test_a_row_says_more_than_a_column_and_runs_of_a_changed_source_tree_are_mar
     table = lines(folder, "TD3: {variant: td3, cell: '{score}, {steps:,.0f}'}, ActPC: actpc")
     assert lines(folder, "ActPC: actpc, d: demonstrators", "{dense_return:.0f} x {n:.0f}")[2:] == [
         "| ActPC | 200 x 2 | -4 x 1 |",
-        "| d | 2000 |  |",
+        "| d | 2000 | 2000 |",
     ]
     assert lines(folder, "ActPC: actpc", "{paper:.1f}")[2] == "| ActPC | 2170.7 | -9.3 |"
     assert table[2:] == ["| TD3 | 7 (2), 1,000 † |  |", "| ActPC | 200 (2) | 1.00 |"]

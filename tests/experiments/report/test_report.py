@@ -193,7 +193,7 @@ def test_a_row_that_was_not_written_to_its_end_is_left_out(tmp_path: Path) -> No
 def test_a_folder_without_runs_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["report", str(tmp_path)]) == 2
     errors = capsys.readouterr().err
-    assert "no runs in" in errors and "sb3-actpc compare --out" in errors and errors.count("\n") == 1
+    assert "no runs in" in errors and "sb3-actpc compare --output" in errors and errors.count("\n") == 1
 
 
 def test_robosuites_tasks_are_scored_by_success(tmp_path: Path) -> None:

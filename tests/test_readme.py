@@ -1,0 +1,85 @@
+"""The README and what stands beside it: commands that exist, links that lead somewhere, code that runs."""
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+import yaml
+
+from sb3_actpc.cli import build_parser
+from sb3_actpc.experiments.comparison import plan_runs, read_comparison
+
+ROOT = Path(__file__).parents[1]
+PAGES = ["README.md", "RESULTS.md", *(f"docs/{path.name}" for path in sorted((ROOT / "docs").glob("*.md")))]
+
+
+def blocks(page: str, language: str) -> list[str]:
+    """The code blocks of a page."""
+    return re.findall(rf"```{language}\n(.*?)```", (ROOT / page).read_text(encoding="utf-8"), flags=re.DOTALL)
+
+
+def commands(page: str) -> list[str]:
+    """Every call of ``sb3-actpc`` in a page's shell blocks, variables filled in; rl-zoo3 reads its own options."""
+    found, variables = [], {}
+    for line in "".join(blocks(page, "bash")).splitlines():
+        words = shlex.split(line, comments=True)
+        if len(words) == 1 and "=" in words[0]:
+            variables[f"${words[0].partition('=')[0]}"] = words[0].partition("=")[2]
+            continue
+        text = shlex.join(shlex.split(variables[words[0]]) + words[1:]) if words and words[0] in variables else line
+        found += [part.strip() for part in text.split("&&") if part.strip().startswith("sb3-actpc")]
+    return [command for command in found if not command.startswith("sb3-actpc zoo")]
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_every_command_is_one_that_the_command_line_takes(page: str) -> None:
+    for command in commands(page):
+        build_parser().parse_args(shlex.split(command, comments=True)[1:])  # exits where it does not
+
+
+def test_the_commands_are_found() -> None:
+    assert len(commands("README.md")) >= 10 and len(commands("RESULTS.md")) >= 15
+    assert any(command.startswith("sb3-actpc compare --output runs/first") for command in commands("RESULTS.md"))
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_every_link_inside_the_repository_leads_to_a_file(page: str) -> None:
+    for target in re.findall(r"\]\(([^)\s]+)\)", (ROOT / page).read_text(encoding="utf-8")):
+        file, _, heading = target.partition("#")
+        if file.startswith("http"):
+            continue
+        path = (ROOT / page).parent / file if file else ROOT / page
+        assert path.exists(), f"{page}: {target}"
+        if heading:
+            names = re.findall(r"^#+ (.*)$", path.read_text(encoding="utf-8"), flags=re.MULTILINE)
+            assert heading in [re.sub(r"[^\w -]", "", name.lower()).replace(" ", "-") for name in names], f"{page}: {target}"
+
+
+def test_the_ci_runs_the_test_command_of_the_readme() -> None:
+    [command] = [line for block in blocks("README.md", "bash") for line in block.splitlines() if "pytest" in line]
+    assert command in (ROOT / ".ci" / "run").read_text(encoding="utf-8").splitlines()
+
+
+def test_the_circuit_of_the_readme_learns() -> None:
+    [block] = [block for block in blocks("README.md", "python") if "NGCCircuit" in block]
+    names: dict[str, object] = {}
+    exec(block, names)
+    energies = []
+    for _ in range(50):
+        exec("state = circuit.settle(x, target); circuit.apply_changes(circuit.hebbian_update(state), optimizer)", names)
+        exec("energy = float(((circuit.project(x) - target) ** 2).mean())", names)
+        energies.append(names["energy"])
+    assert energies[-1] < energies[0]  # type: ignore[operator]
+
+
+def test_the_agent_of_the_readme_takes_its_keywords() -> None:
+    [block] = [block for block in blocks("README.md", "python") if "model = ActPC(" in block]
+    exec(block.replace('model.learn(5_000, progress_bar=True)\nmodel.save("cheetah")\n', ""), {})
+
+
+def test_the_file_of_the_comparisons_page_is_one() -> None:
+    [block] = blocks("docs/comparisons.md", "yaml")
+    comparison = read_comparison(yaml.safe_load(block))
+    assert [len(comparison.tasks), len(comparison.variants), comparison.seeds] == [2, 3, 5]
+    assert [len(plan_runs(comparison, Path("none")))] == [2 * 3 * 5]
