@@ -9,6 +9,7 @@ from sb3_actpc.envs import register_envs
 if TYPE_CHECKING:
     from sb3_actpc.actpc import ActPC, CnnPolicy, MlpPolicy, MultiInputPolicy
     from sb3_actpc.demonstrations import Demonstrations, shipped_demonstrations
+    from sb3_actpc.experiments.runs import preset
     from sb3_actpc.ngc import NGCCircuit
 
 try:
@@ -24,6 +25,7 @@ __all__ = [
     "MultiInputPolicy",
     "NGCCircuit",
     "__version__",
+    "preset",
     "shipped_demonstrations",
 ]
 
@@ -32,9 +34,14 @@ _MODULE_OF = {
     **dict.fromkeys(("ActPC", "CnnPolicy", "MlpPolicy", "MultiInputPolicy"), "sb3_actpc.actpc"),
     **dict.fromkeys(("Demonstrations", "shipped_demonstrations"), "sb3_actpc.demonstrations"),
     "NGCCircuit": "sb3_actpc.ngc",
+    "preset": "sb3_actpc.experiments.runs",
 }
 
 register_envs()
+
+
+def __dir__() -> list[str]:
+    return __all__
 
 
 def __getattr__(name: str) -> Any:

@@ -43,7 +43,7 @@ def read_comparison(given: Mapping[str, Any]) -> Comparison:
     """
     given = {str(key): value for key, value in given.items() if value is not None}
     own = {key: given.pop(key) for key in OWN_KEYS if key in given}
-    shared = part_of_run({"eval_episodes": 10, "continuable": False, **given})
+    shared = part_of_run({"eval_episodes": 10, "continuable": False, **given}, OWN_KEYS)
     variants = [parse_variant(entry) for entry in _list(own, "algos")]
     if own.get("ablate"):
         variants += [variant for variant in ablation_variants() if variant not in variants]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -43,7 +43,7 @@ def parse_variant(entry: Any) -> Run:
         raise ValueError(f"expected the name of an algorithm or a mapping, found {entry!r}")
     given = {str(key): value for key, value in entry.items()}
     base = given.pop("base", None)
-    own = part_of_run(given)
+    own = part_of_run(given, ("base",))
     if base is not None:
         return Run(**merged(find_variant(base), own))
     if "algo" not in given:
@@ -51,15 +51,19 @@ def parse_variant(entry: Any) -> Run:
     return Run(**merged(Run(name=own.algo), own))
 
 
-def part_of_run(entry: Mapping[str, Any]) -> Run:
+def part_of_run(entry: Mapping[str, Any], also: Sequence[str] = ()) -> Run:
     """
     :param entry: keys of a run
+    :param also: further keys that stand beside them where the entry is from
     :return: the part
     :raises ValueError: for an unknown key, a wrong value, or a key that the comparison itself decides
     """
-    for key in PLANNED:
-        if key in entry:
-            raise ValueError(f"{key}={entry[key]!r} cannot be given here: the comparison decides it, leave it out")
+    known = sorted({*also, *Run.known_keys()} - set(PLANNED))
+    for key, value in entry.items():
+        if key in PLANNED:
+            raise ValueError(f"{key}={value!r} cannot be given here: the comparison decides it, leave it out")
+        if key not in known:
+            raise ValueError(f"unknown key {key!r}{nearest(key, known)}: expected some of {', '.join(known)}")
     return Run(**entry)
 
 

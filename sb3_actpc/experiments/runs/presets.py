@@ -64,7 +64,7 @@ def load_preset(preset: str, env_id: str) -> dict[str, Any]:
     :raises FileNotFoundError: when there is no such preset
     :raises ValueError: when the file is not a YAML mapping, or has neither entry
     """
-    path = _preset_path(preset)
+    path = preset_path(preset)
     entries = read_yaml(path.read_bytes(), str(path))
     if not isinstance(entries, Mapping):
         raise ValueError(f"{path}: expected a mapping from environment ids to settings")
@@ -257,7 +257,12 @@ def preset_names() -> list[str]:
     return sorted({path.stem for folder in HYPERPARAMS_FOLDERS for path in folder.glob("*.yml")})
 
 
-def _preset_path(name: str) -> Path:
+def preset_path(name: str) -> Path:
+    """
+    :param name: of a file of the package, or a path ending in ``.yml`` or ``.yaml``
+    :return: where it is
+    :raises FileNotFoundError: when there is none
+    """
     if Path(name).suffix in (".yml", ".yaml"):
         if not Path(name).is_file():
             raise FileNotFoundError(f"no preset file at {name}")

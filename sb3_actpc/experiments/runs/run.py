@@ -145,8 +145,8 @@ def _stored_run(folder: Path, report: Report) -> Run | None:
 
 
 def _content(run: Run) -> str:
-    """An id of what must not change; the policy may have been fitted to the observations."""
-    return content_id({**run.model_dump(), "n_timesteps": None, "policy": None}, run.seed)
+    """An id of what must not change; the policy may have been fitted to the observations, and ``eval_freq`` to the steps."""
+    return content_id({**run.model_dump(), "n_timesteps": None, "policy": None, "eval_freq": None}, run.seed)
 
 
 def _run(run: Run, report: Report, callbacks: Sequence[BaseCallback], resumes: bool) -> dict[str, Any]:

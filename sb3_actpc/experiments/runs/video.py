@@ -124,7 +124,10 @@ def _rendering(env_id: str, env_kwargs: dict[str, Any]) -> Iterator[Any]:
 
     env = None
     try:
-        env = make_env(env_id, env_kwargs, render_mode="rgb_array")
+        try:
+            env = make_env(env_id, env_kwargs, render_mode="rgb_array")
+        except ValueError as error:  # it takes no render_mode
+            raise NotImplementedError(str(error)) from error
         yield env
     except (FatalError, gym.error.Error, ImportError, OSError, RuntimeError, AttributeError, NotImplementedError) as error:
         raise RenderingUnavailable(f"{type(error).__name__}: {error}") from error

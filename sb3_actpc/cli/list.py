@@ -1,0 +1,69 @@
+"""``sb3-actpc list``: what there is to choose from."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+
+KINDS = ("tasks", "algos", "presets", "demos")
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the sub-command.
+
+    :param subparsers: where to add it
+    """
+    parser = subparsers.add_parser("list", help="what there is: tasks, algorithms, presets, demonstrations")
+    parser.add_argument("kind", choices=KINDS, help="tasks (--env), algos (--algo, and variants of compare), presets, demos")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print a line for each.
+
+    :param args: parsed arguments
+    :return: exit code 0
+    """
+    rows = list({"tasks": _tasks, "algos": _algos, "presets": _presets, "demos": _demos}[args.kind]())
+    width = max(len(name) for name, _ in rows)
+    for name, about in rows:
+        print(f"{name:{width}}  {about}".rstrip())
+    return 0
+
+
+def _tasks() -> Iterator[tuple[str, str]]:
+    from sb3_actpc import envs
+
+    kinds = (
+        (envs.SPARSE_MUJOCO_IDS, "a MuJoCo task with a sparse reward"),
+        (envs.GOAL_MUJOCO_IDS, "the same with a goal in the observation, for hindsight"),
+        (envs.ROBOSUITE_IDS, "an arm of robosuite (extra robosuite)"),
+    )
+    yield from ((env_id, about) for ids, about in kinds for env_id in ids)
+    yield "any other Gymnasium id", "with --demonstrations FILE or none, and --gym-packages where a module registers it"
+
+
+def _algos() -> Iterator[tuple[str, str]]:
+    from sb3_actpc.experiments.comparison import find_variant, variant_names
+    from sb3_actpc.experiments.runs.algorithms import ALGORITHMS, load_algorithm
+
+    for name in ALGORITHMS:
+        yield name, (load_algorithm(name).__doc__ or "").strip().partition("\n")[0]
+    for name in variant_names():
+        if name not in ALGORITHMS:
+            yield name, f"for compare, {find_variant(name).algo}: {find_variant(name).about}"
+
+
+def _presets() -> Iterator[tuple[str, str]]:
+    from sb3_actpc.experiments.runs.presets import preset_names, preset_path
+
+    for name in preset_names():
+        yield name, str(preset_path(name))
+
+
+def _demos() -> Iterator[tuple[str, str]]:
+    from sb3_actpc.demonstrations import Demonstrations
+    from sb3_actpc.demonstrations.dataset import DATA_FOLDER
+
+    for path in sorted(DATA_FOLDER.glob("*.npz")):
+        demonstrations = Demonstrations.load(path)
+        yield demonstrations.env_id, f"{demonstrations.n_episodes} episodes in {path}"

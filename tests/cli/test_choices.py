@@ -1,0 +1,162 @@
+"""What a user may choose on the command line: steps, settings, own environments, more steps, TensorBoard."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from stable_baselines3 import TD3
+
+import sb3_actpc
+from sb3_actpc.cli import main
+from sb3_actpc.experiments.runs import Run, finish_run
+from tests.cli.line import ENV_ID, RUN, rows_of, train
+
+ROOT = Path(__file__).resolve().parents[2]
+OWN_TASK = """
+import gymnasium as gym
+import numpy as np
+
+
+class Own(gym.Env):
+    def __init__(self):
+        box = gym.spaces.Box(-1.0, 1.0, (2,), np.float32)
+        self.observation_space = gym.spaces.Dict({"a": box, "b": box})
+        self.action_space = gym.spaces.Box(-1.0, 1.0, (1,))
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.count = 0
+        return self._observation(), {}
+
+    def step(self, action):
+        self.count += 1
+        return self._observation(), 1.0, self.count == 5, False, {}
+
+    def _observation(self):
+        return {"a": np.zeros(2, np.float32), "b": np.ones(2, np.float32)}
+
+
+gym.register("Own-v0", Own)
+"""
+
+
+def test_the_package_is_the_command() -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "sb3_actpc", "--version"], capture_output=True, text=True, cwd=ROOT, check=True
+    )
+    assert done.stdout == f"sb3-actpc {sb3_actpc.__version__}\n"
+
+
+def test_public_names_are_completed() -> None:
+    assert {"ActPC", "preset", "Demonstrations"} <= set(dir(sb3_actpc))
+
+
+@pytest.mark.parametrize(("kind", "found"), [("tasks", "SparseHopper-v5"), ("algos", "sac_rlpd"), ("demos", "20 episodes")])
+def test_what_there_is_can_be_listed(kind: str, found: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["list", kind]) == 0
+    assert found in capsys.readouterr().out
+
+
+def test_the_zoos_help_lists_its_commands(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["zoo", "--help"])
+    assert ended.value.code == 0
+    shown = capsys.readouterr().out
+    assert all(command in shown for command in ("train", "optimize", "enjoy", "plot", "all_plots"))
+
+
+def test_steps_and_settings_as_people_write_them() -> None:
+    assert train("--demonstrations", "none", "--steps", "2e1", "--set", "policy_kwargs.net_arch=[5,6]") == 0
+    model = TD3.load(RUN / "model.zip")
+    assert model.num_timesteps == 20
+    assert [layer.out_features for layer in model.actor.mu if hasattr(layer, "out_features")] == [5, 6, 1]
+
+
+@pytest.mark.parametrize("steps", ["1.5", "many", "inf", "nan"])
+def test_steps_that_are_no_whole_number_are_refused(steps: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        train("--steps", steps)
+    assert f"'{steps}' is not a whole number, such as 100000 or 1e5" in capsys.readouterr().err
+
+
+def test_an_environment_of_the_working_folder_with_observations_of_two_parts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "own_task.py").write_text(OWN_TASK, encoding="utf-8")
+    monkeypatch.setattr(sys, "path", [path for path in sys.path if path not in ("", str(tmp_path))])
+    command = ["train", "--env", "Own-v0", "--algo", "td3", "--preset", "small.yml", "--gym-packages", "own_task"]
+    assert main([*command, "--steps", "30", "--no-progress", "--output", "own"]) == 0
+    record = json.loads(Path("own/config.json").read_text(encoding="utf-8"))
+    assert (record["policy"], record["gym_packages"]) == ("MultiInputPolicy", ["own_task"])
+    assert main(["evaluate", "own", "--episodes", "1", "--no-video"]) == 0
+
+
+def test_a_finished_run_is_given_more_steps(capsys: pytest.CaptureFixture[str]) -> None:
+    """It ends as one that was to have them from the beginning, its evaluations at the former end apart."""
+    straight = ["--demonstrations", "none", "--eval-freq", "20", "--steps", "60", "--output", "straight"]
+    assert train(*straight) == 0
+    assert train(*[{"60": "40", "straight": "more"}.get(word, word) for word in straight]) == 0
+    assert main(["train", "--resume", "more", "--no-progress"]) == 2
+    assert "is finished: say with --steps how many more it shall have" in capsys.readouterr().err
+    assert main(["train", "--resume", "more", "--steps", "2e1", "--no-progress"]) == 0
+    assert "60 steps from step 40" in capsys.readouterr().out
+    assert [int(row["timesteps"]) for row in rows_of("more")] == [0, 20, 40, 60]
+    assert json.loads(Path("more/result.json").read_text(encoding="utf-8"))["timesteps"] == 60
+    weights = [TD3.load(f"{name}/model.zip").policy.state_dict() for name in ("straight", "more")]
+    assert all(bool((value == weights[1][name]).all()) for name, value in weights[0].items())
+    assert len(list(Path("more/checkpoints").iterdir())) == 1
+
+
+def test_a_finished_run_without_a_checkpoint_says_so(capsys: pytest.CaptureFixture[str]) -> None:
+    assert train("--demonstrations", "none", "--steps", "20", "--checkpoint-freq", "0", "--output", "mine") == 0
+    assert main(["train", "--resume", "mine", "--steps", "20"]) == 2
+    assert "kept no checkpoint to go on from" in capsys.readouterr().err
+
+
+def test_bringing_a_run_to_its_end_begins_goes_on_or_does_nothing() -> None:
+    lines: list[str] = []
+    run = Run(env=ENV_ID, algo="td3", preset="small.yml", demonstrations="none", steps=20, output="mine", progress=False)
+    assert finish_run(run, lines.append)["timesteps"] == 20
+    lines.clear()
+    assert finish_run(run, lines.append)["timesteps"] == 20 and lines == []
+    longer = Run(**{**run.model_dump(), "n_timesteps": 40})
+    assert finish_run(longer, lines.append)["timesteps"] == 40
+    assert "40 steps from step 20" in lines[0]
+    with pytest.raises(ValueError, match="mine holds another run"):
+        finish_run(Run(**{**run.model_dump(), "settings": {"gamma": 0.5}}))
+
+
+def test_training_ends_at_the_return_that_was_aimed_at_with_the_best_agent() -> None:
+    """Every evaluation of the line gives 20; the first is before the training."""
+    run = Run(env=ENV_ID, algo="td3", preset="small.yml", demonstrations="none", eval_freq=10, steps=60, progress=False)
+    given = {**run.model_dump(exclude_unset=True), "target_return": 19.0, "keep": "best", "output": "mine"}
+    assert finish_run(Run(**given))["timesteps"] == 1
+    assert finish_run(Run(**given))["timesteps"] == 1  # it is finished
+    unreachable = finish_run(Run(**{**given, "target_return": 21.0, "output": "other"}))
+    assert unreachable["timesteps"] == 60
+
+
+def test_tensorboard_gets_the_log_where_the_settings_say_so() -> None:
+    pytest.importorskip("tensorboard")
+    assert train("--demonstrations", "none", "--steps", "20", "--set", "tensorboard_log=board") == 0
+    assert list(Path("board").rglob("events.out.tfevents*"))
+
+
+def test_without_tensorboard_the_setting_is_refused(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("stable_baselines3.common.logger.SummaryWriter", None)
+    assert train("--demonstrations", "none", "--steps", "20", "--set", "tensorboard_log=board") == 2
+    assert "tensorboard_log='board' needs TensorBoard: pip install tensorboard" in capsys.readouterr().err
+
+
+def test_a_task_that_takes_no_render_mode_is_replayed_without_a_video(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "own_task.py").write_text(OWN_TASK, encoding="utf-8")
+    command = ["train", "--env", "own_task:Own-v0", "--algo", "td3", "--preset", "small.yml", "--steps", "5", "--no-progress"]
+    assert main([*command, "--output", "own"]) == 0
+    assert main(["evaluate", "own", "--episodes", "1"]) == 0
+    assert "no video: rendering is not available here" in capsys.readouterr().out
