@@ -281,7 +281,7 @@ MUTANTS = [
         AGENT,
         "        self.pretrained = True",
         "        self.pretrained = False",
-        f"{LEARNS} -k prior",
+        EQUATIONS,
     ),
     Mutant("the agent ignores the nudge", AGENT, "memory, self.nudge)", "memory)", f"{LEARNS} -k nudge"),
     Mutant(

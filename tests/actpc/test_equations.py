@@ -45,3 +45,13 @@ def test_demonstrated_steps_are_rewarded_by_surprise_and_punished_for_leaving_th
     model = ActPC("MlpPolicy", env, demonstrations=demonstrations(), **keywords)
     model.learn(40)
     assert model.expert.epistemic.min() > 0.0 > model.expert.instrumental.max()
+
+
+def test_a_second_learn_leaves_the_prior_alone():
+    """The paper trains it once, before the task, and freezes it."""
+    keywords = {"learning_starts": 20, "policy_kwargs": {"net_arch": [16, 16]}, **SMALL}
+    model = ActPC("MlpPolicy", make_vec_env(CountingEnv), demonstrations=demonstrations(), **keywords)
+    model.learn(10)
+    before = [weights.clone() for weights in model.prior.weights]
+    model.learn(10)
+    assert all(th.equal(*pair) for pair in zip(before, model.prior.weights, strict=True))
