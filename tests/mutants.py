@@ -327,7 +327,7 @@ MUTANTS = [
         AGENT,
         "batch.bootstrap_features, batch.next_memory",
         "batch.bootstrap_features, batch.memory",
-        f"{LEARNS} -k 'target or memory'",
+        EQUATIONS,
     ),
     Mutant(
         "half of the demonstrations' share",

@@ -55,3 +55,17 @@ def test_a_second_learn_leaves_the_prior_alone():
     before = [weights.clone() for weights in model.prior.weights]
     model.learn(10)
     assert all(th.equal(*pair) for pair in zip(before, model.prior.weights, strict=True))
+
+
+def test_the_bootstrapped_action_is_that_of_the_next_observation_with_the_memory_it_will_have():
+    """μ'(o_t+1, m_t+1), where m_t+1 holds o_t: with m_t the target actor would act on what it had forgotten."""
+    keywords = {"learning_starts": 20, "policy_kwargs": {"net_arch": [16, 16], "memory_history": 3}, **SMALL}
+    model = ActPC("MlpPolicy", make_vec_env(CountingEnv), **keywords)
+    model.learn(60)
+    batch = model._sample_batch(32)
+    next_actions = model.actor_target.project(batch.bootstrap_features, batch.next_memory)
+    forgetful = model.actor_target.project(batch.bootstrap_features, batch.memory)
+    assert (next_actions - forgetful).abs().max() > 1e-3
+    values = model.critic_target[0].project(th.cat([batch.bootstrap_features, next_actions], dim=1))
+    expected = batch.rewards + (1.0 - batch.dones) * model.gamma * values
+    th.testing.assert_close(model._critic_targets(batch), expected)
