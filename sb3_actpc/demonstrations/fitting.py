@@ -34,7 +34,7 @@ def resolve(
     """
     if isinstance(source, Demonstrations):
         return source
-    if isinstance(source, str) and MINARI_ID.fullmatch(source) and not os.path.exists(source):
+    if isinstance(source, str) and _is_minari_id(source):
         return Demonstrations.from_minari(source, observation_space=observation_space)
     if isinstance(source, (str, os.PathLike)):
         return Demonstrations.load(source)
@@ -46,8 +46,13 @@ def findable(source: str | os.PathLike[str] | Demonstrations) -> str | Path | De
     :param source: as :func:`resolve`'s
     :return: the same, a path made absolute, so that a saved agent finds its demonstrations from any folder
     """
-    is_id = isinstance(source, str) and MINARI_ID.fullmatch(source) and not os.path.exists(source)
-    return source if is_id or isinstance(source, Demonstrations) else Path(source).absolute()
+    if isinstance(source, Demonstrations) or (isinstance(source, str) and _is_minari_id(source)):
+        return source
+    return Path(source).absolute()
+
+
+def _is_minari_id(source: str) -> bool:
+    return MINARI_ID.fullmatch(source) is not None and not os.path.exists(source)
 
 
 def fit_demonstrations(

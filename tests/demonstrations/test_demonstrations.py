@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
+import subprocess
 import sys
 import zipfile
 from collections.abc import Iterator
@@ -694,6 +695,14 @@ def test_a_file_whose_name_looks_like_a_minari_id_is_a_file(tmp_path: Path, monk
     monkeypatch.chdir(tmp_path)
     make_demonstrations().save("mine-v0")
     assert_equal(resolve("mine-v0"), make_demonstrations())
+
+
+def test_demonstrations_are_imported_without_what_is_heavy() -> None:
+    program = "import sys; from sb3_actpc import Demonstrations; from sb3_actpc.demonstrations import Demonstrations as Same; "
+    program += (
+        "assert Same is Demonstrations; print(sorted({'torch', 'stable_baselines3', 'mujoco', 'h5py'} & set(sys.modules)))"
+    )
+    assert subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout.strip() == "[]"
 
 
 def test_metadata_is_readable_without_the_package(saved: Path) -> None:
