@@ -1,5 +1,6 @@
 """ActPC: active predictive coding as a Stable-Baselines3 algorithm (Ororbia & Mali, arXiv 2209.09174, Algorithm 1)."""
 
+import time
 import warnings
 from collections.abc import Callable, Iterable
 from functools import partial, reduce
@@ -18,6 +19,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
+from tqdm import tqdm
 
 from sb3_actpc.actpc.arguments import (
     MAX_SEED,
@@ -55,6 +57,7 @@ SelfActPC = TypeVar("SelfActPC", bound="ActPC")
 # noise must not be blown up to full strength
 SMALLEST_VALUE_SCALE = 1.0
 EXPERT_SIGNALS_INTERVAL = 1000  # updates between two evaluations of the demonstrations' signals
+PRETRAINING_INTERVAL = 1000  # updates between two lines about pre-training
 
 
 class ActPC(OffPolicyAlgorithm):
@@ -85,7 +88,8 @@ class ActPC(OffPolicyAlgorithm):
     :param optimize_memory_usage: as in SB3
     :param n_steps: length of n-step returns
     :param settling: "iterative" (the paper) or "scheduled" (cheaper, numerically backprop without autograd)
-    :param demonstrations: a path, or a :class:`~sb3_actpc.demonstrations.dataset.Demonstrations`
+    :param demonstrations: a path, a Minari id, or a :class:`~sb3_actpc.demonstrations.dataset.Demonstrations`. A path is saved
+        as it was given; others can be set later (``agent.demonstrations = ...``), which a trained prior outlasts
     :param n_demonstrations: use only the first so many episodes of them
     :param n_demonstration_transitions: use only the first so many transitions (the paper's "300 samples")
     :param prior_updates: updates of the prior on the demonstrations before learning starts; then it is frozen
@@ -306,6 +310,7 @@ class ActPC(OffPolicyAlgorithm):
     def _setup_demonstrations(self) -> None:
         """Check the demonstrations against the environment, cut them, and derive what follows from having them."""
         self.expert: DemonstrationReplay | None = None
+        self._followed = self.demonstrations, self.n_demonstrations, self.n_demonstration_transitions
         if self.demonstrations is None:
             names = "demonstration_fraction actor_warm_start n_demonstrations n_demonstration_transitions".split()
             idle = [name for name in names if getattr(self, name)]
@@ -329,6 +334,21 @@ class ActPC(OffPolicyAlgorithm):
         if self.observation_normalization == "demonstrations" and not self.pretrained:
             observations = self.inputs.observations(self.expert.episodes.observations)
             self.actor.normalizer.fit(self.inputs.features(observations))
+
+    def _follow_demonstrations(self) -> None:
+        """
+        Use those that were set since, or that were put back. A prior and a normaliser that have learned stay as they are.
+
+        :raises ValueError: when they do not fit, or are not there
+        """
+        now = self.demonstrations, self.n_demonstrations, self.n_demonstration_transitions
+        if self.expert is None or any(mine is not other for mine, other in zip(now, self._followed, strict=True)):
+            self._setup_demonstrations()
+        if self.expert is None and self.demonstrations is not None:
+            raise ValueError(
+                f"no demonstrations file at {self.demonstrations}, and learning needs it: put it back, or set "
+                "agent.demonstrations"
+            )
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         super().set_env(env, force_reset)
@@ -364,18 +384,40 @@ class ActPC(OffPolicyAlgorithm):
                 self.replay_buffer.cut_running_episodes()
         result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
         self._check_observations(self._last_obs)
-        self.pretrain(between_updates(result[1]))
+        self._follow_demonstrations()
+        if self.verbose:
+            print(self.describe())
+        self.pretrain(between_updates(result[1]), progress_bar)
+        self.start_time = time.time_ns()  # of the frames per second: pre-training has none
         return result
 
-    def pretrain(self, before_update: Callable[[], None] = lambda: None) -> None:
+    def describe(self) -> str:
+        """What the reward is made of, from which demonstrations, and what is off; ``learn`` prints it with ``verbose=1``."""
+        assert self.replay_buffer is not None
+        ext, ep, inst = self.reward_weights
+        parts = {
+            "the task's reward": ext,
+            "generator": ep,
+            "prior": inst,
+            "critic's pressure": self.actor_pressure,
+            "refresh": self.refresh_weight,
+            "self-imitation": self.replay_buffer.self_imitation is not None,
+            "demonstrations in the critic's batch": self.demonstration_fraction,
+            "working memory": self.memory_history,
+        }
+        return (
+            f"reward: {ext:g} x task (alpha_ext) + {ep:g} x epistemic (alpha_ep) + {inst:g} x instrumental signal (alpha_in)\n"
+            f"demonstrations: {'none' if self.expert is None else self.expert.demonstrations!r}\n"
+            f"off: {', '.join(name for name, value in parts.items() if not value) or 'nothing'}"
+        )
+
+    def pretrain(self, before_update: Callable[[], None] = lambda: None, progress_bar: bool = False) -> None:
         """
         Train the prior (and, if asked for, the actor) on the demonstrations, once; ``learn`` calls this.
 
         :param before_update: called before each update
-        :raises ValueError: when the demonstrations of a loaded agent are not there any more
+        :param progress_bar: show one
         """
-        if self.expert is None and self.demonstrations is not None:
-            raise ValueError(f"no demonstrations file at {self.demonstrations}: set agent.demonstrations, or put it back")
         if self.pretrained or self.expert is None:
             return
         if self._vec_normalize_env is not None and self._vec_normalize_env.norm_obs:
@@ -385,7 +427,12 @@ class ActPC(OffPolicyAlgorithm):
                 stacklevel=2,
             )
         n_prior = self.prior_updates if self.alpha_in else 0  # without a weight the prior has no role
-        for update in range(self.n_pretraining_updates, n_prior + self.actor_warm_start):
+        updates: Iterable[int] = range(self.n_pretraining_updates, n_prior + self.actor_warm_start)
+        if progress_bar:
+            updates = tqdm(updates, "pre-training", n_prior + self.actor_warm_start, initial=self.n_pretraining_updates)
+        for update in updates:
+            if self.verbose and update % PRETRAINING_INTERVAL == 0:
+                print(f"pre-training: update {update} of {n_prior} of the prior and {self.actor_warm_start} of the actor")
             before_update()
             if update < n_prior:
                 self._update_prior(self.policy.batch_size_of("prior", self.batch_size))
@@ -715,7 +762,7 @@ class ActPC(OffPolicyAlgorithm):
 
     def _excluded_save_params(self) -> list[str]:
         aliases = ["actor", "critic", "generator", "prior", "actor_target", "critic_target"]
-        derived = ["expert", "diagnostics"]
+        derived = ["expert", "_followed", "diagnostics"]
         return [*super()._excluded_save_params(), *aliases, *derived]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:

@@ -155,7 +155,10 @@ def check_actions(space: gym.spaces.Box, noise: ActionNoise | None) -> None:
     except ValueError:
         fits = False
     if not fits:
-        raise ValueError(f"action_noise has mean and sigma of shapes {shapes[0]} and {shapes[1]}, the actions {space.shape}")
+        raise ValueError(
+            f"action_noise has a mean and a sigma of shapes {shapes[0]} and {shapes[1]}, an action has {space.shape}: use "
+            f"NormalActionNoise(np.zeros({space.shape}), 0.1 * np.ones({space.shape}))"
+        )
 
 
 # ---------------------------------------------------------------------- of the policy

@@ -1,5 +1,6 @@
 """Checks of what the user passes and of what circuits and environments produce."""
 
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
@@ -101,18 +102,23 @@ def named_in_errors(what: str, *passed_on: type[Exception]) -> Iterator[None]:
 
 def check_device(device: Any) -> None:
     """
+    Warns where SB3 will silently take the CPU: for a CUDA device on a machine without one.
+
     :param device: what the user passed
     :raises ValueError: when it is no torch device, or one that this machine cannot compute on
     """
     try:
         if not isinstance(device, (str, th.device)):
             raise RuntimeError(f"found a {type(device).__name__}")
-        th.zeros(1, device=get_device(device)).item()
+        chosen = get_device(device)
+        th.zeros(1, device=chosen).item()
     except (RuntimeError, AssertionError, NotImplementedError, ImportError) as error:
-        reason = (str(error).strip() or type(error).__name__).splitlines()[0]
+        reason = (str(error).strip() or type(error).__name__).splitlines()[0][:150]
         raise ValueError(
             f"device={device!r} must be 'auto' or a torch device of this machine, such as 'cpu' or 'cuda:0': {reason}"
         ) from error
+    if device != "auto" and th.device(device).type != chosen.type:
+        warnings.warn(f"device={str(device)!r}: torch finds none here, the agent runs on the CPU", stacklevel=2)
 
 
 def check_finite(where: str, what: str, values: np.ndarray, step: int) -> None:

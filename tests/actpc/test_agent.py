@@ -1,6 +1,9 @@
 """The agent: every part of Algorithm 1 is wired, and does what the paper says it does."""
 
 import dataclasses
+import multiprocessing
+import pickle
+import time
 import warnings
 
 import gymnasium as gym
@@ -15,6 +18,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_actpc import ActPC
+from sb3_actpc.ngc import NGCCircuit, settle_coupled
 from tests.actpc.agents import SMALL, differ, make, weights_of
 from tests.actpc.envs import CountingEnv, demonstrations
 
@@ -179,22 +183,29 @@ def test_scaled_pressure_is_divided_by_the_mean_absolute_action_value_or_by_one_
         assert th.allclose(plain, scaled * value.clamp_min(1.0), rtol=1e-2, atol=1e-7)
 
 
-def test_soft_targets_move_by_tau_and_hard_ones_every_c_transitions():
+def test_targets_of_actor_and_critic_move_by_tau():
     model = make(tau=0.25, learning_starts=1000)
-    model.learn(20)
-    with th.no_grad():
-        for p in model.critic.parameters():
+    pairs = [(model.critic_target, model.critic), (model.actor_target, model.actor.circuit)]
+    for _, circuit in pairs:
+        for p in circuit.parameters():
             p.add_(1.0)
-    before = weights_of(model.critic_target)
+    before = [weights_of(target) for target, _ in pairs]
     model._update_targets(model.tau)
-    for old, new, source in zip(before, weights_of(model.critic_target), weights_of(model.critic), strict=True):
-        assert th.allclose(new, 0.75 * old + 0.25 * source, atol=1e-6)
-    model = make(tau=1.0, target_update_interval=25, learning_starts=10)
-    model.learn(49)  # the copy of step 25 is in the target, the updates since are not
-    assert differ(weights_of(model.critic_target), weights_of(model.critic))
-    before = weights_of(model.critic_target)
-    model.learn(1, reset_num_timesteps=False)  # step 50: copied before its update
-    assert differ(before, weights_of(model.critic_target))
+    for olds, (target, circuit) in zip(before, pairs, strict=True):
+        for old, new, source in zip(olds, target.parameters(), circuit.parameters(), strict=True):
+            assert th.allclose(new, 0.75 * old + 0.25 * source, atol=1e-6)
+
+
+def test_hard_targets_are_copied_every_c_transitions_and_rest_in_between():
+    model = make(tau=1.0, target_update_interval=25)
+    copied = []
+    for step in range(1, 61):
+        circuits, targets = weights_of(model.critic), weights_of(model.critic_target)
+        model.learn(1, reset_num_timesteps=step == 1)
+        if differ(targets, weights_of(model.critic_target)):
+            copied.append(step)
+            assert not differ(circuits, weights_of(model.critic_target))  # as it was before this step's update
+    assert copied == [25, 50]
 
 
 def test_the_smallest_of_the_critics_bootstraps():
@@ -240,6 +251,64 @@ def test_the_prior_learns_from_the_demonstrations_and_then_stands_still():
     trained = weights_of(model.prior)
     model.learn(40)
     assert differ(untrained, trained) and not differ(trained, weights_of(model.prior))
+
+
+def test_generator_and_prior_learn_the_next_observation():
+    """Here the next observation is minus this one."""
+    data = demonstrations()
+    data = dataclasses.replace(data, next_observations=-data.observations)
+    model = make(demonstrations=data, prior_updates=300, demonstration_fraction=0.9, learning_rate=2e-3)
+    model.learn(300)
+    o, actions = th.as_tensor(data.observations), model.inputs.tensor(model.expert.episodes.actions)
+    for predicted in (model.prior.project(o), model.generator.project(th.cat([o, actions], dim=1))):
+        assert (predicted + o).square().mean() < 0.3 * o.square().mean()
+
+
+def test_refresh_imitates_the_agents_own_best_episodes_beside_the_demonstrations():
+    errors = {}
+    for with_own in (False, True):
+        model = make(demonstrations=demonstrations(), actor_pressure=0.0, learning_rate=2e-3)
+        model.learn(15)
+        lived, chosen = np.full((30, 3), 5.0), np.full((30, 2), 0.8)
+        if with_own:
+            model.replay_buffer.self_imitation.store(lived, chosen, 9.0)
+        model.train(150, 16)
+        errors[with_own] = float((model.actor.circuit.project(model.inputs.tensor(lived)) - 0.8).abs().mean())
+    assert errors[True] < 0.1 < 0.5 < errors[False]
+
+
+def test_the_pressure_has_the_nudge_that_was_asked_for():
+    """With SGD at rate 1 the step is the change; a whole nudge moves the settled state, an infinitesimal one does not."""
+    policy_kwargs = {"net_arch": [16, 16], "optimizer_class": th.optim.SGD}
+    options = {"settling": "iterative", "learning_rate": 1.0, "replay_buffer_kwargs": NO_MEMORY, "learning_starts": 100}
+    model = make(nudge=1.0, policy_kwargs=policy_kwargs, **options)
+    model.learn(50)
+    batch, actor = model._sample_batch(16), model.actor.circuit
+    whole, smallest = (
+        actor.hebbian_update(settle_coupled(actor, model.critic.first(), batch.features, None, nudge).actor).tensors()
+        for nudge in (1.0, None)
+    )
+    before, model._n_updates = weights_of(actor), 1
+    model._update_actor(batch)
+    steps = [new - old for new, old in zip(weights_of(actor), before, strict=True)]
+    for step, wanted in zip(steps, whole, strict=True):
+        assert th.allclose(step, wanted, atol=1e-6)
+    assert not all(th.allclose(a, b, rtol=1e-3, atol=1e-6) for a, b in zip(whole, smallest, strict=True))
+
+
+def test_every_circuit_learns_from_as_many_rows_as_train_was_asked_for(monkeypatch):
+    own = {"net_arch": [16, 16], "generator_kwargs": {"batch_size": 5}}
+    model = make(demonstrations=demonstrations(), actor_pressure=0.0, policy_kwargs=own)
+    model.learn(30)
+    sizes, settle = {}, NGCCircuit.settle
+
+    def counting(self, x, *rest):
+        sizes[self] = len(x)
+        return settle(self, x, *rest)
+
+    monkeypatch.setattr(NGCCircuit, "settle", counting)
+    model.train(1, 11)
+    assert [sizes[circuit] for circuit in (model.actor.circuit, model.critic[0], model.generator)] == [11, 11, 5]
 
 
 def test_actor_warm_start_imitates_before_any_step():
@@ -419,11 +488,26 @@ def test_a_bare_predict_acts_with_an_empty_memory_and_warns_once():
     assert np.array_equal(first, again) and np.array_equal(first, fresh) and not np.array_equal(first, carried)
 
 
-def test_evaluate_policy_carries_the_memory():
-    model = make(policy_kwargs=remembering(7))
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        evaluate_policy(model, DummyVecEnv([CountingEnv]), n_eval_episodes=2, warn=False)
+def test_evaluate_policy_carries_the_memory_of_what_came_before_in_the_episode():
+    """The action is that of o_t and of the H observations before it in its episode, o_t not among them."""
+    history = 3
+    model = make(policy_kwargs=remembering(history))
+    seen, acted, begins = [], [], [True]
+
+    def record(scope, _):
+        seen.append(scope["observations"][0].copy())
+        acted.append(scope["actions"][0].copy())
+        begins.append(bool(scope["dones"][0]))  # the next one
+
+    evaluate_policy(model, DummyVecEnv([CountingEnv]), n_eval_episodes=3, callback=record, warn=False)
+    assert sum(begins[:-1]) == 3 and len(seen) == 5 + 9 + 3
+    for step, action in enumerate(acted):
+        start = max(index for index in range(step + 1) if begins[index])
+        past = np.zeros((history, 3), np.float32)
+        lived = seen[max(start, step - history) : step]
+        past[history - len(lived) :] = np.reshape(lived, (-1, 3))
+        expected = model.actor.circuit.project(th.as_tensor(seen[step])[None], model.actor.memory(th.as_tensor(past)[None]))
+        assert np.allclose(model.policy.scale_action(action), expected[0], atol=1e-5)
 
 
 # ---------------------------------------------------------------------- safety
@@ -521,6 +605,13 @@ def test_discrete_actions_and_images_get_one_clear_line():
         ({"target_update_interval": 0}, "target_update_interval=0"),
         ({"demonstration_fraction": 1.5}, "demonstration_fraction=1.5"),
         ({"refresh_weight": -1.0}, "refresh_weight=-1.0"),
+        ({"alpha_ep": -1.0}, "alpha_ep=-1.0 must be at least 0"),
+        ({"alpha_in": -0.1}, "alpha_in=-0.1 must be at least 0"),
+        (
+            {"policy_kwargs": {"activation_fn": th.nn.ReLU}},
+            r"chosen by name, with policy_kwargs=dict\(circuit_kwargs=dict\(act",
+        ),
+        ({"action_noise": NormalActionNoise(np.zeros(3), np.ones(3))}, r"shapes \(3,\) and \(3,\), an action has \(2,\)"),
         ({"policy_kwargs": {"n_critics": 0}}, "n_critics=0"),
         ({"nudge": 0.0}, "nudge=0.0"),
         ({"actor_warm_start": 10}, "actor_warm_start need demonstrations="),
@@ -540,6 +631,31 @@ def test_discrete_actions_and_images_get_one_clear_line():
 def test_a_wrong_keyword_is_named(keywords, named):
     with pytest.raises(ValueError, match=named):
         make(**keywords)
+
+
+def test_an_action_that_cannot_vary_is_named_with_its_dimension():
+    class Fixed(CountingEnv):
+        def __init__(self):
+            super().__init__()
+            self.action_space = gym.spaces.Box(np.array([-1.0, 2.0], np.float32), np.array([1.0, 2.0], np.float32))
+
+    with pytest.raises(ValueError, match=r"dimension 1 has low == high == 2\.0"):
+        ActPC("MlpPolicy", Fixed())
+
+
+def test_dict_observations_ask_for_the_policy_that_takes_them():
+    for policy in ("MlpPolicy", ActPC.policy_aliases["MlpPolicy"]):
+        with pytest.raises(ValueError, match="MultiInputPolicy"):
+            ActPC(policy, CountingEnv(dict_observations=True))
+
+
+def test_a_device_that_is_not_there_is_named_in_short():
+    with pytest.raises(ValueError, match="device='xpu' must be 'auto' or a torch device of this machine") as caught:
+        make(device="xpu")
+    assert len(str(caught.value)) < 300
+    if not th.cuda.is_available():
+        with pytest.warns(UserWarning, match="device='cuda': torch finds none here, the agent runs on the CPU"):
+            assert make(device="cuda").device.type == "cpu"
 
 
 def test_demonstrations_of_another_task_are_refused():
@@ -567,6 +683,48 @@ def test_save_and_load_predict_the_same_and_training_goes_on(keywords, tmp_path)
     loaded.load_replay_buffer(tmp_path / "replay")
     loaded.learn(20, reset_num_timesteps=False)
     assert loaded.num_timesteps == 60 and loaded._n_updates > model._n_updates
+
+
+def test_policies_can_be_pickled(tmp_path):
+    model = make(policy_kwargs=remembering(2)).learn(20)
+    obs, start = np.ones((1, 3), np.float32), np.ones(1, bool)
+    th.save(model.policy, tmp_path / "policy.pt")
+    copies = [pickle.loads(pickle.dumps(model.policy)), th.load(tmp_path / "policy.pt", weights_only=False)]
+    for copied in copies:
+        assert np.array_equal(copied.predict(obs, None, start)[0], model.predict(obs, None, start)[0])
+    with multiprocessing.get_context("spawn").Pool(1) as pool:
+        assert np.array_equal(pool.apply(model.policy.predict, (obs, None, start))[0], model.predict(obs, None, start)[0])
+
+
+def test_demonstrations_that_are_set_later_are_checked_and_used(tmp_path):
+    demonstrations().save(tmp_path / "demos.npz")
+    model = make(demonstrations=tmp_path / "demos.npz").learn(20)
+    prior = weights_of(model.prior)
+    model.demonstrations = demonstrations(n_episodes=2)
+    model.learn(10, reset_num_timesteps=False)
+    assert len(model.expert) == 40 and not differ(prior, weights_of(model.prior))
+    model.demonstrations = dataclasses.replace(demonstrations(), actions=np.zeros((60, 5), np.float32))
+    with pytest.raises(ValueError, match="actions"):
+        model.learn(10)
+
+
+def test_a_path_of_demonstrations_is_saved_as_it_was_given(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    demonstrations().save("demos.npz")
+    make(demonstrations="demos.npz").learn(15).save("agent")
+    assert ActPC.load("agent").demonstrations == "demos.npz"
+
+
+def test_learning_says_what_the_reward_is_made_of_and_how_far_pre_training_is(capsys):
+    model = make(demonstrations=demonstrations(), alpha_ep=0.5, actor_warm_start=1200, verbose=1)
+    began = time.time_ns()
+    model.learn(20)
+    printed = capsys.readouterr().out
+    assert "reward: 0 x task (alpha_ext) + 0.5 x epistemic (alpha_ep) + 1 x instrumental signal (alpha_in)" in printed
+    assert "3 episodes, 60 transitions" in printed and "mean return 1.0" in printed
+    assert "off: the task's reward, demonstrations in the critic's batch, working memory" in printed
+    assert "update 1000 of 5 of the prior and 1200 of the actor" in printed
+    assert model.start_time > began and model.start_time - began > 0.5 * (time.time_ns() - began)  # time/fps leaves it out
 
 
 @pytest.mark.parametrize("settling", ["iterative", "scheduled"])

@@ -1,5 +1,7 @@
 """Replay: combined experience replay, signals kept apart, self-imitation, n-step sums, memory."""
 
+import warnings
+
 import numpy as np
 import pytest
 from gymnasium import spaces
@@ -133,6 +135,45 @@ def test_the_replay_buffer_offers_whole_episodes_of_every_environment():
         buffer.add(obs, obs, np.zeros((2, 1)), np.array([0.0, float(step == 3)]), done, [{}, {}])
     episodes = buffer.self_imitation.episodes
     assert np.array_equal(episodes.observations[:, 0], [0.5, 1.5, 2.5, 3.5]) and len(buffer.self_imitation) == 4
+
+
+def test_an_episode_is_whole_when_the_ring_wraps_and_left_out_when_the_ring_has_lost_its_start():
+    buffer = CombinedReplayBuffer(8, *SPACES, self_imitation_size=50, device="cpu")
+    lengths, step = (5, 7, 9), 0
+    for length in lengths:
+        for index in range(length):
+            obs, last = np.full((1, 2), step), index == length - 1
+            buffer.add(obs, obs + 1, np.full((1, 1), step / 100), np.array([float(last)]), np.array([last]), [{}])
+            step += 1
+    episodes = buffer.self_imitation.episodes
+    assert episodes.observations[:, 0].tolist() == list(range(12)) and buffer.self_imitation.lengths == [5, 7]
+    assert np.allclose(episodes.actions[:, 0], np.arange(12) / 100)
+
+
+def test_signals_come_from_what_was_added_and_are_stored_with_it():
+    buffer, seen = CombinedReplayBuffer(4, *SPACES, n_envs=2, history=2, device="cpu"), []
+
+    def score(obs, action, next_obs, past, mask):
+        seen.append((obs, action, next_obs, past, mask))
+        return obs[:, 0] + 0.5, -next_obs[:, 0]
+
+    obs, nothing = np.array([[1.0, 2.0], [3.0, 4.0]]), np.zeros(2)
+    for step in range(2):
+        buffer.add(obs + step, obs + step + 1, np.full((2, 1), 0.25), nothing, nothing, [{}, {}], score=score)
+    assert buffer.epistemic[:2].tolist() == [[1.5, 3.5], [2.5, 4.5]]
+    assert buffer.instrumental[:2].tolist() == [[-2.0, -4.0], [-3.0, -5.0]]
+    assert (seen[1][1] == 0.25).all() and seen[1][4].tolist() == [[0, 1], [0, 1]] and np.array_equal(seen[1][3][:, 1], obs)
+
+
+def test_a_task_that_pays_negative_rewards_alone_is_warned_of_once():
+    memory = SelfImitationMemory(100)
+    with pytest.warns(UserWarning, match="all of the first 20 episodes had a negative return") as caught:
+        assert not any(memory.takes(5, -1.0) for _ in range(60))
+    assert len(caught) == 1
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        sparse = SelfImitationMemory(100)
+        assert not any(sparse.takes(5, 0.0) for _ in range(60))
 
 
 def test_the_union_is_drawn_uniformly():
