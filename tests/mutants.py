@@ -277,11 +277,11 @@ MUTANTS = [
         f"{LEARNS} -k prior",
     ),
     Mutant(
-        "the prior goes on learning",
+        "the target actor lacks the warm start",
         AGENT,
-        "        self.pretrained = True",
-        "        self.pretrained = False",
-        EQUATIONS,
+        "self.actor_target.load_state_dict(self.actor.circuit.state_dict())",
+        "pass",
+        f"{EQUATIONS} -k warm_start",
     ),
     Mutant("the agent ignores the nudge", AGENT, "memory, self.nudge)", "memory)", f"{LEARNS} -k nudge"),
     Mutant(
@@ -327,7 +327,7 @@ MUTANTS = [
         AGENT,
         "batch.bootstrap_features, batch.next_memory",
         "batch.bootstrap_features, batch.memory",
-        EQUATIONS,
+        f"{EQUATIONS} -k bootstrapped",
     ),
     Mutant(
         "half of the demonstrations' share",
@@ -362,7 +362,7 @@ MUTANTS = [
         FEATURES,
         "following = th.cat([past[:, 1:], features[:, None]], dim=1)",
         "following = past",
-        f"{LEARNS} -k memory",
+        f"{EQUATIONS} -k next_steps_memory",
     ),
     Mutant(
         "what was before the episode is remembered",

@@ -69,3 +69,24 @@ def test_the_bootstrapped_action_is_that_of_the_next_observation_with_the_memory
     values = model.critic_target[0].project(th.cat([batch.bootstrap_features, next_actions], dim=1))
     expected = batch.rewards + (1.0 - batch.dones) * model.gamma * values
     th.testing.assert_close(model._critic_targets(batch), expected)
+
+
+def test_the_target_actor_begins_where_the_warm_start_ends():
+    keywords = {"learning_starts": 20, "actor_warm_start": 3, "policy_kwargs": {"net_arch": [16, 16]}, **SMALL}
+    model = ActPC("MlpPolicy", make_vec_env(CountingEnv), demonstrations=demonstrations(), **keywords)
+    before = model.actor.circuit.weights[0].clone()
+    model.learn(1)
+    assert not th.equal(before, model.actor.circuit.weights[0])
+    assert all(th.equal(*pair) for pair in zip(model.actor_target.weights, model.actor.circuit.weights, strict=True))
+
+
+def test_the_next_steps_memory_is_the_one_that_the_next_transition_has():
+    keywords = {"learning_starts": 100, "policy_kwargs": {"net_arch": [16, 16], "memory_history": 3}, **SMALL}
+    model = ActPC("MlpPolicy", make_vec_env(CountingEnv), **keywords)
+    model.learn(40)
+    buffer = model.replay_buffer
+    rows = np.flatnonzero(buffer.dones[:39, 0] == 0)  # whose episode goes on
+    batches = [buffer._gather(these, np.zeros_like(these), None) for these in (rows, rows + 1)]
+    now, then = (model.inputs.replayed(batch, model.reward_weights, model.gamma) for batch in batches)
+    assert then.memory.abs().max() > 0.0
+    th.testing.assert_close(now.next_memory, then.memory)
