@@ -30,6 +30,7 @@ from sb3_actpc.actpc.arguments import (
     Size,
     Weight,
     check_actions,
+    check_compile,
     check_computes,
     check_env,
     check_learning_rate,
@@ -39,6 +40,7 @@ from sb3_actpc.actpc.arguments import (
     checked,
 )
 from sb3_actpc.actpc.buffers import SignalReplay, combined_buffer_class
+from sb3_actpc.actpc.compiled import CompiledUpdate, compiled_update
 from sb3_actpc.actpc.demonstration_replay import DemonstrationReplay
 from sb3_actpc.actpc.diagnostics import Diagnostics
 from sb3_actpc.actpc.features import Batch, CircuitInputs
@@ -115,6 +117,8 @@ class ActPC(OffPolicyAlgorithm):
     :param target_update_interval: the targets move after every update (1), or every so many environment steps; hard copies
         as in DQN are ``tau=1, target_update_interval=C``
     :param observation_normalization: "none" (the paper) or "demonstrations" (their mean and standard deviation, fixed)
+    :param compile: run the updates of sweeping circuits as one graph of ``torch.compile`` (see
+        :mod:`~sb3_actpc.actpc.compiled`): True, False or "auto", where the run is long enough to earn it
     :param policy_kwargs: keywords of :class:`~sb3_actpc.actpc.policies.ActPCPolicy`: ``net_arch``, ``n_critics``,
         ``memory_history`` (the working memory), ``circuit_kwargs`` (of every :class:`~sb3_actpc.ngc.NGCCircuit`:
         ``n_settling_steps``, ``feedback``, ``dynamics``, ``activation``, ``synaptic_scaling``, ...), ``actor_kwargs``,
@@ -181,6 +185,7 @@ class ActPC(OffPolicyAlgorithm):
         target_noise_clip: Weight = 0.5,
         target_update_interval: Annotated[int, Between(1)] = 1,
         observation_normalization: Literal["none", "demonstrations"] = "none",
+        compile: Annotated[bool | str, check_compile] = "auto",
         policy_kwargs: Annotated[Settings | None, check_policy_kwargs] = None,
         stats_window_size: Size = 100,
         tensorboard_log: str | None = None,
@@ -237,6 +242,7 @@ class ActPC(OffPolicyAlgorithm):
         self.target_noise_clip = target_noise_clip
         self.target_update_interval = target_update_interval
         self.observation_normalization = observation_normalization
+        self.compile = compile
         self.signal_normalizer = signal_normalizer
         self.epistemic_normalizer = make_normalizer(signal_normalizer)
         self.instrumental_normalizer = make_normalizer(signal_normalizer)
@@ -260,6 +266,7 @@ class ActPC(OffPolicyAlgorithm):
         self._create_aliases()
         self._setup_demonstrations()
         self.diagnostics = Diagnostics(self.policy)
+        self._compiled: CompiledUpdate | None = None
 
     def _make_policy(self) -> ActPCPolicy:
         given = self.policy_kwargs.get("circuit_kwargs") or {}
@@ -389,6 +396,7 @@ class ActPC(OffPolicyAlgorithm):
             print(self.describe())
         self.pretrain(between_updates(result[1]), progress_bar)
         self.start_time = time.time_ns()  # of the frames per second: pre-training has none
+        self._compiled = self._compiled or compiled_update(self, total_timesteps)
         return result
 
     def describe(self) -> str:
@@ -541,9 +549,13 @@ class ActPC(OffPolicyAlgorithm):
             self.diagnostics.begin_update(self._n_updates, self.num_timesteps)
             self._rescore_demonstrations()
             batch = self._sample_batch(batch_size)  # line 17
-            self._update_actor(batch.first(n_actor))  # lines 19 and 26
-            self._update_critic(batch.first(n_critic))  # lines 21 and 22
-            self._update_generator(batch.first(n_generator))  # line 24
+            parts = batch.first(n_actor), batch.first(n_critic), batch.first(n_generator)
+            if self._compiled is not None and self._compiled.ready():
+                self._compiled(*parts)
+            else:
+                self._update_actor(parts[0])  # lines 19 and 26
+                self._update_critic(parts[1])  # lines 21 and 22
+                self._update_generator(parts[2])  # line 24
             if self.target_update_interval == 1:
                 self._update_targets(self.tau)
         self._log_training()
@@ -593,9 +605,7 @@ class ActPC(OffPolicyAlgorithm):
         if self.actor_pressure and self._n_updates > self.critic_warmup:
             coupled = settle_coupled(self.actor.circuit, self.critic.first(), batch.features, batch.memory, self.nudge)
             pressure = self.actor.circuit.hebbian_update(coupled.actor)
-            weight: float | th.Tensor = self.actor_pressure
-            if self.scale_pressure:
-                weight = weight / coupled.action_values.abs().mean().clamp_min(SMALLEST_VALUE_SCALE)
+            weight = self._pressure_weight(self.actor_pressure, coupled.action_values)
             self.diagnostics.coupled(coupled, pressure, batch.features, batch.memory)
             if changes is None:
                 self.diagnostics.settled("actor", coupled.actor)
@@ -603,6 +613,10 @@ class ActPC(OffPolicyAlgorithm):
             changes = pressure if changes is None else changes.add_(pressure)
         if changes is not None:
             self.actor.circuit.apply_changes(changes)
+
+    def _pressure_weight(self, pressure: float | th.Tensor, action_values: th.Tensor) -> float | th.Tensor:
+        """``pressure``, by option over the batch's mean absolute action-value."""
+        return pressure / action_values.abs().mean().clamp_min(SMALLEST_VALUE_SCALE) if self.scale_pressure else pressure
 
     def _update_critic(self, batch: Batch) -> None:
         """Policy circuit(s): settle on the bootstrapped targets (lines 21 and 22)."""
@@ -612,15 +626,22 @@ class ActPC(OffPolicyAlgorithm):
             critic.apply_changes(critic.hebbian_update(state))
             self.diagnostics.settled(f"critic.{index}" if index else "critic", state)
 
-    def _critic_targets(self, batch: Batch) -> th.Tensor:
+    def _target_noise(self, batch: Batch) -> th.Tensor | None:
+        """What is added to the target actor's actions, (B, A)."""
+        if not self.target_policy_noise or self.bootstrap == "literal":
+            return None
+        noise = th.randn_like(batch.actions) * self.target_policy_noise
+        return noise.clamp(-self.target_noise_clip, self.target_noise_clip)
+
+    def _critic_targets(self, batch: Batch, noise: th.Tensor | None = None) -> th.Tensor:
         """t = r + γ c, or r alone when terminal; one and the same reward for every action output, (B, A)."""
+        noise = self._target_noise(batch) if noise is None else noise
         if self.bootstrap == "literal":
             next_actions = batch.actions
         else:
             next_actions = self.actor_target.project(batch.bootstrap_features, batch.next_memory)
-            if self.target_policy_noise:
-                noise = th.randn_like(next_actions) * self.target_policy_noise
-                next_actions = (next_actions + noise.clamp(-self.target_noise_clip, self.target_noise_clip)).clamp(-1.0, 1.0)
+            if noise is not None:
+                next_actions = (next_actions + noise).clamp(-1.0, 1.0)
         inputs = th.cat([batch.bootstrap_features, next_actions], dim=1)
         first, *others = (critic.project(inputs) for critic in self.critic_target)
         values = reduce(th.minimum, others, first)
@@ -658,15 +679,18 @@ class ActPC(OffPolicyAlgorithm):
 
     def _refresh_changes(self, n: int) -> HebbianChanges:
         """Settle the actor on ``n`` imitated actions."""
+        state = self.actor.circuit.settle(*self._sample_imitated(n))
+        self.diagnostics.settled("actor", state)
+        return self.actor.circuit.hebbian_update(state)
+
+    def _sample_imitated(self, n: int) -> tuple[th.Tensor, th.Tensor, th.Tensor | None]:
+        """Features, actions and working memory of ``n`` imitated steps."""
         inputs = self.inputs
         samples = sample_union(self._imitated(), n, self.memory_history)
         features = inputs.features(inputs.observations(samples.observations))
         if self.refresh_noise:
             features = features + self.refresh_noise * th.randn_like(features)
-        memory = inputs.memory(*inputs.past(samples.history, samples.history_mask))
-        state = self.actor.circuit.settle(features, inputs.tensor(samples.actions), memory)
-        self.diagnostics.settled("actor", state)
-        return self.actor.circuit.hebbian_update(state)
+        return features, inputs.tensor(samples.actions), inputs.memory(*inputs.past(samples.history, samples.history_mask))
 
     # ------------------------------------------------------------------ logging, saving
 
@@ -762,7 +786,7 @@ class ActPC(OffPolicyAlgorithm):
 
     def _excluded_save_params(self) -> list[str]:
         aliases = ["actor", "critic", "generator", "prior", "actor_target", "critic_target"]
-        derived = ["expert", "_followed", "diagnostics"]
+        derived = ["expert", "_followed", "diagnostics", "_compiled"]
         return [*super()._excluded_save_params(), *aliases, *derived]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:

@@ -1,0 +1,68 @@
+"""The compiled update: the same numbers as the eager one, and only where it is earned."""
+
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3.common.logger import configure
+
+from sb3_actpc.actpc.compiled import ENOUGH_UPDATES, compiled_update
+from tests.actpc.agents import make
+from tests.actpc.envs import demonstrations
+
+SWEEPING = {
+    "settling": "scheduled",
+    "demonstrations": demonstrations(),
+    "demonstration_fraction": 0.5,
+    "target_policy_noise": 0.2,
+    "refresh_noise": 0.1,
+    "scale_pressure": True,
+    "actor_warm_start": 5,
+}
+LEARNED = {"feedback": "learned", "feedback_start": "mirrored", "weight_decay": 0.1}
+
+
+def agent(feedback=None, **keywords):
+    circuits = {"net_arch": [16, 16], "n_critics": 2, "memory_history": 2, "circuit_kwargs": feedback or LEARNED}
+    return make(policy_kwargs=circuits, **SWEEPING, **keywords)
+
+
+@pytest.mark.slow
+def test_compiled_updates_equal_eager_ones():
+    weights = []
+    for compiled in (False, True):
+        th.manual_seed(0)
+        np.random.seed(0)
+        model = agent(compile=compiled)
+        model.learn(60)
+        start = {name: value.clone() for name, value in model.policy.state_dict().items()}
+        assert (model._compiled is not None) == compiled
+        th.manual_seed(1)
+        np.random.seed(1)
+        model.train(5, 32)
+        weights.append(model.policy.state_dict())
+        assert any((value - start[name]).abs().max() > 1e-3 for name, value in weights[-1].items())
+    for name, eager in weights[0].items():
+        assert th.allclose(eager, weights[1][name], atol=1e-5), name
+
+
+def test_auto_compiles_from_enough_updates_on_and_only_sweeps():
+    model = agent(compile="auto")
+    assert compiled_update(model, ENOUGH_UPDATES - 1) is None
+    assert compiled_update(model, ENOUGH_UPDATES) is not None
+    model.compile = False
+    assert compiled_update(model, ENOUGH_UPDATES) is None
+
+
+def test_without_a_compiler_updates_stay_eager(monkeypatch):
+    monkeypatch.setattr("sb3_actpc.actpc.compiled._has_compiler", lambda: False)
+    model, said = agent(compile=True), []
+    model.set_logger(configure(None, []))
+    monkeypatch.setattr(model.logger, "info", said.append)
+    assert compiled_update(model, 1) is None and len(said) == 1 and "no C++ compiler" in said[0]
+
+
+def test_iterative_circuits_are_not_compiled():
+    with pytest.raises(ValueError, match="compile=True needs settling='scheduled'"):
+        compiled_update(make(settling="iterative", compile=True), 1)
+    with pytest.raises(ValueError, match="compile='fast'"):
+        make(compile="fast")
