@@ -734,7 +734,7 @@ def test_two_seeded_runs_are_bit_identical(settling):
 
 
 def test_learning_rates_of_circuits_and_error_synapses_follow_the_schedule():
-    circuits = {"circuit_kwargs": {"feedback": "learned"}, "actor_kwargs": {"learning_rate": 5e-3}}
+    circuits = {"circuit_kwargs": {"feedback": "learned", "feedback_rate": 0.9}, "actor_kwargs": {"learning_rate": 5e-3}}
     model = make(learning_rate=lambda left: 1e-3 * left, settling="iterative", policy_kwargs=circuits)
     model.learn(30)
     model._current_progress_remaining = 0.5
