@@ -6,7 +6,7 @@ import copy
 from collections import deque
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch as th
@@ -82,6 +82,8 @@ class LOGO(LearnsFromDemonstrations, TRPO):
     :raises ValueError: for a keyword with a value that is not allowed, for demonstrations that do not fit the environment,
         and for other spaces
     """
+
+    is_resumable: ClassVar[bool] = False  # its guidance keeps a state of its own
 
     def __init__(
         self,

@@ -1,4 +1,4 @@
-"""Checkpoints while an SB3 off-policy algorithm learns, and going on from them."""
+"""Checkpoints while an SB3 algorithm learns, and going on from them."""
 
 from __future__ import annotations
 
@@ -9,8 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EventCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.type_aliases import MaybeCallback
 
 from sb3_actpc.checkpoints.bundle import Report, find_bundle, list_bundles, warn, write_bundle
@@ -23,8 +25,8 @@ from sb3_actpc.utils.checks import check_finite
 
 class CheckpointCallback(BaseCallback):
     """
-    Saves everything that the training of any SB3 off-policy algorithm depends on, every ``save_freq`` steps and when the
-    process is told to stop (SIGTERM, SIGINT); the latter raises :class:`~sb3_actpc.checkpoints.TrainingStopped`.
+    Saves everything that the training of an SB3 algorithm depends on, every ``save_freq`` steps and when the process is told
+    to stop (SIGTERM, SIGINT); the latter raises :class:`~sb3_actpc.checkpoints.TrainingStopped`.
 
     A checkpoint is taken between two rollouts (``train_freq`` steps), or between two updates of a pre-training (see
     :func:`between_updates`) that a signal interrupts. The handlers that were there before come back when ``learn`` ends; after
@@ -79,7 +81,7 @@ class CheckpointCallback(BaseCallback):
         :raises ValueError: when a weight is not finite
         :raises OSError: when it cannot be written; those there before stay
         """
-        model = self._algorithm
+        model = self.model
         manifest = describe_model(model, self._env_id or env_name(self.training_env))
         manifest["settings"] = constructor_settings(model)
         with write_bundle(self.folder, model.num_timesteps, self.keep, manifest) as writer:
@@ -90,16 +92,11 @@ class CheckpointCallback(BaseCallback):
             self.report(f"step {model.num_timesteps:>8}  saved in {path}")
         return path
 
-    @property
-    def _algorithm(self) -> OffPolicyAlgorithm:
-        assert isinstance(self.model, OffPolicyAlgorithm)
-        return self.model
-
     # ------------------------------------------------------------------ hooks
 
     def _init_callback(self) -> None:
-        if not isinstance(self.model, OffPolicyAlgorithm):
-            raise ValueError(f"{type(self.model).__name__} is not an off-policy algorithm: only those can be checkpointed")
+        if why_no_checkpoints(type(self.model)):
+            raise ValueError(f"{type(self.model).__name__} {why_no_checkpoints(type(self.model))}: leave the callback out")
         check_writable(self.folder)
         if self.handle_signals:
             self.signals.install()
@@ -124,7 +121,7 @@ class CheckpointCallback(BaseCallback):
     def _on_training_end(self) -> None:
         self._resume()  # where no step was left
         self.close()
-        if self.at_end and self._last_saved != self._algorithm.num_timesteps:
+        if self.at_end and self._last_saved != self.model.num_timesteps:
             self._save_or_report()
 
     def _follow(self, callback: Any) -> None:
@@ -145,15 +142,24 @@ class CheckpointCallback(BaseCallback):
             path = self.save()
         finally:
             self.close()
-        raise TrainingStopped(self.signals.received, self._algorithm.num_timesteps, str(path))
+        raise TrainingStopped(self.signals.received, self.model.num_timesteps, str(path))
 
     def _save_or_report(self) -> None:
         """A full disk does not end the training: the checkpoints written before stay."""
         try:
             self.save()
         except OSError as error:
-            self._last_saved = self._algorithm.num_timesteps  # not again at every step
+            self._last_saved = self.model.num_timesteps  # not again at every step
             self.report(f"no checkpoint at step {self.num_timesteps}: {error.strerror or error}; those written before stay")
+
+
+def why_no_checkpoints(algorithm: type[BaseAlgorithm]) -> str:
+    """
+    :param algorithm: a class; ``is_resumable = False`` in it says that SB3's state is not all of its own
+    :return: why its training cannot be stopped and gone on with; empty where it can
+    """
+    learns_by_rollouts = issubclass(algorithm, (OffPolicyAlgorithm, OnPolicyAlgorithm))
+    return "" if learns_by_rollouts and getattr(algorithm, "is_resumable", True) else "keeps no checkpoints"
 
 
 def between_updates(callback: BaseCallback) -> Callable[[], None]:
@@ -177,7 +183,7 @@ def between_updates(callback: BaseCallback) -> Callable[[], None]:
 # ---------------------------------------------------------------------- going on
 
 
-def restore(model: OffPolicyAlgorithm, path: str | os.PathLike[str], report: Report = warn) -> Restored:
+def restore(model: BaseAlgorithm, path: str | os.PathLike[str], report: Report = warn) -> Restored:
     """
     Put a checkpoint back into an agent made with the settings of the stopped run; :func:`continue_learning` goes on with it.
 
@@ -191,7 +197,7 @@ def restore(model: OffPolicyAlgorithm, path: str | os.PathLike[str], report: Rep
     return restore_model(model, find_bundle(path, report), report)
 
 
-def continue_learning(restored: Restored, callback: MaybeCallback = None, **options: Any) -> OffPolicyAlgorithm:
+def continue_learning(restored: Restored, callback: MaybeCallback = None, **options: Any) -> BaseAlgorithm:
     """
     Learn until the step that the stopped run was to reach.
 

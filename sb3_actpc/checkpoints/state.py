@@ -1,4 +1,4 @@
-"""What a checkpoint holds of an SB3 off-policy algorithm, and how it is put back."""
+"""What a checkpoint holds of an SB3 algorithm, and how it is put back."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ import numpy as np
 import safetensors.numpy
 import safetensors.torch
 import torch as th
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import CSVOutputFormat
 from stable_baselines3.common.noise import VectorizedActionNoise
-from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.save_util import recursive_getattr
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
@@ -60,7 +60,7 @@ class Restored:
     :param decoder: gives them back
     """
 
-    model: OffPolicyAlgorithm
+    model: BaseAlgorithm
     state: dict[str, Any]
     decoder: Decoder
 
@@ -68,7 +68,7 @@ class Restored:
 # ------------------------------------------------------------------ writing
 
 
-def capture_model(model: OffPolicyAlgorithm, callbacks: Sequence[BaseCallback], writer: BundleWriter) -> None:
+def capture_model(model: BaseAlgorithm, callbacks: Sequence[BaseCallback], writer: BundleWriter) -> None:
     """
     Write everything that the rest of the training depends on.
 
@@ -80,15 +80,16 @@ def capture_model(model: OffPolicyAlgorithm, callbacks: Sequence[BaseCallback], 
     """
     check_weights(model)
     encoder = Encoder()
-    assert model.env is not None and model.replay_buffer is not None
+    assert model.env is not None
+    buffer = replay_buffer(model)
     state = {
         "counters": {name: encoder.encode(vars(model)[name], name) for name in _COUNTERS if name in vars(model)},
         "torch": _capture_torch(model, encoder),
         "generators": encoder.encode(_generators(model), "generators"),
         "spaces": encoder.encode([model.action_space, model.observation_space], "spaces"),
-        "noise": encoder.encode(model.action_noise, "noise"),
+        "noise": encoder.encode(getattr(model, "action_noise", None), "noise"),
         "env": capture_vec_env(model.env, encoder, "env"),
-        "buffer": _capture_buffer(model.replay_buffer, encoder, writer),
+        "buffer": None if buffer is None else _capture_buffer(buffer, encoder, writer),
         "own": encoder.encode(own_state(model), "own"),
         "callbacks": [[name, _capture_callback(callback, encoder, name)] for name, callback in named(callbacks)],
         "logger": _capture_logger(model, encoder),
@@ -100,13 +101,13 @@ def capture_model(model: OffPolicyAlgorithm, callbacks: Sequence[BaseCallback], 
     writer.add_json("state.json", state)
 
 
-def describe_model(model: OffPolicyAlgorithm, env_id: str) -> dict[str, Any]:
+def describe_model(model: BaseAlgorithm, env_id: str) -> dict[str, Any]:
     """
     :param model: the agent
     :param env_id: name of its task
     :return: plain values by which a checkpoint of another agent or task is recognised, and the versions
     """
-    assert model.env is not None and model.replay_buffer is not None
+    buffer = replay_buffer(model)
     return {
         "agent": {
             "algorithm": type(model).__name__,
@@ -114,15 +115,15 @@ def describe_model(model: OffPolicyAlgorithm, env_id: str) -> dict[str, Any]:
             "n_envs": model.n_envs,
             "observation_space": str(model.observation_space),
             "action_space": str(model.action_space),
-            "replay_buffer": type(model.replay_buffer).__name__,
-            "buffer_size": model.replay_buffer.buffer_size,
+            "replay_buffer": None if buffer is None else type(buffer).__name__,
+            "buffer_size": None if buffer is None else buffer.buffer_size,
             "weights": {name: list(tensor.shape) for name, tensor in model.policy.state_dict().items()},
         },
         "versions": {name: _version(name) for name in _RECORDED_PACKAGES},
     }
 
 
-def check_weights(model: OffPolicyAlgorithm) -> None:
+def check_weights(model: BaseAlgorithm) -> None:
     """:raises ValueError: naming the first weight that is NaN or infinite"""
     for name, parameter in model.policy.named_parameters():
         if not bool(th.isfinite(parameter).all()):
@@ -150,14 +151,14 @@ def _version(package: str) -> str:
         return "unknown"
 
 
-def _generators(model: OffPolicyAlgorithm) -> dict[str, Any]:
+def _generators(model: BaseAlgorithm) -> dict[str, Any]:
     states = {"python": random.getstate(), "numpy": np.random.get_state(legacy=False), "torch": th.get_rng_state()}
     if model.device.type == "cuda":
         states["cuda"] = th.cuda.get_rng_state(model.device)
     return states
 
 
-def _restore_generators(model: OffPolicyAlgorithm, states: dict[str, Any]) -> None:
+def _restore_generators(model: BaseAlgorithm, states: dict[str, Any]) -> None:
     random.setstate(states["python"])
     np.random.set_state(states["numpy"])
     th.set_rng_state(states["torch"])
@@ -165,7 +166,7 @@ def _restore_generators(model: OffPolicyAlgorithm, states: dict[str, Any]) -> No
         th.cuda.set_rng_state(states["cuda"], model.device)
 
 
-def _capture_torch(model: OffPolicyAlgorithm, encoder: Encoder) -> dict[str, Any]:
+def _capture_torch(model: BaseAlgorithm, encoder: Encoder) -> dict[str, Any]:
     dicts, variables = model._get_torch_save_params()
     record = {
         "dicts": {name: encoder.encode(dict(recursive_getattr(model, name).state_dict()), name) for name in dicts},
@@ -176,8 +177,8 @@ def _capture_torch(model: OffPolicyAlgorithm, encoder: Encoder) -> dict[str, Any
     return record
 
 
-def _noise_matrices(model: OffPolicyAlgorithm) -> Any:
-    return getattr(getattr(model, "actor", None), "action_dist", None) if model.use_sde else None
+def _noise_matrices(model: BaseAlgorithm) -> Any:
+    return getattr(getattr(model, "actor", model.policy), "action_dist", None) if model.use_sde else None
 
 
 def own_state(thing: Any) -> Any:
@@ -186,6 +187,11 @@ def own_state(thing: Any) -> Any:
 
 
 # ------------------------------------------------------------------ buffers
+
+
+def replay_buffer(model: BaseAlgorithm) -> ReplayBuffer | None:
+    """An algorithm that learns on policy has none: its rollouts begin empty."""
+    return getattr(model, "replay_buffer", None)
 
 
 def stored_rows(buffer: ReplayBuffer) -> int:
@@ -299,11 +305,11 @@ def _restore_callback(callback: BaseCallback, record: dict[str, Any], decoder: D
         restore_vec_env(vars(callback)[name], env_record, decoder)
 
 
-def _csv_formats(model: OffPolicyAlgorithm) -> list[CSVOutputFormat]:
+def _csv_formats(model: BaseAlgorithm) -> list[CSVOutputFormat]:
     return [output for output in model.logger.output_formats if isinstance(output, CSVOutputFormat)]
 
 
-def _capture_logger(model: OffPolicyAlgorithm, encoder: Encoder) -> dict[str, Any] | None:
+def _capture_logger(model: BaseAlgorithm, encoder: Encoder) -> dict[str, Any] | None:
     if not hasattr(model, "_logger"):
         return None
     values: dict[str, Any] = {}
@@ -321,7 +327,7 @@ def _capture_logger(model: OffPolicyAlgorithm, encoder: Encoder) -> dict[str, An
     return {"values": values, "csv": texts}
 
 
-def _restore_logger(model: OffPolicyAlgorithm, record: dict[str, Any], decoder: Decoder) -> None:
+def _restore_logger(model: BaseAlgorithm, record: dict[str, Any], decoder: Decoder) -> None:
     for name, values in record["values"].items():
         target = getattr(model.logger, name)
         target.clear()
@@ -338,7 +344,7 @@ def _restore_logger(model: OffPolicyAlgorithm, record: dict[str, Any], decoder: 
 # ------------------------------------------------------------------ reading
 
 
-def restore_model(model: OffPolicyAlgorithm, bundle: Bundle, report: Report) -> Restored:
+def restore_model(model: BaseAlgorithm, bundle: Bundle, report: Report) -> Restored:
     """
     Put everything back into an agent that was made with the same settings. Nothing is changed when the two do not fit.
 
@@ -348,17 +354,19 @@ def restore_model(model: OffPolicyAlgorithm, bundle: Bundle, report: Report) -> 
     :return: the agent, and what :func:`restore_learning` puts back once ``learn(..., reset_num_timesteps=False)`` has begun
     :raises ValueError: when the checkpoint is of another algorithm, task, network or buffer
     """
-    assert model.env is not None and model.replay_buffer is not None
-    state = bundle.read_json("state.json")
+    assert model.env is not None
+    state, buffer = bundle.read_json("state.json"), replay_buffer(model)
     _check_fit(describe_model(model, env_name(model.env))["agent"], bundle)
-    _check_buffer(model.replay_buffer, state["buffer"], bundle)
+    if buffer is not None:
+        _check_buffer(buffer, state["buffer"], bundle)
     decoder = Decoder(
         safetensors.numpy.load(bundle.read_bytes("arrays.safetensors")),
         safetensors.torch.load(bundle.read_bytes("tensors.safetensors")),
     )
     lost = restore_vec_env(model.env, state["env"], decoder)
     _restore_torch(model, state["torch"], decoder)
-    _restore_buffer(model.replay_buffer, state["buffer"], bundle, decoder)
+    if buffer is not None:
+        _restore_buffer(buffer, state["buffer"], bundle, decoder)
     for name, node in state["counters"].items():
         setattr(model, name, decoder.decode(node))
     own = decoder.decode(state["own"])
@@ -412,34 +420,37 @@ def _check_fit(mine: dict[str, Any], bundle: Bundle) -> None:
             )
 
 
-def _restore_torch(model: OffPolicyAlgorithm, record: dict[str, Any], decoder: Decoder) -> None:
+def _restore_torch(model: BaseAlgorithm, record: dict[str, Any], decoder: Decoder) -> None:
     for name, node in record["dicts"].items():
         recursive_getattr(model, name).load_state_dict(decoder.decode(node))
     for name, node in record["variables"].items():
         recursive_getattr(model, name).data = decoder.decode(node).to(model.device)
 
 
-def _restore_noise(model: OffPolicyAlgorithm, node: Any, decoder: Decoder) -> None:
+def _restore_noise(model: BaseAlgorithm, node: Any, decoder: Decoder) -> None:
     if node is None:
         return
-    if model.action_noise is None:
+    noise = getattr(model, "action_noise", None)
+    if noise is None:
         raise ValueError(f"the checkpoint's agent has the action noise {node['object']}, this one none: pass action_noise=")
-    if node["object"] == VectorizedActionNoise.__name__ and not isinstance(model.action_noise, VectorizedActionNoise):
-        model.action_noise = VectorizedActionNoise(model.action_noise, model.n_envs)
-    decoder.decode(node, model.action_noise)
+    if node["object"] == VectorizedActionNoise.__name__ and not isinstance(noise, VectorizedActionNoise):
+        noise = model.action_noise = VectorizedActionNoise(noise, model.n_envs)  # type: ignore[attr-defined]
+    decoder.decode(node, noise)
 
 
-def _restore_random(model: OffPolicyAlgorithm, state: dict[str, Any], decoder: Decoder) -> None:
+def _restore_random(model: BaseAlgorithm, state: dict[str, Any], decoder: Decoder) -> None:
     decoder.decode(state["spaces"], [model.action_space, model.observation_space])
     _restore_generators(model, decoder.decode(state["generators"]))
 
 
-def _start_episodes_again(model: OffPolicyAlgorithm, lost: list[tuple[int, str]], report: Report) -> None:
+def _start_episodes_again(model: BaseAlgorithm, lost: list[tuple[int, str]], report: Report) -> None:
     """``learn`` resets the environments when there is no last observation."""
-    assert model.replay_buffer is not None and model.env is not None
+    buffer = replay_buffer(model)
+    assert model.env is not None
     if model.seed is not None and not isinstance(vec_env_layers(model.env)[-1], DummyVecEnv):
         model.env.seed((model.seed + model.num_timesteps) % 2**31)  # their generators are out of reach
     for index, reason in lost:
         report(f"environment {index} cannot be restored within its episode, all episodes start again: {reason}")
-    _cut_running_episodes(model.replay_buffer)
+    if buffer is not None:
+        _cut_running_episodes(buffer)
     model._last_obs = None

@@ -8,8 +8,6 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from sb3_actpc.utils.constructors import constructor_keywords
 
@@ -69,17 +67,6 @@ def check_keywords(algorithm: type[BaseAlgorithm], settings: Mapping[str, Any]) 
             raise ValueError(f"{name!r} is not set here: use {_OPTION_OF[name]}")
         if name not in known:
             raise ValueError(f"{algorithm.__name__} has no setting {name!r}{nearest(name, known)}")
-
-
-def why_no_checkpoints(algorithm: type[BaseAlgorithm]) -> str:
-    """
-    :param algorithm: the class
-    :return: why its runs cannot be stopped and gone on with; empty where they can
-    """
-    if issubclass(algorithm, OffPolicyAlgorithm):
-        return ""
-    reason = "learns on policy" if issubclass(algorithm, OnPolicyAlgorithm) else "is quick enough to be run again"
-    return f"{reason} and keeps no checkpoints"
 
 
 def nearest(name: str, known: Iterable[str]) -> str:

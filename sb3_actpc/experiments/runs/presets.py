@@ -16,9 +16,10 @@ from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckA
 from stable_baselines3.common.utils import LinearSchedule
 from torch import nn
 
+from sb3_actpc.checkpoints import why_no_checkpoints
 from sb3_actpc.demonstrations.dataset import shipped_demonstrations
 from sb3_actpc.envs import sparse_env_id
-from sb3_actpc.experiments.runs.algorithms import check_keywords, load_algorithm, why_no_checkpoints
+from sb3_actpc.experiments.runs.algorithms import check_keywords, load_algorithm
 from sb3_actpc.experiments.runs.environments import make_env
 from sb3_actpc.experiments.runs.provenance import file_hash
 from sb3_actpc.experiments.runs.schema import Run, merged

@@ -13,12 +13,11 @@ import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, ProgressBarCallback
 from stable_baselines3.common.logger import CSVOutputFormat, KVWriter, Logger, TensorBoardOutputFormat
-from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_actpc.checkpoints import CheckpointCallback, DamagedCheckpoint, list_bundles, restore
+from sb3_actpc.checkpoints import CheckpointCallback, DamagedCheckpoint, list_bundles, restore, why_no_checkpoints
 from sb3_actpc.demonstrations.dataset import Demonstrations
-from sb3_actpc.experiments.runs.algorithms import load_algorithm, why_no_checkpoints
+from sb3_actpc.experiments.runs.algorithms import load_algorithm
 from sb3_actpc.experiments.runs.environments import check_env_id, make_eval_envs, make_train_env
 from sb3_actpc.experiments.runs.episode_log import EpisodeLog
 from sb3_actpc.experiments.runs.evaluation import PROGRESS, EvaluationCallback, NormalizedPredictor, Predictor, play_episodes
@@ -51,7 +50,7 @@ def train_run(run: Run, report: Report = silent, callbacks: Sequence[BaseCallbac
     """Train one agent; its folder then holds ``config.json``, ``progress.csv`` (the evaluations), ``episodes.csv`` (every
     training episode), ``diagnostics.csv`` (what the agent logs), ``model.zip``, the plot and, last, ``result.json``.
 
-    Works with any algorithm of ``ALGORITHMS``; :func:`~sb3_actpc.experiments.runs.algorithms.why_no_checkpoints` says which
+    Works with any algorithm of ``ALGORITHMS``; :func:`~sb3_actpc.checkpoints.why_no_checkpoints` says which
     cannot be gone on with. Sets the number of torch threads of the process.
 
     :param run: what to train
@@ -175,7 +174,6 @@ def _train(
     goes_on = resumes and bool(list_bundles(checkpoints))
     restored = None
     if goes_on:  # before any file of the run is touched
-        assert isinstance(model, OffPolicyAlgorithm)
         restored = restore(model, checkpoints, report)
     folder.mkdir(parents=True, exist_ok=True)
     if not resumes:
@@ -327,8 +325,8 @@ def build_model(run: Run, env: VecEnv) -> BaseAlgorithm:
     algorithm, keywords = load_algorithm(run.algo), agent_keywords(run, env.observation_space, env.action_space)
     try:
         return algorithm(env=env, seed=run.seed, device=run.device, **keywords)
-    except (TypeError, AssertionError) as error:
-        # SB3 checks some settings by assertion
+    except (TypeError, AssertionError, RuntimeError) as error:
+        # SB3 checks some settings by assertion, torch says so of a network that is too large for the memory
         raise ValueError(f"{algorithm.__name__}: {error}") from error
 
 

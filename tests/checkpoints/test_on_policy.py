@@ -1,0 +1,60 @@
+"""PPO and TRPO, stopped and gone on with, are those that never stopped: statistics of the observations, returns and all."""
+
+import os
+import signal
+from pathlib import Path
+from typing import Any
+
+import pytest
+from stable_baselines3.common.callbacks import BaseCallback
+
+from sb3_actpc.checkpoints import CheckpointCallback, TrainingStopped, list_bundles
+from sb3_actpc.experiments.runs import Run, finish_run
+from tests.checkpoints.runs import log_rows
+
+SETTINGS: dict[str, dict[str, Any]] = {
+    "ppo": {"n_steps": 32, "batch_size": 16, "n_epochs": 2, "use_sde": True},
+    "trpo": {"n_steps": 32, "batch_size": 16, "n_critic_updates": 2},
+}
+
+
+class StopAt(BaseCallback):
+    """Tells its own process to stop."""
+
+    def __init__(self, step: int) -> None:
+        super().__init__()
+        self.step = step
+
+    def _on_step(self) -> bool:
+        if self.num_timesteps == self.step:
+            os.kill(os.getpid(), signal.SIGTERM)
+        return True
+
+
+def run_of(algo: str, folder: Path) -> Run:
+    return Run(
+        env="Pendulum-v1", algo=algo, settings={**SETTINGS[algo], "policy_kwargs": {"net_arch": [8]}}, n_timesteps=512,
+        normalize=True, n_envs=2, eval_freq=64, eval_episodes=1, demonstrations="none", progress=False, output=str(folder),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("algo", ["ppo", "trpo"])
+def test_a_stopped_run_goes_on_as_if_it_never_was(algo: str, tmp_path: Path) -> None:
+    finish_run(run_of(algo, tmp_path / "straight"))
+    with pytest.raises(TrainingStopped):
+        finish_run(run_of(algo, tmp_path / "stopped"), callbacks=[StopAt(300)])
+    assert len(list_bundles(tmp_path / "stopped" / "checkpoints")) >= 1
+    lines: list[str] = []
+    finish_run(run_of(algo, tmp_path / "stopped"), lines.append)
+    assert "512 steps from step 320" in lines[0]  # the rollout of 64 steps that the signal fell in is finished first
+    for name in ("progress.csv", "episodes.csv"):
+        rows = log_rows(tmp_path / "straight" / name)
+        assert rows and log_rows(tmp_path / "stopped" / name) == rows
+
+
+def test_an_algorithm_with_a_state_of_its_own_is_refused(tmp_path: Path) -> None:
+    from sb3_actpc.baselines import BC, LOGO
+    from sb3_actpc.checkpoints import why_no_checkpoints
+
+    assert why_no_checkpoints(LOGO) == why_no_checkpoints(BC) == "keeps no checkpoints"
+    assert CheckpointCallback(tmp_path).keep == 3
