@@ -45,7 +45,7 @@ from sb3_actpc.actpc.demonstration_replay import DemonstrationReplay
 from sb3_actpc.actpc.diagnostics import Diagnostics
 from sb3_actpc.actpc.features import Batch, CircuitInputs
 from sb3_actpc.actpc.policies import POLICIES, ActPCActor, ActPCPolicy, Critics, check_policy, check_policy_kwargs
-from sb3_actpc.actpc.reward_signals import make_normalizer, summed_squared_errors
+from sb3_actpc.actpc.reward_signals import STORED, Normalize, instrumental_reward, make_normalizer, summed_squared_errors
 from sb3_actpc.actpc.self_imitation import Episodes, Observations, map_observations, sample_union
 from sb3_actpc.checkpoints import Restored, between_updates, load_checkpoint, load_weights, save_weights
 from sb3_actpc.demonstrations import fit_demonstrations
@@ -104,6 +104,9 @@ class ActPC(OffPolicyAlgorithm):
     :param alpha_in: weight of the instrumental signal
     :param alpha_ext: weight of the task's reward; by default 0 with demonstrations (the paper) and 1 without
     :param signal_normalizer: "max" (running maximum, the paper), "saturating" (r / (r + 1)) or "quantile"
+    :param signal_normalization: "stored" (once, when a transition is seen, the paper) or "sampled" (whenever it is replayed,
+        by what the normaliser has seen until then)
+    :param instrumental_form: what the prior's normalised errors r pay: "penalty", -r (the paper's equation), or "unit", 1 - r
     :param signal_errors: the signals sum the squared errors of "all" layers (the paper) or of the "output" alone
     :param actor_pressure: weight of the critic's pressure on the actor; 0 leaves refresh alone (cloning)
     :param scale_pressure: divide the pressure by the batch's mean absolute action-value (at least 1: one paid step)
@@ -175,6 +178,8 @@ class ActPC(OffPolicyAlgorithm):
         alpha_in: Weight = 1.0,
         alpha_ext: float | None = None,
         signal_normalizer: Literal["max", "saturating", "quantile"] = "max",
+        signal_normalization: Literal["stored", "sampled"] = "stored",
+        instrumental_form: Literal["penalty", "unit"] = "penalty",
         signal_errors: Literal["all", "output"] = "all",
         actor_pressure: Weight = 1.0,
         scale_pressure: bool = False,
@@ -244,6 +249,8 @@ class ActPC(OffPolicyAlgorithm):
         self.observation_normalization = observation_normalization
         self.compile = compile
         self.signal_normalizer = signal_normalizer
+        self.signal_normalization = signal_normalization
+        self.instrumental_form = instrumental_form
         self.epistemic_normalizer = make_normalizer(signal_normalizer)
         self.instrumental_normalizer = make_normalizer(signal_normalizer)
         self.pretrained, self.n_pretraining_updates = False, 0
@@ -505,17 +512,25 @@ class ActPC(OffPolicyAlgorithm):
         past: Observations | None,
         mask: np.ndarray | None,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Both signals of new transitions (Algorithm 1, lines 10 to 13), (n_envs,) each; the normalisers follow them."""
+        """Both signals of new transitions as they are stored (Algorithm 1, lines 10, 12 and 13), (n_envs,) each."""
         inputs, (_, alpha_ep, alpha_in) = self.inputs, self.reward_weights
         features, next_features = (inputs.features(inputs.observations(o)) for o in (observations, next_observations))
         memory = inputs.memory(*inputs.past(past, mask))
         raw_ep, raw_in = self._raw_signals(features, inputs.tensor(actions), next_features, memory)
         epistemic = self.epistemic_normalizer(raw_ep) if alpha_ep else raw_ep
-        instrumental = -self.instrumental_normalizer(raw_in) if alpha_in else raw_in
+        instrumental = raw_in
+        if alpha_in:
+            instrumental = instrumental_reward(self.instrumental_normalizer(raw_in), self.instrumental_form)
         check_finite("generator", "signals", epistemic, self.num_timesteps)
         check_finite("prior", "signals", instrumental, self.num_timesteps)
         self.diagnostics.follow(epistemic_signal=epistemic.mean(), instrumental_signal=instrumental.mean())
-        return epistemic, instrumental
+        return (raw_ep, raw_in) if self.signal_normalization == "sampled" else (epistemic, instrumental)
+
+    @property
+    def _rewards_of_signals(self) -> tuple[Normalize, Normalize]:
+        """What summed squared errors of generator and prior pay by what the normalisers have seen; these do not move."""
+        instrumental = self.instrumental_normalizer.rescale
+        return self.epistemic_normalizer.rescale, lambda raw: instrumental_reward(instrumental(raw), self.instrumental_form)
 
     def _raw_signals(
         self, features: th.Tensor, actions: th.Tensor, next_features: th.Tensor, memory: th.Tensor | None
@@ -577,8 +592,7 @@ class ActPC(OffPolicyAlgorithm):
         if self.expert is None or not self.demonstration_fraction or not any(self.reward_weights[1:]):
             return
         if self._n_updates % EXPERT_SIGNALS_INTERVAL == 1 or not self.expert.has_signals:
-            normalizers = self.epistemic_normalizer, self.instrumental_normalizer
-            self.expert.refresh_signals(self._raw_signals, self.inputs, *normalizers)
+            self.expert.refresh_signals(self._raw_signals, self.inputs, *self._rewards_of_signals)
 
     def _sample_batch(self, batch_size: int) -> Batch:
         """Replayed transitions, the newest among them, then the share that comes from the demonstrations."""
@@ -586,7 +600,8 @@ class ActPC(OffPolicyAlgorithm):
         sizes = self._batch_sizes(batch_size)
         largest, inputs, weights = max(sizes), self.inputs, self.reward_weights
         n_expert = round(self.demonstration_fraction * largest) if self.expert is not None else 0
-        replayed = self.replay_buffer.sample(largest - n_expert, env=self._vec_normalize_env)
+        rewards_of = self._rewards_of_signals if self.signal_normalization == "sampled" else STORED
+        replayed = self.replay_buffer.sample(largest - n_expert, self._vec_normalize_env, rewards_of)
         batch = inputs.replayed(replayed, weights, self.gamma)
         internal = batch.rewards - weights[0] * replayed.rewards
         self.diagnostics.follow(internal_reward=internal.mean, task_reward=replayed.rewards.mean)

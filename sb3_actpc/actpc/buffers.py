@@ -11,6 +11,7 @@ from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer
 from stable_baselines3.common.vec_env import VecNormalize
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
+from sb3_actpc.actpc.reward_signals import STORED, Normalize
 from sb3_actpc.actpc.self_imitation import Observations, SelfImitationMemory, TensorObservations, map_observations
 from sb3_actpc.utils.checks import LARGEST_SIZE, check_kinds, check_range
 
@@ -185,17 +186,20 @@ class SignalReplay(ReplayBuffer):
 
     # ------------------------------------------------------------------ sampling
 
-    def sample(self, batch_size: int, env: VecNormalize | None = None) -> SignalReplaySamples:  # type: ignore[override]
+    def sample(  # type: ignore[override]
+        self, batch_size: int, env: VecNormalize | None = None, rewards_of: tuple[Normalize, Normalize] = STORED
+    ) -> SignalReplaySamples:
         """
         :param batch_size: B
         :param env: VecNormalize whose statistics normalise observations and the task's rewards
+        :param rewards_of: what stored epistemic and instrumental signals pay, element by element; themselves by default
         :return: B transitions; with ``combined``, those of the last step (of every environment) come first
         """
         newest = np.arange(min(self.n_envs if self.combined else 0, batch_size))
         rows, envs = self._draw(batch_size - len(newest))
         rows = np.concatenate([np.full(len(newest), self.newest), rows])
         envs = np.concatenate([newest, envs])
-        return self._relabel(self._gather(rows, envs, env), rows, envs, len(newest), env)
+        return self._relabel(self._gather(rows, envs, env, rewards_of), rows, envs, len(newest), env)
 
     def _relabel(
         self, batch: SignalReplaySamples, rows: np.ndarray, envs: np.ndarray, n_newest: int, env: VecNormalize | None
@@ -212,7 +216,13 @@ class SignalReplay(ReplayBuffer):
         ages = np.random.randint(skipped, self.buffer_size, size=n)
         return (self.pos + ages) % self.buffer_size, np.random.randint(0, self.n_envs, size=n)
 
-    def _gather(self, rows: np.ndarray, envs: np.ndarray, env: VecNormalize | None) -> SignalReplaySamples:
+    def _gather(
+        self,
+        rows: np.ndarray,
+        envs: np.ndarray,
+        env: VecNormalize | None,
+        rewards_of: tuple[Normalize, Normalize] = STORED,
+    ) -> SignalReplaySamples:
         last, mask = rows, None
         history, history_mask = self._history_at(rows, envs, env)
         next_history: tuple[Any, Any] = (None, None)
@@ -228,8 +238,8 @@ class SignalReplay(ReplayBuffer):
                 self._summed(self.rewards, rows, envs, mask, lambda rewards: self._normalize_reward(rewards, env))
             ),
             discounts=None if mask is None else self.to_torch(self.gamma ** mask.sum(1, keepdims=True)),
-            epistemic=self.to_torch(self._summed(self.epistemic, rows, envs, mask)),
-            instrumental=self.to_torch(self._summed(self.instrumental, rows, envs, mask)),
+            epistemic=self.to_torch(self._summed(self.epistemic, rows, envs, mask, rewards_of[0])),
+            instrumental=self.to_torch(self._summed(self.instrumental, rows, envs, mask, rewards_of[1])),
             history=history,
             history_mask=history_mask,
             following_observations=None if mask is None else self._next_observations_at(rows, envs, env),
@@ -293,7 +303,7 @@ class SignalReplay(ReplayBuffer):
         rows: np.ndarray,
         envs: np.ndarray,
         mask: np.ndarray | None,
-        normalize: Callable[[np.ndarray], np.ndarray] = lambda values: values,
+        normalize: Normalize,
     ) -> np.ndarray:
         """``values`` at the rows, or their discounted sum over the n-step window, each normalised first, (B, 1)."""
         if mask is None:

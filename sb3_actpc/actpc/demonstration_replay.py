@@ -8,7 +8,7 @@ import torch as th
 from gymnasium import spaces
 
 from sb3_actpc.actpc.features import Batch, CircuitInputs
-from sb3_actpc.actpc.reward_signals import Normalizer
+from sb3_actpc.actpc.reward_signals import Normalize
 from sb3_actpc.actpc.self_imitation import Episodes, split_observations
 from sb3_actpc.demonstrations.dataset import Demonstrations
 
@@ -98,20 +98,20 @@ class DemonstrationReplay:
         return weights[0] * task + weights[1] * self.epistemic[rows] + weights[2] * self.instrumental[rows]
 
     def refresh_signals(
-        self, raw_signals: RawSignals, inputs: CircuitInputs, epistemic: Normalizer, instrumental: Normalizer
+        self, raw_signals: RawSignals, inputs: CircuitInputs, epistemic: Normalize, instrumental: Normalize
     ) -> None:
         """
-        Signals of all transitions under the present generator and prior; the normalisers do not move.
+        Signals of all transitions under the present generator and prior.
 
         :param raw_signals: summed squared errors of both circuits from (features, actions, next features, memory)
         :param inputs: turns observations into features
-        :param epistemic: normaliser of the epistemic signal
-        :param instrumental: normaliser of the instrumental signal
+        :param epistemic: what the generator's summed squared errors pay
+        :param instrumental: what the prior's pay
         """
         for start in range(0, len(self), 1024):
             rows = np.arange(start, min(start + 1024, len(self)))
             batch = self.batch(rows, inputs, (0.0, 0.0, 0.0), 0.0)
             raw_ep, raw_in = raw_signals(batch.features, batch.actions, batch.next_features, batch.memory)
-            self.epistemic[rows] = epistemic.rescale(raw_ep)
-            self.instrumental[rows] = -instrumental.rescale(raw_in)
+            self.epistemic[rows] = epistemic(raw_ep)
+            self.instrumental[rows] = instrumental(raw_in)
         self.has_signals = True

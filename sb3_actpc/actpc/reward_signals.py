@@ -1,5 +1,7 @@
 """The internal reward: epistemic and instrumental signals from the errors of settled circuits, and their normalisers."""
 
+from collections.abc import Callable
+
 import numpy as np
 import torch as th
 
@@ -7,6 +9,8 @@ from sb3_actpc.ngc import SettledState
 
 NORMALIZERS = ("max", "saturating", "quantile")
 SIGNAL_ERRORS = ("all", "output")
+Normalize = Callable[[np.ndarray], np.ndarray]  # element by element, in any shape
+STORED: tuple[Normalize, Normalize] = (np.asarray, np.asarray)  # both signals pay what was stored
 
 
 def summed_squared_errors(state: SettledState, which: str = "all") -> th.Tensor:
@@ -19,6 +23,18 @@ def summed_squared_errors(state: SettledState, which: str = "all") -> th.Tensor:
     """
     errors = state.errors if which == "all" else state.errors[-1:]
     return th.stack([error.square().sum(1) for error in errors]).sum(0)
+
+
+def instrumental_reward(normalized: np.ndarray, form: str = "penalty") -> np.ndarray:
+    """
+    What the prior's normalised errors are worth.
+
+    :param normalized: (n,) in [0, 1], 0 where the step was as demonstrated
+    :param form: "penalty", -r in [-1, 0] (the paper's equation; never positive, so that the shortest episode is the best where
+        the task can end by falling), or "unit", 1 - r in [0, 1] (the paper's sentence below it; a step as demonstrated pays 1)
+    :return: (n,)
+    """
+    return 1.0 - normalized if form == "unit" else -normalized
 
 
 class RunningMaximum:

@@ -122,7 +122,7 @@ class Episodes:
 
 class SelfImitationMemory:
     """
-    The actor's memory of its own goal-reaching episodes (paper: M^actor, Algorithm 1, line 30), laid end to end.
+    The actor's memory of its own goal-reaching episodes (paper: M^actor, Algorithm 1, line 29), laid end to end.
 
     An episode enters when its sparse return is positive and at least the best return now stored; the oldest leave when the
     capacity is passed. A task that pays negative rewards alone never gets one in: the memory warns of it, once.

@@ -96,6 +96,65 @@ def test_every_normalizer_keeps_signals_in_their_range(normalizer):
     assert 0 < model.replay_buffer.epistemic[:60].max() <= 1 and -1 <= model.replay_buffer.instrumental[:60].min() < 0
 
 
+@pytest.mark.parametrize("normalization", ["stored", "sampled"])
+def test_the_unit_form_pays_one_more_than_the_penalty_for_every_transition(normalization):
+    """1 - r = 1 + (-r): the same settled errors and the same normaliser, so the two differ by 1 everywhere."""
+    batches = []
+    for form in ("penalty", "unit"):
+        keywords = {"instrumental_form": form, "signal_normalization": normalization, "learning_starts": 1000}
+        model = make(demonstrations=demonstrations(), alpha_ep=0.0, **keywords)
+        model.learn(40)
+        np.random.seed(1)
+        batches.append(model._sample_batch(32))
+    assert th.allclose(batches[0].rewards + 1.0, batches[1].rewards, atol=1e-6)
+    assert -1 <= batches[0].rewards.min() < batches[0].rewards.max() <= 0
+
+
+def test_signals_normalised_when_sampled_follow_the_maximum_that_was_seen_last():
+    """Stored once, r = r̂ / max so far; sampled, r̂ / max of all: the latter ranks transitions by r̂ for as long as they live."""
+    models = {}
+    for normalization in ("stored", "sampled"):
+        models[normalization] = make(
+            demonstrations=demonstrations(), signal_normalization=normalization, learning_starts=1000, alpha_in=0.0
+        )
+        models[normalization].learn(30)
+    raw = models["sampled"].replay_buffer.epistemic[:30, 0]
+    running = np.maximum.accumulate(np.maximum(raw, 1.0))
+    assert running[0] < running[-1]  # else nothing tells them apart
+    assert np.allclose(models["stored"].replay_buffer.epistemic[:30, 0], raw / running, rtol=1e-5)
+    model = models["sampled"]
+    for maximum in (running[-1], 10 * running[-1]):
+        model.epistemic_normalizer.maximum = maximum
+        np.random.seed(1)
+        rows = np.concatenate([[29], np.random.randint(0, 30, size=31)])
+        np.random.seed(1)
+        assert np.allclose(model._sample_batch(32).rewards[:, 0].numpy(), raw[rows] / maximum, rtol=1e-5)
+
+
+@pytest.mark.parametrize("form", ["penalty", "unit"])
+def test_demonstrated_transitions_are_paid_in_the_same_form(form):
+    model = make(demonstrations=demonstrations(), demonstration_fraction=0.5, instrumental_form=form, alpha_ep=0.0)
+    model.learn(30)
+    paid = model.expert.instrumental
+    assert (0 <= paid.min() and paid.max() <= 1) if form == "unit" else (-1 <= paid.min() and paid.max() <= 0)
+    assert paid.std() > 0
+
+
+def test_an_actor_with_a_memory_weight_of_zero_acts_on_the_present_alone():
+    """The paper's alpha_m, of one circuit: the others keep the working memory."""
+    policy_kwargs = {**remembering(3), "actor_kwargs": {"memory_weight": 0.0}}
+    model = make(demonstrations=demonstrations(), policy_kwargs=policy_kwargs)
+    model.learn(60)
+    observation = model.observation_space.sample()[None]
+    pasts = [(np.full((1, 3, observation.shape[1]), value, np.float32),) for value in (-1.0, 0.0, 2.0)]
+    actions = [model.predict(observation, past)[0] for past in pasts]
+    assert np.array_equal(actions[0], actions[1]) and np.array_equal(actions[1], actions[2])
+    features = th.as_tensor(observation)
+    memories = [model.actor.memory(th.as_tensor(past[0])) for past in pasts]
+    predicted = [model.prior.project(features, memory) for memory in memories]
+    assert not th.allclose(predicted[0], predicted[2])
+
+
 def test_without_demonstrations_the_task_reward_takes_the_role_of_the_prior():
     assert make().reward_weights == (1.0, 1.0, 0.0)
     assert make(demonstrations=demonstrations()).reward_weights == (0.0, 1.0, 1.0)

@@ -20,7 +20,7 @@ from tests.recordings import record_file
 pytestmark = pytest.mark.filterwarnings("ignore:.*out of date.*", "ignore:.*infinity.*", "ignore:.*mini-batch size.*")
 FOLDER = next(folder for folder in HYPERPARAMS_FOLDERS if folder.is_dir())
 # settings of a preset that is no algorithm's
-ALGO_OF = {"actpc_paper": "actpc", "ppo_demonstrator": "ppo", "td3_demonstrator": "td3"}
+ALGO_OF = {"actpc_paper": "actpc", "actpc_faithful": "actpc", "ppo_demonstrator": "ppo", "td3_demonstrator": "td3"}
 N_EPISODES = 26  # of 12 steps: the paper's preset asks for 300 transitions
 DEFAULT_ENV = {"her": "GoalHopper-v5", **dict.fromkeys(("ppo", "sac", "trpo"), "Hopper-v5")}
 # what would take long, and nothing else

@@ -8,9 +8,11 @@ from typing import Any
 
 import pytest
 
+from sb3_actpc.actpc.policies import CIRCUIT_KEYWORDS
 from sb3_actpc.demonstrations.dataset import Demonstrations, shipped_demonstrations
 from sb3_actpc.experiments.runs import load_preset
 from sb3_actpc.experiments.runs.algorithms import load_algorithm
+from sb3_actpc.utils.constructors import constructor_keywords
 
 FILE = Path(__file__).with_name("paper_tables.csv")
 ENTRIES = list(csv.DictReader(FILE.read_text(encoding="utf-8").splitlines()))
@@ -26,6 +28,15 @@ TABLES = {
 LEFT_OUT = "none: "  # and why there is nothing to compare
 CAPACITY = "at least the shipped demonstrations"
 UNSET: Any = object()
+# what the faithful preset changes of the paper's (its comment names these rungs)
+RUNGS = {
+    "settling",
+    "observation_normalization",
+    "policy_kwargs.actor_kwargs.memory_weight",
+    "n_demonstration_transitions",
+    "actor_warm_start",
+    "refresh_weight",
+}
 
 
 def cases() -> list[tuple[str, str, str]]:
@@ -47,10 +58,14 @@ def look_up(settings: Mapping[str, Any], path: str, algorithm: Any) -> Any:
     if node is not UNSET:
         return node
     if first == "policy_kwargs":
-        policy = next(iter(algorithm.policy_aliases.values()))
-        defaults = inspect.signature(policy.__init__).parameters
-        return defaults[rest].default if rest in defaults else UNSET
-    return UNSET if rest else inspect.signature(algorithm).parameters[first].default
+        return default_of(next(iter(algorithm.policy_aliases.values())), rest)
+    return UNSET if rest else default_of(algorithm, first)
+
+
+def default_of(kind: type, name: str) -> Any:
+    """Of a constructor's keyword; a subclass may pass it on to the class above."""
+    signatures = [inspect.signature(base.__init__).parameters for base in kind.__mro__ if "__init__" in vars(base)]
+    return next((parameters[name].default for parameters in signatures if name in parameters), UNSET)
 
 
 def is_papers(value: Any, expected: str) -> bool:
@@ -82,3 +97,36 @@ def test_the_preset_has_the_papers_values(method: str, task: str, env_id: str) -
             if not is_papers(value, expected):
                 differing.append(f"{entry['setting']} of {entry['circuit']} ({key}): {value!r}, the paper's is {expected}")
     assert not differing
+
+
+# of the run, of the computation, or of nothing that the paper's preset turns on
+NOT_OF_THE_AGENT = set(
+    "policy env device seed verbose tensorboard_log stats_window_size optimize_memory_usage replay_buffer_class "
+    "demonstrations n_demonstrations action_noise target_noise_clip".split()
+)
+OF_THE_AGENT = {"settling"}  # among the circuits' keywords
+
+
+def test_the_papers_preset_leaves_nothing_to_defaults() -> None:
+    """The constructor's defaults may become any recipe; the paper's preset stays what it is."""
+    algorithm = load_algorithm("actpc")
+    for env_id in ("SparseHopper-v5", "SparseLift-v0"):
+        settings = load_preset("actpc_paper", env_id)
+        assert not set(constructor_keywords(algorithm)) - NOT_OF_THE_AGENT - set(settings)
+        assert set(settings["policy_kwargs"]["circuit_kwargs"]) == CIRCUIT_KEYWORDS - OF_THE_AGENT
+
+
+def flat(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested settings under dotted keys."""
+    found: dict[str, Any] = {}
+    for key, value in settings.items():
+        found |= flat(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
+    return found
+
+
+@pytest.mark.parametrize("env_id", [env_id for method, _, env_id in cases() if method == "actpc"])
+def test_the_faithful_preset_is_the_papers_but_for_its_rungs(env_id: str) -> None:
+    paper, faithful = flat(load_preset("actpc_paper", env_id)), flat(load_preset("actpc_faithful", env_id))
+    differing = {key for key in paper | faithful if paper.get(key, UNSET) != faithful.get(key, UNSET)} - {"n_timesteps"}
+    rungs = RUNGS - {"n_demonstration_transitions"} if "-v0" in env_id else RUNGS
+    assert differing == rungs
