@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from sb3_actpc.experiments.zoo import NET_ARCHS, convert_actpc_params, main
 
 from sb3_actpc.cli import main as command_line
+from sb3_actpc.cli.zoo import NET_ARCHS, convert_actpc_params
 from tests.recordings import record
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -46,7 +46,7 @@ SCRIPT = {
 CODE = """
 import json, sys
 import rl_zoo3.exp_manager
-from sb3_actpc.experiments.zoo import main
+from sb3_actpc.cli import main
 
 make_vec_env = rl_zoo3.exp_manager.make_vec_env
 
@@ -57,7 +57,7 @@ def make_and_tell(*arguments, **keywords):
 rl_zoo3.exp_manager.make_vec_env = make_and_tell
 for name, arguments in json.loads(sys.argv[1]).items():
     print(f"@@@ {name}", flush=True)
-    main(arguments)
+    assert main(["--debug", "zoo", *arguments]) == 0
 """
 
 
@@ -124,7 +124,7 @@ def test_the_evaluation_starts_elsewhere_than_the_training(ran: tuple[Path, dict
 
 def test_help_is_rl_zoo3s_with_our_algorithms() -> None:
     pytest.importorskip("rl_zoo3")
-    command = [sys.executable, "-m", "sb3_actpc.experiments.zoo", "train", "--help"]
+    command = [sys.executable, "-m", "sb3_actpc", "zoo", "train", "--help"]
     shown = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=120, check=True).stdout
     assert "--optimize-hyperparameters" in shown and "actpc" in shown and "sac_rlpd" in shown
 
@@ -165,8 +165,6 @@ def test_sampled_parameters_become_keywords() -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ([], "zoo has no command ''"),
-        (["dance"], "zoo has no command 'dance': choose one of train, optimize, enjoy"),
         (["train", "--algo", "actpc"], "--env is missing"),
         (["optimize", "--algo", "bc", "--env", "SparseReacher-v5"], "zoo optimize does not know what to vary for 'bc'"),
         (["enjoy", "--env", "SparseReacher-v5", "--folder", "nowhere"], "no runs of actpc in nowhere"),
@@ -176,7 +174,7 @@ def test_sampled_parameters_become_keywords() -> None:
 def test_mistakes_give_one_line_and_exit_code_2(
     arguments: list[str], message: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("sb3_actpc.experiments.zoo.register_algorithms", lambda: None)  # leaves rl-zoo3 alone
+    monkeypatch.setattr("sb3_actpc.cli.zoo.register_algorithms", lambda: None)  # leaves rl-zoo3 alone
     assert command_line(["zoo", *arguments]) == 2
     assert message in capsys.readouterr().err
 
@@ -184,4 +182,4 @@ def test_mistakes_give_one_line_and_exit_code_2(
 def test_without_rl_zoo3_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "rl_zoo3", None)
     with pytest.raises(ImportError, match=r"pip install 'sb3-actpc\[zoo\]'"):
-        main(["train", "--env", "SparseReacher-v5"])
+        command_line(["--debug", "zoo", "train", "--env", "SparseReacher-v5"])
