@@ -3,10 +3,13 @@
 import re
 import shlex
 from pathlib import Path
+from typing import Any
 
 import pytest
+import torch
 import yaml
 
+from sb3_actpc import shipped_demonstrations
 from sb3_actpc.cli import build_parser
 from sb3_actpc.experiments.comparison import plan_runs, read_comparison
 
@@ -63,19 +66,22 @@ def test_the_ci_runs_the_test_command_of_the_readme() -> None:
 
 def test_the_circuit_of_the_readme_learns() -> None:
     [block] = [block for block in blocks("README.md", "python") if "NGCCircuit" in block]
-    names: dict[str, object] = {}
+    torch.manual_seed(0)
+    names: dict[str, Any] = {}
     exec(block, names)
+    circuit, x, target = names["circuit"], names["x"], names["target"]
     energies = []
     for _ in range(50):
-        exec("state = circuit.settle(x, target); circuit.apply_changes(circuit.hebbian_update(state), optimizer)", names)
-        exec("energy = float(((circuit.project(x) - target) ** 2).mean())", names)
-        energies.append(names["energy"])
-    assert energies[-1] < energies[0]  # type: ignore[operator]
+        circuit.apply_changes(circuit.hebbian_update(circuit.settle(x, target)))
+        energies.append(float(((circuit.project(x) - target) ** 2).mean()))
+    assert energies[-1] < energies[0]
 
 
-def test_the_agent_of_the_readme_takes_its_keywords() -> None:
-    [block] = [block for block in blocks("README.md", "python") if "model = ActPC(" in block]
-    exec(block.replace('model.learn(5_000, progress_bar=True)\nmodel.save("cheetah")\n', ""), {})
+def test_the_agents_of_the_readme_can_be_made() -> None:
+    quick, own, *_ = blocks("README.md", "python")
+    exec(quick[: quick.index("model.learn")], {})
+    path = repr(shipped_demonstrations("SparseReacher-v5").as_posix())
+    exec(own.replace('"mine.npz"', path), {"env": "SparseReacher-v5"})
 
 
 def test_the_file_of_the_comparisons_page_is_one() -> None:

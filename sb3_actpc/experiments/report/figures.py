@@ -83,6 +83,7 @@ def draw_curves(results: Results, task: str, path: Path) -> None:
     """
     groups, measure = results.groups(task), measure_of(task)
     lines = reference_lines(results, task)
+    order = sorted(results.finished["label"].unique())  # a variant looks the same on every task
     panels: list[tuple[Any, str, str]] = [
         (step_curve, "environment steps", "evaluation"),
         (time_curve, "seconds of training", "evaluation"),
@@ -92,15 +93,16 @@ def draw_curves(results: Results, task: str, path: Path) -> None:
     figure = _figure(5.0 * len(panels), 4.2)
     for axes, (curve, x_label, where) in zip(figure.subplots(1, len(panels)), panels, strict=True):
         heights = [*lines.values()]
-        for index, (label, runs) in enumerate(groups.items()):
+        for label, runs in groups.items():
             x, values = curve(results, runs.index, measure)
             if len(x):
-                _band(axes, x, values, label, index)
+                _band(axes, x, values, label, order.index(label))
                 heights += [float(values.min()), float(values.max())]
         for style, (label, height) in zip(("--", ":"), lines.items(), strict=False):
             axes.axhline(height, color="black", linestyle=style, linewidth=1, label=label)
         limits = axis_limits([0.0, 1.0] if measure == "success_rate" else heights)
         axes.set(xlabel=x_label, ylabel=f"{MEASURE_NAMES[measure]} in {where}", ylim=limits)
+        axes.locator_params(axis="x", nbins=6)
     figure.suptitle(task)
     _legend(figure)
     _save(figure, path)

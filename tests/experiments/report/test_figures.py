@@ -22,7 +22,7 @@ from sb3_actpc.experiments.report.figures import (
 )
 from sb3_actpc.experiments.report.references import reference_score
 from sb3_actpc.experiments.report.results import Results, load_results
-from tests.experiments.report.folders import HOPPER, write_run
+from tests.experiments.report.folders import HOPPER, REACHER, write_run
 
 
 def curve_of(function: Any, folder: Path, *measure: str, task: str = HOPPER) -> Curve:
@@ -132,3 +132,13 @@ def test_what_was_not_logged_has_no_panel(tmp_path: Path, drawn: list[Any]) -> N
     assert [axes.get_title() for axes in drawn[0].axes] == ["signals"]
     silent = Results(results.runs, results.evaluations, results.episodes, pd.DataFrame(columns=["run"]))
     assert not draw_diagnostics(silent, silent.groups(HOPPER), HOPPER, tmp_path / "none.png") and len(drawn) == 1
+
+
+def test_a_variant_looks_the_same_on_every_task(tmp_path: Path, drawn: list[Any]) -> None:
+    for task, variants in ((HOPPER, ("actpc", "td3")), (REACHER, ("td3",))):
+        for variant in variants:
+            write_run(tmp_path, task, variant, algo=variant, returns=[1.0])
+    for task in (HOPPER, REACHER):
+        draw_curves(load_results(tmp_path), task, tmp_path / "none.png")
+    lines = [line for figure in drawn for axes in figure.axes for line in axes.lines if line.get_label() == "td3"]
+    assert len(lines) == 6 and len({line.get_color() for line in lines}) == 1

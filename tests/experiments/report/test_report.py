@@ -68,7 +68,7 @@ def test_a_column_that_nobody_has_a_value_in_is_left_out(tmp_path: Path) -> None
 
 def test_runs_from_a_changed_source_tree_are_marked(tmp_path: Path) -> None:
     write_run(tmp_path, variant="actpc", commit="a" * 40)
-    write_run(tmp_path, variant="td3", algo="td3", dirty=True)
+    write_run(tmp_path, variant="td3", algo="td3", commit="a" * 40, dirty=True)
     names = task_table(load_results(tmp_path), HOPPER)["", "variant"]
     assert {"actpc", "td3 †"} < set(names)
     write_report(tmp_path)
