@@ -4,9 +4,11 @@ the speed of the robosuite tasks as a ratio to robosuite's own loop."""
 from __future__ import annotations
 
 import argparse
+import json
 import statistics
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -17,6 +19,8 @@ BATCH_SIZE = 256
 WIDTH = 256
 N_FILLED = 1000
 N_ENV_STEPS = 20
+LEARNED = {"feedback": "learned", "feedback_start": "mirrored"}
+UNITS = {"TD3": "SB3 TD3 train()", "the products": "matrix products of one settling"}
 
 
 def add_parser(subparsers: Any) -> None:
@@ -25,6 +29,9 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument("--rounds", type=int, default=40, help="interleaved measurements of every entry")
     parser.add_argument("--threads", type=int, default=None, help="torch threads (default: torch's own choice)")
     parser.add_argument("--device", default="cpu", help="torch device")
+    parser.add_argument("--compiled", action="store_true", help="also the compiled update (compiling takes minutes)")
+    parser.add_argument("--output", type=Path, default=None, help="write the ratios to this JSON file")
+    parser.add_argument("--table", type=Path, nargs="+", default=None, help="print written ratios as a Markdown table instead")
     parser.add_argument("--robosuite", action="store_true", help="time the robosuite tasks instead")
     parser.set_defaults(run=run)
 
@@ -42,6 +49,9 @@ def run(args: argparse.Namespace) -> int:
 
     if args.rounds < 1 or (args.threads is not None and args.threads < 1):
         raise ValueError(f"--rounds {args.rounds} and --threads {args.threads} must be at least 1")
+    if args.table:
+        print(table(args.table))
+        return 0
     if args.threads is not None:
         th.set_num_threads(args.threads)
     if args.robosuite:
@@ -50,29 +60,39 @@ def run(args: argparse.Namespace) -> int:
     entries: dict[str, Callable[[], object]] = {"SB3 TD3 train()": _stepper(_td3(args.device))}
     for name, keywords in _settings().items():
         entries[name] = _stepper(_actpc(keywords, args.device))
+    if args.compiled:
+        keywords = {**_settings()["shipped, learned sweep"], "compile": True}
+        entries["shipped, learned sweep, compiled"] = _stepper(_actpc(keywords, args.device))
     entries |= _settling(args.device)
     times = _interleave(entries, args.rounds, synchronize=th.cuda.synchronize if args.device != "cpu" else lambda: None)
-    _print(times, th.get_num_threads(), args.device)
+    ratios = _ratios(times)
+    print(f"batch {BATCH_SIZE}, hidden [{WIDTH}, {WIDTH}], {args.device}, {th.get_num_threads()} threads; medians of rounds")
+    for name, (ratio, unit) in ratios.items():
+        print(f"{name:46s} {ratio:6.2f} x {unit}")
+    if args.output:
+        about = {"device": args.device, "threads": th.get_num_threads(), "rounds": args.rounds, "torch": th.__version__}
+        args.output.write_text(json.dumps({**about, "ratios": ratios}, indent=1) + "\n")
     print(f"replay memory over SB3's, per HalfCheetah transition: {_memory_ratio():.2f}")
     return 0
 
 
 def _settings() -> dict[str, dict[str, Any]]:
-    """The agents measured: the bare one, the shipped defaults and the paper's preset, with both schedules."""
+    """The agents measured: the bare one and the shipped one with every kind of settling, and the paper's preset."""
     from sb3_actpc.experiments.runs import preset
     from sb3_actpc.experiments.runs.presets import with_changes
 
-    bare: dict[str, Any] = {}
-    presets = {"shipped defaults": "actpc", "paper preset": "actpc_paper"}
-    with_data = {label: preset(TASK, name) for label, name in presets.items()}
-    settings = {}
-    for label, keywords in (("bare", bare), *with_data.items()):
-        for settling in ("scheduled", "iterative"):
-            chosen: dict[str, Any] = {"settling": settling}
-            if settling == "scheduled" and label == "paper preset":  # implies tied feedback
-                chosen["policy_kwargs.circuit_kwargs"] = {"activation": "relu6"}
-            settings[f"ActPC train(), {label}, {settling}"] = with_changes(keywords, chosen)
-    return settings
+    kinds: dict[str, tuple[str, dict[str, Any]]] = {
+        "tied sweep": ("scheduled", {"feedback": "tied"}),
+        "learned sweep": ("scheduled", LEARNED),
+        "iterative, default tolerance": ("iterative", LEARNED),
+    }
+    agents = {"bare": {}, "shipped": preset(TASK, "actpc")}
+    settings = {
+        f"{name}, {kind}": with_changes(keywords, {"settling": settling, "policy_kwargs.circuit_kwargs": circuits})
+        for name, keywords in agents.items()
+        for kind, (settling, circuits) in kinds.items()
+    }
+    return {**settings, "paper preset": preset(TASK, "actpc_paper")}
 
 
 def _td3(device: str) -> OffPolicyAlgorithm:
@@ -107,7 +127,7 @@ def _settling(device: str) -> dict[str, Callable[[], object]]:
 
     from sb3_actpc.ngc import NGCCircuit
 
-    circuit = NGCCircuit(23, 17, (WIDTH, WIDTH), feedback="tied").to(device)
+    circuit = NGCCircuit(23, 17, (WIDTH, WIDTH), feedback="tied", dynamics="error").to(device)
     x, target = th.randn(BATCH_SIZE, 23, device=device), th.randn(BATCH_SIZE, 17, device=device)
     hidden, output = th.randn(BATCH_SIZE, WIDTH, device=device), th.randn(BATCH_SIZE, 17, device=device)
     wide, narrow = circuit.weights[1], circuit.weights[2]
@@ -138,13 +158,28 @@ def _interleave(
     return times
 
 
-def _print(times: dict[str, list[float]], threads: int, device: str) -> None:
-    print(f"batch {BATCH_SIZE}, hidden [{WIDTH}, {WIDTH}], {device}, {threads} threads; medians of interleaved rounds")
-    reference, floor = times["SB3 TD3 train()"], times["matrix products of one settling"]
+def _ratios(times: dict[str, list[float]]) -> dict[str, tuple[float, str]]:
+    """Of every entry, the median ratio to its unit, round by round."""
+    ratios = {}
     for name, own in times.items():
-        base, unit = (floor, "the products") if "settling" in name else (reference, "TD3")
-        ratio = statistics.median(a / b for a, b in zip(own, base, strict=True))
-        print(f"{name:46s} {ratio:6.2f} x {unit}")
+        unit = "the products" if "settling" in name else "TD3"
+        base = times[UNITS[unit]]
+        ratios[name] = round(statistics.median(a / b for a, b in zip(own, base, strict=True)), 2), unit
+    return ratios
+
+
+def table(files: list[Path]) -> str:
+    """
+    :param files: what ``--output`` wrote, such as one for each number of threads
+    :return: a Markdown table, a row for each entry and a column for each file
+    """
+    measured = [json.loads(file.read_text()) for file in files]
+    heads = [f"{about['device']}, {about['threads']} threads" for about in measured]
+    lines = [f"| update, over its unit | {' | '.join(heads)} |", "| --- |" + " --- |" * len(heads)]
+    for name, (_, unit) in measured[0]["ratios"].items():
+        cells = [f"{about['ratios'][name][0]:.2f}" if name in about["ratios"] else "" for about in measured]
+        lines.append(f"| {name} / {unit} | {' | '.join(cells)} |")
+    return "\n".join(lines)
 
 
 def _bench_robosuite(rounds: int) -> None:

@@ -1,0 +1,30 @@
+"""The bench: ratios are taken round by round, each to its own unit; the table is written from the files."""
+
+import json
+
+from sb3_actpc.cli.bench import _ratios, table
+
+
+def test_ratios_are_medians_of_the_rounds_own():
+    times = {
+        "SB3 TD3 train()": [1.0, 2.0, 4.0],
+        "bare": [2.0, 2.0, 40.0],  # ratios 2, 1, 10
+        "matrix products of one settling": [0.5, 0.5, 0.5],
+        "one settling, K = 10": [1.0, 0.5, 3.0],  # ratios 2, 1, 6
+    }
+    ratios = _ratios(times)
+    assert ratios["bare"] == (2.0, "TD3") and ratios["one settling, K = 10"] == (2.0, "the products")
+
+
+def test_the_table_has_a_column_for_each_file(tmp_path):
+    files = []
+    for threads, ratio in ((1, 0.9), (2, 0.75)):
+        files.append(tmp_path / f"{threads}.json")
+        ratios = {"bare": [ratio, "TD3"], **({"compiled": [0.5, "TD3"]} if threads == 1 else {})}
+        files[-1].write_text(json.dumps({"device": "cpu", "threads": threads, "ratios": ratios}))
+    assert table(files).splitlines() == [
+        "| update, over its unit | cpu, 1 threads | cpu, 2 threads |",
+        "| --- | --- | --- |",
+        "| bare / TD3 | 0.90 | 0.75 |",
+        "| compiled / TD3 | 0.50 |  |",
+    ]
