@@ -64,7 +64,7 @@ def look_up(settings: Mapping[str, Any], path: str, algorithm: Any) -> Any:
 
 def default_of(kind: type, name: str) -> Any:
     """Of a constructor's keyword; a subclass may pass it on to the class above."""
-    signatures = [inspect.signature(base.__init__).parameters for base in kind.__mro__ if "__init__" in vars(base)]
+    signatures = [inspect.signature(vars(base)["__init__"]).parameters for base in kind.__mro__ if "__init__" in vars(base)]
     return next((parameters[name].default for parameters in signatures if name in parameters), UNSET)
 
 
@@ -102,7 +102,7 @@ def test_the_preset_has_the_papers_values(method: str, task: str, env_id: str) -
 # of the run, of the computation, or of nothing that the paper's preset turns on
 NOT_OF_THE_AGENT = set(
     "policy env device seed verbose tensorboard_log stats_window_size optimize_memory_usage replay_buffer_class "
-    "demonstrations n_demonstrations action_noise target_noise_clip".split()
+    "compile demonstrations n_demonstrations action_noise target_noise_clip".split()
 )
 OF_THE_AGENT = {"settling"}  # among the circuits' keywords
 
