@@ -44,6 +44,7 @@ from sb3_actpc.actpc.compiled import CompiledUpdate, compiled_update
 from sb3_actpc.actpc.demonstration_replay import DemonstrationReplay
 from sb3_actpc.actpc.diagnostics import Diagnostics
 from sb3_actpc.actpc.features import Batch, CircuitInputs
+from sb3_actpc.actpc.habit import Trials
 from sb3_actpc.actpc.policies import POLICIES, ActPCActor, ActPCPolicy, Critics, check_policy, check_policy_kwargs
 from sb3_actpc.actpc.reward_signals import STORED, Normalize, instrumental_reward, make_normalizer, summed_squared_errors
 from sb3_actpc.actpc.self_imitation import Episodes, Observations, map_observations, sample_union
@@ -60,6 +61,13 @@ SelfActPC = TypeVar("SelfActPC", bound="ActPC")
 SMALLEST_VALUE_SCALE = 1.0
 EXPERT_SIGNALS_INTERVAL = 1000  # updates between two evaluations of the demonstrations' signals
 PRETRAINING_INTERVAL = 1000  # updates between two lines about pre-training
+WARM_START_RATES, WARM_START_BATCH = (1e-3, 5e-5), 256  # a precise clone: what follows can only be as good as its habit
+ACTOR_SLOWNESS = 4.0  # how much slower than the others the actor learns, after a warm start
+SMALLEST_EXPLORATION = 0.2  # of ``exploration_noise``, where demonstrations hardly spread
+TARGET_NOISE_CLIP = 2.5  # standard deviations, as TD3's 0.5 for 0.2
+AVERAGING_RATE = 0.001  # per update, of the average of the actor that becomes the habit
+PRESSURE_FACTORS = {"accepted": 1.15, "tied": 1.0, "rejected": 0.85, "relapsed": 0.5}  # what a verdict does to the pressure
+SMALLEST_PRESSURE, LARGEST_PRESSURE = 0.2, 5.0  # times its first value
 
 
 class ActPC(OffPolicyAlgorithm):
@@ -67,10 +75,26 @@ class ActPC(OffPolicyAlgorithm):
     Active predictive coding: four NGC circuits that learn by settling and Hebbian changes, never by backprop.
 
     The actor acts; the critic values its actions; the generator's surprise is an epistemic reward; the prior, learned from
-    demonstrations and then frozen, gives an instrumental one. Paper: https://arxiv.org/abs/2209.09174. Defaults are the
-    paper's (its tables for HalfCheetah) except where a comment at the constructor says otherwise, and for the error synapses,
-    which are tied unless ``policy_kwargs=dict(circuit_kwargs=dict(feedback="learned"))`` asks for the paper's. Without
-    demonstrations there is no prior, and the task's reward takes its role.
+    demonstrations and then frozen, gives an instrumental one. Paper: https://arxiv.org/abs/2209.09174.
+
+    Defaults are one recipe for anybody's demonstrations, measured in RESULTS.md; the paper's own values are in
+    ``hyperparams/actpc_paper.yml``. Keywords whose default is None have one value with demonstrations and one without:
+
+    ====================================== ============== =======
+    keyword                                demonstrations without
+    ====================================== ============== =======
+    ``learning_starts``                    0              100
+    ``tau``                                0.02           0.005
+    ``n_steps`` (1 with hindsight)         5              1
+    ``actor_warm_start``                   7500           0
+    ``critic_warmup``                      3000           0
+    ``demonstration_fraction``             0.5            0
+    ``observation_normalization``          demonstrations none
+    ``policy_kwargs["habit"]``             True           False
+    the actor's learning rate, of others'  1/4 [#]_       1
+    ====================================== ============== =======
+
+    .. [#] with a habit
 
     :param policy: "MlpPolicy", "MultiInputPolicy", "CnnPolicy" (fixed random convolutions) or a class
     :param env: the environment, or its id
@@ -82,33 +106,40 @@ class ActPC(OffPolicyAlgorithm):
     :param gamma: discount
     :param train_freq: environment steps (or episodes) between updates
     :param gradient_steps: updates each time; -1 for as many as steps were collected
-    :param action_noise: exploration noise added to the action; the paper has none
+    :param action_noise: SB3's exploration noise, in the place of ``exploration_noise``
     :param replay_buffer_class: None, or one of SB3's classes or its name (its ActPC counterpart is used)
     :param replay_buffer_kwargs: keywords of the buffer: ``combined`` (True: the newest transition of every environment is in
         every batch) and ``self_imitation_size`` (100,000 transitions in the memory of the agent's own best episodes; 0 for
         none), and those of SB3's class
     :param optimize_memory_usage: as in SB3
     :param n_steps: length of n-step returns
-    :param settling: "iterative" (the paper) or "scheduled" (cheaper, numerically backprop without autograd)
+    :param settling: "scheduled" (one ordered sweep of the errors, the zero-divergence schedule or Z-IL of the
+        predictive-coding literature) or "iterative" (the paper: K steps of eq. 1)
+    :param exploration_noise: standard deviation of the Gaussian noise on the actions in [-1, 1]; with demonstrations at most
+        their spread around the warm-started actor, dimension by dimension. With a habit every second episode goes without.
+        0 for none (the paper)
+    :param policy_delay: updates of the critic for each of the actor, as in TD3; the paper's is 1
     :param demonstrations: a path, a Minari id, or a :class:`~sb3_actpc.demonstrations.dataset.Demonstrations`. A path is saved
         as it was given; others can be set later (``agent.demonstrations = ...``), which a trained prior outlasts
     :param n_demonstrations: use only the first so many episodes of them
     :param n_demonstration_transitions: use only the first so many transitions (the paper's "300 samples")
     :param prior_updates: updates of the prior on the demonstrations before learning starts; then it is frozen
-    :param actor_warm_start: updates of the actor on the demonstrations before learning starts
+    :param actor_warm_start: updates of the actor on the demonstrations before learning starts, with learning rates that fall
+        from ``WARM_START_RATES[0]`` to ``[1]``
     :param refresh_weight: weight of the actor's refresh from the demonstrations and its own best episodes
     :param refresh_noise: standard deviation of Gaussian noise on the features (normalised observations) that refresh and warm
         start imitate on, not on the working memory's; against overfitting to few demonstrations. 0 for none (the paper)
     :param demonstration_fraction: share of the critic's batch that comes from the demonstrations
     :param alpha_ep: weight of the epistemic signal
     :param alpha_in: weight of the instrumental signal
-    :param alpha_ext: weight of the task's reward; by default 0 with demonstrations (the paper) and 1 without
+    :param alpha_ext: weight of the task's reward (the paper's is 0 with demonstrations)
     :param signal_normalizer: "max" (running maximum, the paper), "saturating" (r / (r + 1)) or "quantile"
     :param signal_normalization: "stored" (once, when a transition is seen, the paper) or "sampled" (whenever it is replayed,
         by what the normaliser has seen until then)
     :param instrumental_form: what the prior's normalised errors r pay: "penalty", -r (the paper's equation), or "unit", 1 - r
     :param signal_errors: the signals sum the squared errors of "all" layers (the paper) or of the "output" alone
-    :param actor_pressure: weight of the critic's pressure on the actor; 0 leaves refresh alone (cloning)
+    :param actor_pressure: weight of the critic's pressure on the actor, at first: with a habit it grows with every proof and
+        shrinks with every failure (``pressure`` is the present one). 0 leaves refresh alone (cloning)
     :param scale_pressure: divide the pressure by the batch's mean absolute action-value (at least 1: one paid step)
     :param nudge: scale of the critic's clamped error while actor and critic settle as one (the paper's is 1); None for an
         infinitesimal one, or 1 with ``dynamics="state"``
@@ -116,13 +147,12 @@ class ActPC(OffPolicyAlgorithm):
     :param bootstrap: "joint" (target critic at the target actor's next action, the appendix) or "literal" (at the action
         taken, the main text's equation)
     :param target_policy_noise: standard deviation of the noise on the target actor's action; 0 for none
-    :param target_noise_clip: its bound
     :param target_update_interval: the targets move after every update (1), or every so many environment steps; hard copies
         as in DQN are ``tau=1, target_update_interval=C``
     :param observation_normalization: "none" (the paper) or "demonstrations" (their mean and standard deviation, fixed)
     :param compile: run the updates of sweeping circuits as one graph of ``torch.compile`` (see
         :mod:`~sb3_actpc.actpc.compiled`): True, False or "auto", where the run is long enough to earn it
-    :param policy_kwargs: keywords of :class:`~sb3_actpc.actpc.policies.ActPCPolicy`: ``net_arch``, ``n_critics``,
+    :param policy_kwargs: keywords of :class:`~sb3_actpc.actpc.policies.ActPCPolicy`: ``net_arch``, ``n_critics``, ``habit``,
         ``memory_history`` (the working memory), ``circuit_kwargs`` (of every :class:`~sb3_actpc.ngc.NGCCircuit`:
         ``n_settling_steps``, ``feedback``, ``dynamics``, ``activation``, ``synaptic_scaling``, ...), ``actor_kwargs``,
         ``critic_kwargs``, ``generator_kwargs`` and ``prior_kwargs`` (of one, and its ``net_arch``, ``learning_rate`` and
@@ -153,9 +183,9 @@ class ActPC(OffPolicyAlgorithm):
         env: Annotated[GymEnv | str, check_env],
         learning_rate: Annotated[float | Schedule, check_learning_rate] = 4e-4,
         buffer_size: Size = 1_000_000,
-        learning_starts: Weight = 100,
-        batch_size: Size = 256,
-        tau: Share = 0.005,  # the paper's 0.05 to 0.15 chases its own tail when the task's reward counts
+        learning_starts: Annotated[float | None, Between(0)] = None,
+        batch_size: Size = 128,
+        tau: Annotated[float | None, Between(0, 1)] = None,
         gamma: Share = 0.99,
         train_freq: Annotated[int | tuple[int, str], check_train_freq] = 1,
         gradient_steps: Annotated[int, Between(-1)] = 1,
@@ -163,33 +193,34 @@ class ActPC(OffPolicyAlgorithm):
         replay_buffer_class: type[ReplayBuffer] | str | None = None,
         replay_buffer_kwargs: Settings | None = None,
         optimize_memory_usage: bool = False,
-        n_steps: Size = 1,
+        n_steps: Annotated[int | None, Between(1)] = None,
         *,
-        settling: Literal["iterative", "scheduled"] = "iterative",
+        settling: Literal["iterative", "scheduled"] = "scheduled",
         demonstrations: Demonstrations | str | Path | None = None,
         n_demonstrations: Annotated[int | None, Between(1)] = None,
         n_demonstration_transitions: Annotated[int | None, Between(1)] = None,
         prior_updates: Count = 2000,
-        actor_warm_start: Count = 0,
+        actor_warm_start: Annotated[int | None, Between(0)] = None,
         refresh_weight: Weight = 1.0,
         refresh_noise: Weight = 0.0,
-        demonstration_fraction: Share = 0.0,
-        alpha_ep: Weight = 1.0,
-        alpha_in: Weight = 1.0,
-        alpha_ext: float | None = None,
+        demonstration_fraction: Annotated[float | None, Between(0, 1)] = None,
+        exploration_noise: Weight = 0.1,
+        alpha_ep: Weight = 0.0,
+        alpha_in: Weight = 0.0,
+        alpha_ext: float = 1.0,
         signal_normalizer: Literal["max", "saturating", "quantile"] = "max",
         signal_normalization: Literal["stored", "sampled"] = "stored",
         instrumental_form: Literal["penalty", "unit"] = "penalty",
         signal_errors: Literal["all", "output"] = "all",
         actor_pressure: Weight = 1.0,
-        scale_pressure: bool = False,
+        scale_pressure: bool = True,
         nudge: Annotated[float | None, check_nudge] = None,
-        critic_warmup: Count = 0,
+        critic_warmup: Annotated[int | None, Between(0)] = None,
+        policy_delay: Size = 2,
         bootstrap: Literal["joint", "literal"] = "joint",
-        target_policy_noise: Weight = 0.0,
-        target_noise_clip: Weight = 0.5,
+        target_policy_noise: Weight = 0.2,
         target_update_interval: Annotated[int, Between(1)] = 1,
-        observation_normalization: Literal["none", "demonstrations"] = "none",
+        observation_normalization: Literal["none", "demonstrations"] | None = None,
         compile: Annotated[bool | str, check_compile] = "auto",
         policy_kwargs: Annotated[Settings | None, check_policy_kwargs] = None,
         stats_window_size: Size = 100,
@@ -199,14 +230,21 @@ class ActPC(OffPolicyAlgorithm):
         seed: Annotated[int | None, Between(0, MAX_SEED)] = None,
         _init_setup_model: bool = True,
     ) -> None:
+        shown = demonstrations is not None
+        relabels = "HerReplayBuffer" in str(replay_buffer_class) or optimize_memory_usage
+
+        def default(given: Any, with_demonstrations: Any, without: Any) -> Any:
+            return given if given is not None else with_demonstrations if shown else without
+
+        n_steps = default(n_steps, 1 if relabels else 5, 1)
         super().__init__(
             policy,
             env,
             learning_rate,
             buffer_size,
-            learning_starts,  # type: ignore[arg-type]
+            default(learning_starts, 0, 100),
             batch_size,
-            tau,
+            default(tau, 0.02, 0.005),
             gamma,
             train_freq,
             gradient_steps,
@@ -215,7 +253,7 @@ class ActPC(OffPolicyAlgorithm):
             replay_buffer_kwargs=replay_buffer_kwargs,
             optimize_memory_usage=optimize_memory_usage,
             n_steps=n_steps,
-            policy_kwargs=policy_kwargs,
+            policy_kwargs={"habit": shown, **(policy_kwargs or {})},
             stats_window_size=stats_window_size,
             tensorboard_log=tensorboard_log,
             verbose=verbose,
@@ -230,23 +268,24 @@ class ActPC(OffPolicyAlgorithm):
         self.n_demonstrations = n_demonstrations
         self.n_demonstration_transitions = n_demonstration_transitions
         self.prior_updates = prior_updates
-        self.actor_warm_start = actor_warm_start
+        self.actor_warm_start: int = default(actor_warm_start, 7500, 0)
         self.refresh_weight = refresh_weight
         self.refresh_noise = refresh_noise
-        self.demonstration_fraction = demonstration_fraction
+        self.demonstration_fraction: float = default(demonstration_fraction, 0.5, 0.0)
+        self.exploration_noise = exploration_noise
         self.alpha_ep = alpha_ep
         self.alpha_in = alpha_in
         self.alpha_ext = alpha_ext
         self.signal_errors = signal_errors
-        self.actor_pressure = actor_pressure
+        self.actor_pressure = self.pressure = actor_pressure
         self.scale_pressure = scale_pressure
         self.nudge = nudge
-        self.critic_warmup = critic_warmup
+        self.critic_warmup: int = default(critic_warmup, 3000, 0)
+        self.policy_delay = policy_delay
         self.bootstrap = bootstrap
         self.target_policy_noise = target_policy_noise
-        self.target_noise_clip = target_noise_clip
         self.target_update_interval = target_update_interval
-        self.observation_normalization = observation_normalization
+        self.observation_normalization: str = default(observation_normalization, "demonstrations", "none")
         self.compile = compile
         self.signal_normalizer = signal_normalizer
         self.signal_normalization = signal_normalization
@@ -254,6 +293,8 @@ class ActPC(OffPolicyAlgorithm):
         self.epistemic_normalizer = make_normalizer(signal_normalizer)
         self.instrumental_normalizer = make_normalizer(signal_normalizer)
         self.pretrained, self.n_pretraining_updates = False, 0
+        self.trials: Trials | None = None
+        self.noise_scale: np.ndarray | None = None  # (A,), of the exploration noise
         if _init_setup_model:
             self._setup_model()
 
@@ -271,6 +312,7 @@ class ActPC(OffPolicyAlgorithm):
             self.replay_buffer = self._make_replay_buffer()
         self._convert_train_freq()
         self._create_aliases()
+        self.trials = Trials(self.n_envs) if self.policy.habit else None
         self._setup_demonstrations()
         self.diagnostics = Diagnostics(self.policy)
         self._compiled: CompiledUpdate | None = None
@@ -282,6 +324,9 @@ class ActPC(OffPolicyAlgorithm):
         if not isinstance(chosen, str) or chosen != self.settling:
             raise ValueError(f"circuit_kwargs has settling={chosen!r} but the agent's is {self.settling!r}; pass settling=")
         kwargs = {**self.policy_kwargs, "circuit_kwargs": {**given, "settling": self.settling}}
+        if kwargs.get("habit"):
+            slow = self.lr_schedule(1.0) / ACTOR_SLOWNESS
+            kwargs["actor_kwargs"] = {"learning_rate": slow, **(kwargs.get("actor_kwargs") or {})}
         return self.policy_class(self.observation_space, self.action_space, self.lr_schedule, **kwargs)  # type: ignore[return-value]
 
     def _make_replay_buffer(self) -> SignalReplay:
@@ -376,10 +421,8 @@ class ActPC(OffPolicyAlgorithm):
 
     @property
     def reward_weights(self) -> tuple[float, float, float]:
-        """(α_ext, α_ep, α_in) as used: without demonstrations there is no prior and the task's reward takes its role."""
-        if self.demonstrations is not None:
-            return (0.0 if self.alpha_ext is None else self.alpha_ext), self.alpha_ep, self.alpha_in
-        return (1.0 if self.alpha_ext is None else self.alpha_ext), self.alpha_ep, 0.0
+        """(α_ext, α_ep, α_in) as used: without demonstrations there is no prior."""
+        return self.alpha_ext, self.alpha_ep, 0.0 if self.demonstrations is None else self.alpha_in
 
     # ------------------------------------------------------------------ before learning: prior and warm start
 
@@ -396,6 +439,8 @@ class ActPC(OffPolicyAlgorithm):
             self._rollout_starts = np.ones(self.n_envs, dtype=bool)
             if self.replay_buffer is not None:
                 self.replay_buffer.cut_running_episodes()
+            if self.trials is not None:
+                self.trials.begin_all()
         result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
         self._check_observations(self._last_obs)
         self._follow_demonstrations()
@@ -452,11 +497,19 @@ class ActPC(OffPolicyAlgorithm):
             if update < n_prior:
                 self._update_prior(self.policy.batch_size_of("prior", self.batch_size))
             else:
-                n = self.policy.batch_size_of("actor", self.batch_size)
-                self.actor.circuit.apply_changes(self._refresh_changes(n))
+                self._warm_up_actor((update - n_prior) / self.actor_warm_start)
             self.n_pretraining_updates += 1
-        self.actor_target.load_state_dict(self.actor.circuit.state_dict())
+        if self.actor_warm_start:
+            self.actor.circuit.optimizer.state.clear()  # its moments are those of other learning rates
+        _copy(self.actor.circuit, self.actor_target, self.actor.habit, self.policy.actor_average)
         self.pretrained = True
+
+    def _warm_up_actor(self, progress: float) -> None:
+        """One update on imitated actions; ``progress`` is the share of the warm start that is done."""
+        first, last = WARM_START_RATES
+        for group in self.actor.circuit.optimizer.param_groups:
+            group["lr"] = first * (last / first) ** progress
+        self.actor.circuit.apply_changes(self._refresh_changes(WARM_START_BATCH))
 
     def _update_prior(self, batch_size: int) -> None:
         assert self.expert is not None
@@ -469,17 +522,41 @@ class ActPC(OffPolicyAlgorithm):
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
     ) -> tuple[np.ndarray, np.ndarray]:
-        warming_up = self.num_timesteps < learning_starts
+        assert self._last_obs is not None
+        warming_up, roles = self.num_timesteps < learning_starts, ["actor"] * n_envs
+        if self.trials is not None:
+            roles = list(self.trials.roles)
         if self.memory_history or not warming_up:  # the working memory follows random actions too
-            assert self._last_obs is not None
-            unscaled, self._rollout_state = self.policy.predict(self._last_obs, self._rollout_state, self._rollout_starts)
+            players = {"actor": self.actor.circuit, "candidate": self.policy.candidate, "habit": self.actor.habit}
+            circuits = [players[role] for role in roles]
+            scaled, self._rollout_state = self.actor.roll_out(
+                self._last_obs, self._rollout_state, self._rollout_starts, circuits  # type: ignore[arg-type]
+            )
         if warming_up:
-            unscaled = np.array([self.action_space.sample() for _ in range(n_envs)])
-        scaled = self.policy.scale_action(unscaled)
+            scaled = self.policy.scale_action(np.array([self.action_space.sample() for _ in range(n_envs)]))
         check_finite("actor", "actions", scaled, self.num_timesteps)
-        if action_noise is not None:
-            scaled = np.clip(scaled + action_noise(), -1.0, 1.0)
+        if action_noise is not None or self.exploration_noise:
+            noise = self._exploration(scaled.shape) if action_noise is None else action_noise()
+            noisy = np.array([role == "actor" for role in roles]).reshape(-1, *[1] * (scaled.ndim - 1))
+            scaled = np.clip(scaled + noisy * noise, -1.0, 1.0).astype(np.float32)
         return self.policy.unscale_action(scaled), scaled
+
+    def _exploration(self, shape: tuple[int, ...]) -> np.ndarray:
+        """Gaussian noise, no wider in any dimension than the demonstrations spread around the warm-started actor."""
+        if self.noise_scale is None:
+            self.noise_scale = np.full(shape[1:], self.exploration_noise, dtype=np.float32)
+            if self.expert is not None and self.actor_warm_start:
+                spread = self._imitation_spread().reshape(shape[1:])
+                self.noise_scale = np.clip(spread, SMALLEST_EXPLORATION * self.exploration_noise, self.exploration_noise)
+        return np.random.normal(size=shape).astype(np.float32) * self.noise_scale
+
+    def _imitation_spread(self) -> np.ndarray:
+        """Root of the mean squared difference of demonstrated actions and the actor's, (A,)."""
+        assert self.expert is not None
+        rows = np.random.randint(0, len(self.expert), size=min(len(self.expert), 4096))
+        batch = self.expert.batch(rows, self.inputs, self.reward_weights, self.gamma)
+        errors = batch.actions - self.actor.circuit.project(batch.features, batch.memory)
+        return errors.square().mean(0).sqrt().cpu().numpy()
 
     def _store_transition(
         self,
@@ -500,6 +577,27 @@ class ActPC(OffPolicyAlgorithm):
         scored: Any = SimpleNamespace(add=partial(replay_buffer.add, score=score))  # SB3 calls ``add`` and nothing else
         super()._store_transition(scored, buffer_action, new_obs, reward, dones, infos)
         self._rollout_starts = np.array(dones, dtype=bool)
+        self._prove(reward, dones)
+
+    def _prove(self, rewards: np.ndarray, dones: np.ndarray) -> None:
+        """The habit follows from what whole episodes were paid: see :mod:`sb3_actpc.actpc.habit`."""
+        if self.trials is None:
+            return
+        for env, (reward, done) in enumerate(zip(rewards, dones, strict=True)):
+            self.trials.step(env, float(reward))
+            if not done:
+                continue
+            verdict = self.trials.end(env)
+            if verdict is not None and self._n_updates > self.critic_warmup:
+                bounds = SMALLEST_PRESSURE * self.actor_pressure, LARGEST_PRESSURE * self.actor_pressure
+                self.pressure = float(np.clip(self.pressure * PRESSURE_FACTORS[verdict], *bounds))
+            if verdict == "accepted":
+                _copy(self.policy.candidate, self.actor.habit)
+            if verdict == "relapsed":
+                _copy(self.actor.habit, self.actor.circuit, self.actor_target, self.policy.actor_average)
+            if self.trials.needs_candidate():
+                _copy(self.policy.actor_average, self.policy.candidate)
+            self.trials.begin(env)
 
     def _check_observations(self, observations: Any) -> None:
         map_observations(lambda array: check_finite("environment", "observations", array, self.num_timesteps), observations)
@@ -564,11 +662,13 @@ class ActPC(OffPolicyAlgorithm):
             self.diagnostics.begin_update(self._n_updates, self.num_timesteps)
             self._rescore_demonstrations()
             batch = self._sample_batch(batch_size)  # line 17
-            parts = batch.first(n_actor), batch.first(n_critic), batch.first(n_generator)
+            due = self._n_updates % self.policy_delay == 0
+            parts = batch.first(n_actor) if due else None, batch.first(n_critic), batch.first(n_generator)
             if self._compiled is not None and self._compiled.ready():
                 self._compiled(*parts)
             else:
-                self._update_actor(parts[0])  # lines 19 and 26
+                if parts[0] is not None:
+                    self._update_actor(parts[0])  # lines 19 and 26
                 self._update_critic(parts[1])  # lines 21 and 22
                 self._update_generator(parts[2])  # line 24
             if self.target_update_interval == 1:
@@ -617,10 +717,10 @@ class ActPC(OffPolicyAlgorithm):
         changes = self._refresh_changes(len(batch.features)) if self.refresh_weight and self._imitated() else None
         if changes is not None:
             self.diagnostics.change_norms("refresh", changes.scale_(self.refresh_weight))
-        if self.actor_pressure and self._n_updates > self.critic_warmup:
+        if self.pressure and self._n_updates > self.critic_warmup:
             coupled = settle_coupled(self.actor.circuit, self.critic.first(), batch.features, batch.memory, self.nudge)
             pressure = self.actor.circuit.hebbian_update(coupled.actor)
-            weight = self._pressure_weight(self.actor_pressure, coupled.action_values)
+            weight = self._pressure_weight(self.pressure, coupled.action_values)
             self.diagnostics.coupled(coupled, pressure, batch.features, batch.memory)
             if changes is None:
                 self.diagnostics.settled("actor", coupled.actor)
@@ -634,7 +734,9 @@ class ActPC(OffPolicyAlgorithm):
         return pressure / action_values.abs().mean().clamp_min(SMALLEST_VALUE_SCALE) if self.scale_pressure else pressure
 
     def _update_critic(self, batch: Batch) -> None:
-        """Policy circuit(s): settle on the bootstrapped targets (lines 21 and 22)."""
+        """Policy circuit(s): settle on the bootstrapped targets (lines 21 and 22). Without pressure nobody asks them."""
+        if not self.actor_pressure:
+            return
         inputs, targets = th.cat([batch.features, batch.actions], dim=1), self._critic_targets(batch)
         for index, critic in enumerate(self.critic):
             state = critic.settle(inputs, targets)
@@ -645,8 +747,8 @@ class ActPC(OffPolicyAlgorithm):
         """What is added to the target actor's actions, (B, A)."""
         if not self.target_policy_noise or self.bootstrap == "literal":
             return None
-        noise = th.randn_like(batch.actions) * self.target_policy_noise
-        return noise.clamp(-self.target_noise_clip, self.target_noise_clip)
+        bound = TARGET_NOISE_CLIP * self.target_policy_noise
+        return (th.randn_like(batch.actions) * self.target_policy_noise).clamp(-bound, bound)
 
     def _critic_targets(self, batch: Batch, noise: th.Tensor | None = None) -> th.Tensor:
         """t = r + γ c, or r alone when terminal; one and the same reward for every action output, (B, A)."""
@@ -673,9 +775,9 @@ class ActPC(OffPolicyAlgorithm):
     def _update_targets(self, tau: float) -> None:
         """Move the target circuits by ``tau`` (1 copies)."""
         for target, circuit in zip([self.actor_target, *self.critic_target], [self.actor.circuit, *self.critic], strict=True):
-            for mine, theirs in zip(target.synapses, circuit.synapses, strict=True):
-                if mine:
-                    th._foreach_lerp_(mine, theirs, tau)
+            _follow(target, circuit, tau)
+        if self.policy.actor_average is not None:
+            _follow(self.policy.actor_average, self.actor.circuit, AVERAGING_RATE)
 
     def _on_step(self) -> None:
         """Moves the targets where that goes by environment steps."""
@@ -718,6 +820,10 @@ class ActPC(OffPolicyAlgorithm):
         if memory is not None:
             self.logger.record("train/self_imitation_size", len(memory))
             self.logger.record("train/self_imitation_best_return", memory.best_return)
+        if self.trials is not None:
+            self.logger.record("train/pressure", self.pressure)
+            self.logger.record("train/habit_return", self.trials.habit_return)
+            self.logger.record("train/habit_generation", self.trials.generation)
 
     def learn(
         self: SelfActPC,
@@ -741,6 +847,9 @@ class ActPC(OffPolicyAlgorithm):
             "normalizers": [dict(vars(self.epistemic_normalizer)), dict(vars(self.instrumental_normalizer))],
             "expert_signals": None if expert is None else [expert.epistemic, expert.instrumental, expert.has_signals],
             "diagnostics": dict(self.diagnostics.values),
+            "trials": None if self.trials is None else self.trials.checkpoint_state(),
+            "pressure": self.pressure,
+            "noise_scale": self.noise_scale,
         }
 
     def restore_checkpoint_state(self, state: dict[str, Any]) -> None:
@@ -763,6 +872,8 @@ class ActPC(OffPolicyAlgorithm):
         for normalizer, values in zip(normalizers, state["normalizers"], strict=True):
             vars(normalizer).update(values)
         self.diagnostics.values = dict(state["diagnostics"])
+        self.trials = None if state["trials"] is None else Trials(**state["trials"])
+        self.pressure, self.noise_scale = state["pressure"], state["noise_scale"]
 
     @classmethod
     def load_checkpoint(cls: type[SelfActPC], path: str | PathLike[str], env: GymEnv | str, **keywords: Any) -> Restored:
@@ -807,3 +918,17 @@ class ActPC(OffPolicyAlgorithm):
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         names = [name if name != "actor" else "actor.circuit" for name, _ in self.policy.named_circuits()]
         return ["policy", *(f"policy.{name}.optimizer" for name in names)], []
+
+
+def _follow(target: NGCCircuit, circuit: NGCCircuit, tau: float) -> None:
+    """Move all synapses of ``target`` by the share ``tau`` of the way towards those of ``circuit``."""
+    for mine, theirs in zip(target.synapses, circuit.synapses, strict=True):
+        if mine:
+            th._foreach_lerp_(mine, theirs, tau)
+
+
+def _copy(source: NGCCircuit | None, *targets: NGCCircuit | None) -> None:
+    """The state of one circuit into others; without a habit there are none."""
+    for target in targets:
+        if source is not None and target is not None:
+            target.load_state_dict(source.state_dict())

@@ -20,10 +20,10 @@ ENOUGH_UPDATES = (
 class _Given(NamedTuple):
     """What an update starts from beside the synapses: tensors alone, so that other values need no other graph."""
 
-    actor: Batch
+    actor: Batch | None  # None where the actor waits
     critic: Batch
     generator: Batch
-    imitated: tuple[th.Tensor, th.Tensor, th.Tensor | None]  # features, actions, memory
+    imitated: tuple[th.Tensor, th.Tensor, th.Tensor | None] | None  # features, actions, memory
     target_noise: th.Tensor | None  # (B, A)
     pressure: th.Tensor  # 0-d
     refresh: th.Tensor  # 0-d
@@ -50,22 +50,25 @@ class CompiledUpdate:
         return begun and bool(agent.refresh_weight and agent._imitated()) and not agent.diagnostics.active
 
     @th.no_grad()
-    def __call__(self, actor: Batch, critic: Batch, generator: Batch) -> None:
+    def __call__(self, actor: Batch | None, critic: Batch, generator: Batch) -> None:
         """
-        :param actor: the rows of the sampled batch that the actor learns from; the others likewise
+        :param actor: the rows of the sampled batch that the actor learns from, None where it waits; the others likewise
         """
         agent = self.agent
-        imitated = agent._sample_imitated(len(actor.features))  # drawn in the order of the eager update
-        weights = [th.tensor(float(weight), device=agent.device) for weight in (agent.actor_pressure, agent.refresh_weight)]
+        # drawn in the order of the eager update
+        imitated = None if actor is None else agent._sample_imitated(len(actor.features))
+        weights = [th.tensor(float(weight), device=agent.device) for weight in (agent.pressure, agent.refresh_weight)]
         given = _Given(actor, critic, generator, imitated, agent._target_noise(critic), *weights)
-        circuits = [agent.actor.circuit, *agent.critic, *([agent.generator] if agent.alpha_ep else [])]
+        circuits = [*agent.critic, *([agent.generator] if agent.alpha_ep else [])]
+        if actor is not None:
+            circuits.insert(0, agent.actor.circuit)
         for circuit, changes in zip(circuits, self._changes(given), strict=True):
             circuit.apply_changes(HebbianChanges(*changes))
 
     def _all_changes(self, given: _Given) -> list[tuple[list[th.Tensor], list[th.Tensor], list[th.Tensor]]]:
         agent, batch = self.agent, given.critic
         inputs, targets = th.cat([batch.features, batch.actions], dim=1), agent._critic_targets(batch, given.target_noise)
-        changes = [self._actor_changes(given)]
+        changes = [] if given.actor is None else [self._actor_changes(given.actor, given)]
         changes += [critic.hebbian_update(critic.settle(inputs, targets)) for critic in agent.critic]
         if agent.alpha_ep:
             seen = given.generator
@@ -73,10 +76,11 @@ class CompiledUpdate:
             changes.append(agent.generator.hebbian_update(state))
         return [(change.weights, change.biases, change.memory) for change in changes]
 
-    def _actor_changes(self, given: _Given) -> HebbianChanges:
+    def _actor_changes(self, batch: Batch, given: _Given) -> HebbianChanges:
         agent, actor = self.agent, self.agent.actor.circuit
+        assert given.imitated is not None
         refresh = actor.hebbian_update(actor.settle(*given.imitated))
-        coupled = settle_coupled(actor, agent.critic.first(), given.actor.features, given.actor.memory)
+        coupled = settle_coupled(actor, agent.critic.first(), batch.features, batch.memory)
         pressure = actor.hebbian_update(coupled.actor)
         weight = agent._pressure_weight(given.pressure, coupled.action_values)
         changes = [

@@ -84,6 +84,7 @@ class ActPCActor(BasePolicy):
     :param circuit_kwargs: keywords of :class:`~sb3_actpc.ngc.NGCCircuit`
     :param net_arch: hidden sizes
     :param memory_history: H observations in the working memory; 0 for none
+    :param with_habit: keep a second circuit, the habit, which then is the one that acts
     :param normalize_images: divide image observations by 255
     """
 
@@ -97,6 +98,7 @@ class ActPCActor(BasePolicy):
         net_arch: list[int],
         circuit_kwargs: dict[str, Any],
         memory_history: int = 0,
+        with_habit: bool = False,
         normalize_images: bool = True,
     ) -> None:
         super().__init__(
@@ -118,6 +120,7 @@ class ActPCActor(BasePolicy):
             n_memory=self.memory.size if self.memory else 0,
             **circuit_kwargs,
         )
+        self.habit = copy.deepcopy(self.circuit) if with_habit else None
         self._warned_of_empty_memory = False
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
@@ -127,8 +130,14 @@ class ActPCActor(BasePolicy):
             net_arch=self.net_arch,
             circuit_kwargs=self.circuit_kwargs,
             memory_history=self.memory_history,
+            with_habit=self.habit is not None,
         )
         return data
+
+    @property
+    def acting(self) -> NGCCircuit:
+        """The circuit that acts: the habit where there is one."""
+        return self.circuit if self.habit is None else self.habit
 
     def train(self, mode: bool = True) -> "ActPCActor":
         """Only the extractor can tell training from acting: circuits have no such mode (SB3 asks at every step)."""
@@ -148,10 +157,50 @@ class ActPCActor(BasePolicy):
         :return: actions in [-1, 1], (B, A)"""
         features = self.features(observations)
         if self.memory is None:
-            return self.circuit.project(features)
+            return self.acting.project(features)
         if history is None:
             history = features.new_zeros(len(features), self.memory_history, features.shape[1])
-        return self.circuit.project(features, self.memory(history))
+        return self.acting.project(features, self.memory(history))
+
+    def roll_out(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None,
+        episode_start: np.ndarray | None,
+        circuits: list[NGCCircuit],
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """
+        As :meth:`predict`, with a circuit for every environment.
+
+        :param observation: (n_envs, *obs_shape), or a dict of such
+        :param state: as for ``predict``
+        :param episode_start: as for ``predict``
+        :param circuits: n_envs of them
+        :return: actions in [-1, 1], (n_envs, *action_shape), and the new state
+        """
+        self.set_training_mode(False)
+        with th.no_grad():
+            features = self.features(self.obs_to_tensor(observation)[0])
+            memory = None
+            if self.memory is not None:
+                memory, state = self._remember(features, state, episode_start)
+            actions = th.empty(len(features), circuits[0].sizes[-1], device=features.device)
+            for circuit in dict.fromkeys(circuits):
+                rows = [row for row, own in enumerate(circuits) if own is circuit]
+                actions[rows] = circuit.project(features[rows], None if memory is None else memory[rows])
+        return actions.cpu().numpy().reshape(-1, *self.action_space.shape), state
+
+    def _remember(
+        self, features: th.Tensor, state: tuple[np.ndarray, ...] | None, episode_start: np.ndarray | None
+    ) -> tuple[th.Tensor, tuple[np.ndarray, ...]]:
+        """m_t of the observations before these, (n_envs, n_memory), and the state with these among them."""
+        assert self.memory is not None
+        shape = (len(features), self.memory_history, features.shape[1])
+        history = np.zeros(shape, dtype=np.float32) if state is None else state[0].copy()
+        if episode_start is not None:
+            history[np.asarray(episode_start, dtype=bool)] = 0.0
+        memory = self.memory(th.as_tensor(history, device=self.device))
+        return memory, (np.concatenate([history[:, 1:], features.cpu().numpy()[:, None]], axis=1),)
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         return self(observation)
@@ -181,13 +230,8 @@ class ActPCActor(BasePolicy):
         observations, vectorized = self.obs_to_tensor(observation)
         with th.no_grad():
             features = self.features(observations)
-            shape = (len(features), self.memory_history, features.shape[1])
-            history = np.zeros(shape, dtype=np.float32) if state is None else state[0].copy()
-            if episode_start is not None:
-                history[np.asarray(episode_start, dtype=bool)] = 0.0
-            past = th.as_tensor(history, device=self.device)
-            actions = self.circuit.project(features, self.memory(past)).cpu().numpy()
-        state = (np.concatenate([history[:, 1:], features.cpu().numpy()[:, None]], axis=1),)
+            memory, state = self._remember(features, state, episode_start)
+            actions = self.acting.project(features, memory).cpu().numpy()
         actions = self.unscale_action(actions.reshape(-1, *self.action_space.shape))
         return (actions if vectorized else actions[0]), state
 
@@ -209,6 +253,7 @@ class ActPCPolicy(BasePolicy):
     :param generator_kwargs: the same for the generator
     :param prior_kwargs: the same for the prior
     :param memory_history: H observations in the working memory of actor, generator and prior; 0 for none
+    :param habit: keep the best proven actor beside the one that learns (:mod:`sb3_actpc.actpc.habit`)
     :param features_extractor_class: fixed features extractor (it is never trained)
     :param features_extractor_kwargs: its keywords
     :param normalize_images: divide image observations by 255
@@ -227,13 +272,14 @@ class ActPCPolicy(BasePolicy):
         action_space: spaces.Box,
         lr_schedule: Schedule,
         net_arch: Annotated[list[int] | dict[str, list[int]] | None, check_net_arch] = None,
-        n_critics: Annotated[int, Between(1, MAX_CRITICS)] = 1,
+        n_critics: Annotated[int, Between(1, MAX_CRITICS)] = 2,
         circuit_kwargs: Settings | None = None,
         actor_kwargs: Annotated[Settings | None, check_circuit] = None,
         critic_kwargs: Annotated[Settings | None, check_circuit] = None,
         generator_kwargs: Annotated[Settings | None, check_circuit] = None,
         prior_kwargs: Annotated[Settings | None, check_circuit] = None,
         memory_history: Annotated[int, Between(0, LARGEST_SIZE)] = 0,
+        habit: bool = False,
         features_extractor_class: Annotated[type[BaseFeaturesExtractor], check_extractor] = FlattenExtractor,
         features_extractor_kwargs: Settings | None = None,
         normalize_images: bool = True,
@@ -260,7 +306,7 @@ class ActPCPolicy(BasePolicy):
         self.net_arch, self.n_critics, self.memory_history = net_arch, n_critics, memory_history
         self.circuit_kwargs = dict(circuit_kwargs or {})
         self.kwargs_of = dict(zip(CIRCUITS, (actor_kwargs, critic_kwargs, generator_kwargs, prior_kwargs), strict=True))
-        self.lr_schedule = lr_schedule
+        self.habit, self.lr_schedule = habit, lr_schedule
         self._build()
 
     def _build(self) -> None:
@@ -269,7 +315,14 @@ class ActPCPolicy(BasePolicy):
         extractor.requires_grad_(False)
         arch, kwargs = self._net_arch_of("actor"), self._circuit_kwargs_of("actor")
         self.actor = ActPCActor(
-            self.observation_space, self.action_space, extractor, arch, kwargs, self.memory_history, self.normalize_images
+            self.observation_space,
+            self.action_space,
+            extractor,
+            arch,
+            kwargs,
+            self.memory_history,
+            self.habit,
+            self.normalize_images,
         )
         n_features, n_actions = extractor.features_dim, int(np.prod(self.action_space.shape))
         n_memory = self.actor.memory.size if self.actor.memory else 0
@@ -281,6 +334,9 @@ class ActPCPolicy(BasePolicy):
         self.prior = self._circuit("prior", n_features, n_features, n_memory=n_memory)
         self.actor_target = copy.deepcopy(self.actor.circuit)
         self.critic_target = copy.deepcopy(self.critic)
+        # the slow average of the learning actor, and a frozen copy of it that has to prove itself
+        self.actor_average = copy.deepcopy(self.actor.circuit) if self.habit else None
+        self.candidate = copy.deepcopy(self.actor.circuit) if self.habit else None
         for name, circuit in self.named_circuits():
             circuit.optimizer = self._optimizer(name.partition(".")[0], circuit)
 
@@ -302,7 +358,9 @@ class ActPCPolicy(BasePolicy):
         return default if self.net_arch is None else list(self.net_arch)
 
     def _circuit_kwargs_of(self, name: str) -> dict[str, Any]:
-        default = {"activation": "relu"} if name == "prior" else {}
+        default: dict[str, Any] = {"feedback": "learned", "feedback_start": "mirrored", "weight_decay": 0.1}
+        if name == "prior":
+            default["activation"] = "relu"
         own = {k: v for k, v in self._settings_of(name).items() if k not in ("net_arch", "learning_rate", "batch_size")}
         kwargs = {**default, **self.circuit_kwargs, **own}
         unknown = sorted(set(kwargs) - CIRCUIT_KEYWORDS)
@@ -338,6 +396,7 @@ class ActPCPolicy(BasePolicy):
             n_critics=self.n_critics,
             circuit_kwargs=self.circuit_kwargs,
             memory_history=self.memory_history,
+            habit=self.habit,
             optimizer_class=self.optimizer_class,
             optimizer_kwargs=self.optimizer_kwargs,
             features_extractor_class=self.features_extractor_class,

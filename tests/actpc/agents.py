@@ -1,5 +1,7 @@
 """Small agents."""
 
+from typing import Any
+
 import torch as th
 from stable_baselines3.common.vec_env import DummyVecEnv
 
@@ -14,11 +16,46 @@ SMALL = {
     "seed": 0,
     "device": "cpu",
 }
+# one critic and tied error synapses, which do not decay; no habit
+PLAIN_POLICY = {
+    "net_arch": [16, 16],
+    "n_critics": 1,
+    "habit": False,
+    "circuit_kwargs": {"feedback": "tied", "weight_decay": 0.0},
+}
+# Algorithm 1 and nothing else: what a test of one mechanism starts from, so that no other one can be the reason
+PLAIN: dict[str, Any] = {
+    **SMALL,
+    "policy_kwargs": PLAIN_POLICY,
+    "tau": 0.005,
+    "n_steps": 1,
+    "prior_updates": 5,
+    "actor_warm_start": 0,
+    "critic_warmup": 0,
+    "policy_delay": 1,
+    "demonstration_fraction": 0.0,
+    "observation_normalization": "none",
+    "exploration_noise": 0.0,
+    "target_policy_noise": 0.0,
+    "scale_pressure": False,
+    "alpha_ep": 1.0,
+    "alpha_in": 1.0,
+    "alpha_ext": 1.0,
+}
+# the constructor's defaults, but for sizes: a warm start and a warm-up of no time
+QUICK: dict[str, Any] = {**SMALL, "learning_starts": None, "actor_warm_start": 5, "critic_warmup": 5}
+
+
+def plain(**keywords: Any) -> dict[str, Any]:
+    """``PLAIN`` with other values; those of ``policy_kwargs`` and of its ``circuit_kwargs`` one by one."""
+    policy = {**PLAIN_POLICY, **keywords.pop("policy_kwargs", {})}
+    policy["circuit_kwargs"] = {**PLAIN_POLICY["circuit_kwargs"], **policy["circuit_kwargs"]}  # type: ignore[dict-item]
+    return {**PLAIN, **keywords, "policy_kwargs": policy}
 
 
 def make(env=None, n_envs=1, **keywords) -> ActPC:
     env = env or DummyVecEnv([CountingEnv for _ in range(n_envs)])
-    return ActPC("MlpPolicy", env, **{**SMALL, "prior_updates": 5, **keywords})
+    return ActPC("MlpPolicy", env, **plain(**keywords))
 
 
 def weights_of(circuit) -> list[th.Tensor]:

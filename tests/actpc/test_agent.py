@@ -19,7 +19,7 @@ from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_actpc import ActPC
 from sb3_actpc.ngc import NGCCircuit, settle_coupled
-from tests.actpc.agents import SMALL, differ, make, weights_of
+from tests.actpc.agents import differ, make, plain, weights_of
 from tests.actpc.envs import CountingEnv, demonstrations
 
 NO_MEMORY = {"self_imitation_size": 0}
@@ -155,9 +155,10 @@ def test_an_actor_with_a_memory_weight_of_zero_acts_on_the_present_alone():
     assert not th.allclose(predicted[0], predicted[2])
 
 
-def test_without_demonstrations_the_task_reward_takes_the_role_of_the_prior():
-    assert make().reward_weights == (1.0, 1.0, 0.0)
-    assert make(demonstrations=demonstrations()).reward_weights == (0.0, 1.0, 1.0)
+def test_without_demonstrations_there_is_no_prior_that_could_reward():
+    weights = {"alpha_ext": 0.75, "alpha_ep": 0.5, "alpha_in": 0.25}
+    assert make(**weights).reward_weights == (0.75, 0.5, 0.0)
+    assert make(**weights, demonstrations=demonstrations()).reward_weights == (0.75, 0.5, 0.25)
 
 
 # ---------------------------------------------------------------------- actor, critic, targets
@@ -238,8 +239,8 @@ def test_scaled_pressure_is_divided_by_the_mean_absolute_action_value_or_by_one_
         model._update_actor(batch)
         steps.append([new - old for new, old in zip(weights_of(model.actor.circuit), before, strict=True)])
     assert (value > 2.0) == (shift > 0.0)
-    for plain, scaled in zip(*steps, strict=True):
-        assert th.allclose(plain, scaled * value.clamp_min(1.0), rtol=1e-2, atol=1e-7)
+    for unscaled, scaled in zip(*steps, strict=True):
+        assert th.allclose(unscaled, scaled * value.clamp_min(1.0), rtol=1e-2, atol=1e-7)
 
 
 def test_targets_of_actor_and_critic_move_by_tau():
@@ -285,15 +286,14 @@ def test_the_literal_bootstrap_values_the_action_taken():
     assert th.allclose(model._critic_targets(batch), batch.rewards + (1 - batch.dones) * model.gamma * values)
 
 
-def test_target_smoothing_is_bounded_noise():
-    model = make(target_policy_noise=0.2, target_noise_clip=0.0)
-    model.learn(40)
+def test_target_smoothing_is_bounded_noise(monkeypatch):
+    """Of 0.04, bounded by 2.5 standard deviations: with huge noise every action is moved by 0.1, up or down."""
+    model = make().learn(40)
     batch = model._sample_batch(16)
     quiet = model._critic_targets(batch)
-    model.target_noise_clip = 0.5
-    noisy = model._critic_targets(batch)
-    assert not th.allclose(quiet, noisy)
-    model.target_policy_noise, model.target_noise_clip = 1e6, 0.1  # every action is moved by 0.1, up or down
+    model.target_policy_noise = 0.04
+    assert not th.allclose(quiet, model._critic_targets(batch))
+    monkeypatch.setattr(th, "randn_like", lambda like: 1e6 * th.empty_like(like).normal_())
     next_actions = model.actor_target.project(batch.next_features)
     corners = [
         (next_actions + th.tensor(shift)).clamp(-1, 1) for shift in ([0.1, 0.1], [0.1, -0.1], [-0.1, 0.1], [-0.1, -0.1])
@@ -388,13 +388,8 @@ def test_noise_on_refreshed_observations_is_ridge_regression():
     data = dataclasses.replace(data, actions=0.2 * data.observations[:, :2])
     slopes = []
     for noise in (0.0, 1.0):
-        circuit = {"net_arch": [], "learning_rate": 2e-3}
         model = make(
-            demonstrations=data,
-            policy_kwargs={"actor_kwargs": circuit},
-            actor_warm_start=600,
-            refresh_noise=noise,
-            batch_size=256,
+            demonstrations=data, policy_kwargs={"actor_kwargs": {"net_arch": []}}, actor_warm_start=2500, refresh_noise=noise
         )
         model.pretrain()
         slopes.append(model.actor.circuit.weights[0][:, :2].diagonal().mean().item())
@@ -472,7 +467,7 @@ def test_a_trained_agent_acts_without_its_demonstrations_and_says_what_is_missin
     (tmp_path / "demos.npz").unlink()
     loaded = ActPC.load(tmp_path / "agent", env=DummyVecEnv([CountingEnv]))
     obs = np.ones((1, 3), np.float32)
-    assert np.array_equal(loaded.predict(obs)[0], model.predict(obs)[0]) and loaded.reward_weights == (0.0, 1.0, 1.0)
+    assert np.array_equal(loaded.predict(obs)[0], model.predict(obs)[0]) and loaded.reward_weights == (1.0, 1.0, 1.0)
     with pytest.raises(ValueError, match=r"no demonstrations file at .*demos\.npz"):
         loaded.learn(10)
 
@@ -502,20 +497,18 @@ def test_rebuilt_memory_equals_the_one_at_collection_across_episode_ends_and_rin
     lengths = [(5 + i, 9, 3, 12) for i in range(n_envs)]
     env = DummyVecEnv([lambda n=n: CountingEnv(lengths=n, dict_observations=dict_observations) for n in lengths])
     policy = "MultiInputPolicy" if dict_observations else "MlpPolicy"
-    keywords = {**SMALL, "learning_starts": 1000, "buffer_size": 30 * n_envs}
-    keywords["policy_kwargs"] = remembering(4)
-    model = ActPC(policy, env, **keywords)
+    model = ActPC(policy, env, **plain(learning_starts=1000, buffer_size=30 * n_envs, policy_kwargs=remembering(4)))
     seen = []
-    predict = type(model.actor).predict
+    roll_out = type(model.actor).roll_out
 
-    def recording(self, observation, state=None, episode_start=None, deterministic=False):
+    def recording(self, observation, state, episode_start, circuits):
         shape = (n_envs, 4, self.features_extractor.features_dim)
         past = np.zeros(shape, np.float32) if state is None else state[0].copy()
         past[np.asarray(episode_start, dtype=bool)] = 0.0
         seen.append(past)
-        return predict(self, observation, state, episode_start, deterministic)
+        return roll_out(self, observation, state, episode_start, circuits)
 
-    monkeypatch.setattr(type(model.actor), "predict", recording)
+    monkeypatch.setattr(type(model.actor), "roll_out", recording)
     steps = 77  # wraps a ring of 30 rows twice
     model.learn(steps * n_envs)
     buffer = model.replay_buffer
@@ -593,10 +586,12 @@ def test_learning_never_backpropagates(settling, monkeypatch):
         policy_kwargs={
             **remembering(7),
             "n_critics": 2,
+            "habit": True,
             "circuit_kwargs": {
                 "synaptic_scaling": "column_norm",
                 "weight_bound": 2.0,
-                "feedback": "learned" if settling == "iterative" else "tied",
+                "feedback": "learned",
+                "weight_decay": 0.1,
             },
         },
     )
@@ -805,8 +800,7 @@ def test_learning_rates_of_circuits_and_error_synapses_follow_the_schedule():
 @pytest.mark.parametrize("n_envs", [1, 2])
 def test_hindsight_relabels_goals_and_rewards_of_drawn_transitions_but_neither_signals_nor_the_newest(n_envs):
     env = DummyVecEnv([lambda: BitFlippingEnv(n_bits=6, continuous=True) for _ in range(n_envs)])
-    model = ActPC("MultiInputPolicy", env, **SMALL, replay_buffer_class=HerReplayBuffer, alpha_ep=0.5)
-    model.learning_starts = 40
+    model = ActPC("MultiInputPolicy", env, **plain(replay_buffer_class=HerReplayBuffer, learning_starts=40))
     model.learn(120)
     buffer = model.replay_buffer
     np.random.seed(0)

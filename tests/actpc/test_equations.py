@@ -3,22 +3,19 @@
 import numpy as np
 import pytest
 import torch as th
-from stable_baselines3.common.env_util import make_vec_env
 
-from sb3_actpc import ActPC
 from sb3_actpc.actpc.reward_signals import RunningQuantile
-from tests.actpc.envs import CountingEnv, demonstrations
+from tests.actpc.agents import make
+from tests.actpc.envs import demonstrations
 
-SMALL = {"settling": "scheduled", "batch_size": 16, "buffer_size": 500, "prior_updates": 5, "seed": 3, "device": "cpu"}
-SGD = {"net_arch": [16, 16], "optimizer_class": th.optim.SGD}  # its steps are the changes themselves
+SGD = {"optimizer_class": th.optim.SGD}  # its steps are the changes themselves
 
 
 def test_the_actors_step_is_proportional_to_the_weight_of_the_critics_pressure():
     untouched = {"refresh_weight": 0.0, "learning_starts": 60, "learning_rate": 1.0, "policy_kwargs": SGD}
     steps = []
     for weight in (0.5, 1.0):
-        env = make_vec_env(CountingEnv)
-        model = ActPC("MlpPolicy", env, actor_pressure=weight, **untouched, **SMALL)
+        model = make(actor_pressure=weight, **untouched)
         model.learn(50)  # nothing is learned yet: both agents are the same
         before = [parameter.clone() for parameter in model.actor.circuit.parameters()]
         model._n_updates = 1
@@ -40,17 +37,13 @@ def test_the_running_quantile_is_passed_by_as_many_values_as_it_says(quantile):
 
 def test_demonstrated_steps_are_rewarded_by_surprise_and_punished_for_leaving_the_prior():
     """What the generator does not foresee draws the agent on, what the prior does not know keeps it back."""
-    env = make_vec_env(CountingEnv)
-    keywords = {"demonstration_fraction": 0.5, "learning_starts": 20, "policy_kwargs": {"net_arch": [16, 16]}, **SMALL}
-    model = ActPC("MlpPolicy", env, demonstrations=demonstrations(), **keywords)
-    model.learn(40)
+    model = make(demonstrations=demonstrations(), demonstration_fraction=0.5).learn(40)
     assert model.expert.epistemic.min() > 0.0 > model.expert.instrumental.max()
 
 
 def test_a_second_learn_leaves_the_prior_alone():
     """The paper trains it once, before the task, and freezes it."""
-    keywords = {"learning_starts": 20, "policy_kwargs": {"net_arch": [16, 16]}, **SMALL}
-    model = ActPC("MlpPolicy", make_vec_env(CountingEnv), demonstrations=demonstrations(), **keywords)
+    model = make(learning_starts=20, demonstrations=demonstrations())
     model.learn(10)
     before = [weights.clone() for weights in model.prior.weights]
     model.learn(10)
@@ -59,8 +52,7 @@ def test_a_second_learn_leaves_the_prior_alone():
 
 def test_the_bootstrapped_action_is_that_of_the_next_observation_with_the_memory_it_will_have():
     """μ'(o_t+1, m_t+1), where m_t+1 holds o_t: with m_t the target actor would act on what it had forgotten."""
-    keywords = {"learning_starts": 20, "policy_kwargs": {"net_arch": [16, 16], "memory_history": 3}, **SMALL}
-    model = ActPC("MlpPolicy", make_vec_env(CountingEnv), **keywords)
+    model = make(learning_starts=20, policy_kwargs={"memory_history": 3})
     model.learn(60)
     batch = model._sample_batch(32)
     next_actions = model.actor_target.project(batch.bootstrap_features, batch.next_memory)
@@ -72,8 +64,7 @@ def test_the_bootstrapped_action_is_that_of_the_next_observation_with_the_memory
 
 
 def test_the_target_actor_begins_where_the_warm_start_ends():
-    keywords = {"learning_starts": 20, "actor_warm_start": 3, "policy_kwargs": {"net_arch": [16, 16]}, **SMALL}
-    model = ActPC("MlpPolicy", make_vec_env(CountingEnv), demonstrations=demonstrations(), **keywords)
+    model = make(learning_starts=20, actor_warm_start=3, demonstrations=demonstrations())
     before = model.actor.circuit.weights[0].clone()
     model.learn(1)
     assert not th.equal(before, model.actor.circuit.weights[0])
@@ -81,8 +72,7 @@ def test_the_target_actor_begins_where_the_warm_start_ends():
 
 
 def test_the_next_steps_memory_is_the_one_that_the_next_transition_has():
-    keywords = {"learning_starts": 100, "policy_kwargs": {"net_arch": [16, 16], "memory_history": 3}, **SMALL}
-    model = ActPC("MlpPolicy", make_vec_env(CountingEnv), **keywords)
+    model = make(learning_starts=100, policy_kwargs={"memory_history": 3})
     model.learn(40)
     buffer = model.replay_buffer
     rows = np.flatnonzero(buffer.dones[:39, 0] == 0)  # whose episode goes on

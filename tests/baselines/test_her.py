@@ -240,8 +240,7 @@ def test_actpc_runs_on_the_same_goal_task_and_demonstrations() -> None:
         demonstrations=record("SparseReacher-v5"),
         learning_starts=50,
         batch_size=16,
-        settling="scheduled",
-        prior_updates=2,
+        actor_warm_start=2,
         policy_kwargs={"net_arch": [8]},
         seed=0,
     )

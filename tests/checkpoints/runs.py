@@ -28,13 +28,16 @@ WALL_TIME = {"time/fps", "time/time_elapsed", "seconds", "evaluation_seconds"}
 START_METHOD = "fork" if "fork" in multiprocessing.get_all_start_methods() else "spawn"
 MakeModel = Callable[[], OffPolicyAlgorithm]
 SMALL: dict[str, Any] = {"policy_kwargs": {"net_arch": [16, 16]}, "learning_starts": 10, "batch_size": 16, "seed": 3}
-ACTPC: dict[str, Any] = {**SMALL, "settling": "scheduled", "prior_updates": 5, "buffer_size": 200, "device": "cpu"}
+# every circuit has a role; what is not said is the recipe of the constructor's defaults
+ACTPC: dict[str, Any] = {**SMALL, "alpha_ep": 0.5, "alpha_in": 0.5, "prior_updates": 5, "buffer_size": 200, "device": "cpu"}
+SHORT_WARM_UP: dict[str, Any] = {"actor_warm_start": 3, "critic_warmup": 5}  # with demonstrations
 
 
 def make_actpc(env: Any, n_envs: int = 1, normalize: bool = False, **keywords: Any) -> ActPC:
     vec_env: Any = make_vec_env(env, n_envs=n_envs)
     if normalize:
         vec_env = VecNormalize(vec_env, gamma=0.9)
+    keywords = {**(SHORT_WARM_UP if "demonstrations" in keywords else {}), **keywords}
     return ActPC(keywords.pop("policy", "MlpPolicy"), vec_env, **deepcopy({**ACTPC, **keywords}))
 
 

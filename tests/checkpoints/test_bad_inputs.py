@@ -27,7 +27,7 @@ from sb3_actpc.actpc.policies import CIRCUIT_KEYWORDS, ActPCPolicy
 from sb3_actpc.cli import main
 from sb3_actpc.demonstrations.dataset import Demonstrations
 from tests.actpc.envs import CountingEnv, demonstrations
-from tests.checkpoints.runs import ACTPC
+from tests.checkpoints.runs import ACTPC, SHORT_WARM_UP
 
 HUGE = 10**30
 # these mean "go on for so long" or "from so late on": nothing is wrong with a large one
@@ -125,7 +125,8 @@ def test_the_constructor_names_what_is_wrong(keyword: tuple[str, Any]) -> None:
     name, value = keyword
     if is_long(name, value):
         return
-    keywords = {"policy": "MlpPolicy", "env": make_vec_env(CountingEnv), **ACTPC, "demonstrations": demonstrations()}
+    keywords = {"policy": "MlpPolicy", "env": make_vec_env(CountingEnv), **ACTPC, **SHORT_WARM_UP}
+    keywords["demonstrations"] = demonstrations()
     inner = keys_of(value)
     try:
         ActPC(**{**keywords, name: value}).learn(14)

@@ -13,13 +13,13 @@ from sb3_actpc import ActPC
 from sb3_actpc.envs import ROBOSUITE_IDS
 from sb3_actpc.experiments.runs import Run, train_run
 from sb3_actpc.experiments.runs.environments import make_train_env
-from tests.checkpoints.runs import assert_same, learn_in_two, learn_straight
+from tests.checkpoints.runs import SHORT_WARM_UP, assert_same, learn_in_two, learn_straight
 from tests.demonstrations.made_up import made_up
 
 pytest.importorskip("robosuite", reason="robosuite is an extra")
 
 SMALL: dict[str, Any] = {
-    "settling": "scheduled",
+    **SHORT_WARM_UP,
     "policy_kwargs": {"net_arch": [16, 16]},
     "batch_size": 16,
     "prior_updates": 3,
@@ -94,5 +94,5 @@ def test_the_command_trains_with_the_shipped_settings(n_envs: int, tmp_path: Pat
     assert result["timesteps"] == 60
     assert result["success_rate"] in (0.0, 1.0)
     recorded = json.loads((tmp_path / "run" / "config.json").read_text())
-    assert (recorded["n_envs"], recorded["settings"]["replay_buffer_kwargs"]) == (n_envs, {"self_imitation_size": 200_000})
+    assert (recorded["n_envs"], recorded["settings"]["gradient_steps"]) == (n_envs, -1)
     assert result["versions"]["robosuite"].startswith("1.5")

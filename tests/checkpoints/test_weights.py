@@ -18,7 +18,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from sb3_actpc import ActPC
 from sb3_actpc.checkpoints import CheckpointCallback
 from tests.actpc.envs import CountingEnv, demonstrations
-from tests.checkpoints.runs import assert_same, make_actpc
+from tests.checkpoints.runs import SHORT_WARM_UP, assert_same, make_actpc
 
 KEYWORDS: dict[str, Any] = {
     "train_freq": (2, "step"),
@@ -27,7 +27,7 @@ KEYWORDS: dict[str, Any] = {
         "net_arch": {"pi": [8], "qf": [12, 12]},
         "optimizer_class": th.optim.SGD,
         "memory_history": 7,
-        "n_critics": 2,
+        "n_critics": 3,
         "circuit_kwargs": {"activation": "tanh"},
     },
     "learning_rate": lambda progress: 1e-3 * progress,
@@ -56,7 +56,7 @@ def everything_is_imported() -> None:
 
 def test_weights_are_loaded_without_running_code(tmp_path: Path, request: pytest.FixtureRequest) -> None:
     env = VecNormalize(make_vec_env(CountingEnv))
-    model = ActPC("MlpPolicy", env, demonstrations=demonstrations(), prior_updates=3, buffer_size=99, **KEYWORDS).learn(150)
+    model = ActPC("MlpPolicy", env, demonstrations=demonstrations(), buffer_size=99, **KEYWORDS, **SHORT_WARM_UP).learn(150)
     assert model.save_weights(tmp_path / "agent") == tmp_path / "agent.safetensors"
     observations = np.random.default_rng(0).normal(size=(5, 3)).astype(np.float32)
     expected = model.predict(observations)[0]
@@ -65,7 +65,7 @@ def test_weights_are_loaded_without_running_code(tmp_path: Path, request: pytest
     assert (loaded.predict(observations)[0] == expected).all()
     for name, tensor in model.policy.state_dict().items():
         assert th.equal(tensor, loaded.policy.state_dict()[name])
-    assert (loaded.gamma, loaded.train_freq, loaded.n_critics, loaded.buffer_size) == (model.gamma, model.train_freq, 2, 50)
+    assert (loaded.gamma, loaded.train_freq, loaded.n_critics, loaded.buffer_size) == (model.gamma, model.train_freq, 3, 50)
     assert loaded.policy.optimizer_class is th.optim.SGD and loaded.learning_rate == 1e-3
     assert np.allclose(loaded.get_vec_normalize_env().obs_rms.mean, env.obs_rms.mean)
     request.getfixturevalue("no_code").undo()
@@ -137,7 +137,7 @@ def test_files_that_do_not_fit_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="VecNormalize"):
         ActPC.from_weights(path, VecNormalize(make_vec_env(CountingEnv)))
     with pytest.raises(ValueError, match="does not fit its own settings"):
-        ActPC.from_weights(path, make_vec_env(CountingEnv), policy_kwargs={"net_arch": [16, 16], "n_critics": 2})
+        ActPC.from_weights(path, make_vec_env(CountingEnv), policy_kwargs={"net_arch": [16, 16], "n_critics": 3})
     (tmp_path / "bad.safetensors").write_bytes(path.read_bytes()[:100])
     with pytest.raises(ValueError, match="not a file of save_weights"):
         ActPC.from_weights(tmp_path / "bad.safetensors", make_vec_env(CountingEnv))

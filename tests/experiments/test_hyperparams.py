@@ -9,7 +9,9 @@ import pytest
 import torch as th
 import yaml
 
+from sb3_actpc import ActPC
 from sb3_actpc.baselines.offline.served import ServedAlgorithm
+from sb3_actpc.checkpoints.settings import constructor_settings
 from sb3_actpc.envs import ROBOSUITE_IDS, sparse_env_id
 from sb3_actpc.experiments.runs import ALGORITHMS, Run, load_preset, resolve
 from sb3_actpc.experiments.runs.environments import make_train_env, register_tasks
@@ -93,6 +95,19 @@ def test_every_entry_builds_its_agent_which_trains(
         assert not all(th.equal(*pair) for pair in zip(before, after, strict=True))
     finally:
         env.close()
+
+
+def test_the_settings_of_a_task_are_the_constructors_defaults(recordings: Path) -> None:
+    """All of them, the policy's too: who writes three lines of Python gets the agent of the command."""
+    env_id = "SparseHopper-v5"
+    demonstrations = record_file(recordings, env_id)
+    run = resolve(Run(env=env_id, demonstrations=str(demonstrations)))
+    by_command = build_model(run, make_train_env(env_id, run.env_kwargs, run.n_envs, run.seed, run.normalize))
+    by_hand = ActPC("MlpPolicy", env_id, demonstrations=demonstrations, seed=run.seed)
+    one, other = constructor_settings(by_command), constructor_settings(by_hand)
+    assert len(one["keywords"]) > 30 and "demonstrations" in one["keywords"]
+    assert one == other
+    assert set(load_preset("actpc", env_id)) <= {"n_timesteps", "policy"}
 
 
 def test_every_algorithm_has_settings_with_a_default() -> None:

@@ -1,0 +1,433 @@
+"""The habit: who plays which episode, what must be proven, and what follows from it."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+from sb3_actpc import ActPC
+from sb3_actpc.actpc import habit as habit_module
+from sb3_actpc.actpc.actpc import AVERAGING_RATE, LARGEST_PRESSURE, SMALLEST_PRESSURE
+from sb3_actpc.actpc.habit import ENOUGH_PROOFS, KEPT_RETURNS, PROOF_STEPS, Trials
+from tests.actpc.agents import QUICK, differ, make, weights_of
+from tests.actpc.envs import CountingEnv, demonstrations
+from tests.checkpoints.runs import assert_same, learn_in_two, learn_straight
+
+OBSERVATIONS = np.random.default_rng(0).normal(size=(7, 3)).astype(np.float32)
+
+
+def play(trials, episode_return, length=PROOF_STEPS, env=0):
+    """One episode, paid at its end: who played it, and what followed."""
+    role = trials.roles[env]
+    for step in range(length):
+        trials.step(env, episode_return if step == length - 1 else 0.0)
+    verdict = trials.end(env)
+    trials.begin(env)
+    return role, verdict
+
+
+def play_quiet(trials, episode_return, length=PROOF_STEPS, env=0):
+    """A noisy episode, whose return must not matter, and the quiet one after it."""
+    assert play(trials, 1e6, 3, env) == ("actor", None)
+    return play(trials, episode_return, length, env)
+
+
+def tried(habit_return, candidate_returns, length=PROOF_STEPS, trials=None):
+    """The verdict of each episode of a candidate, of which all but the last must be None."""
+    trials = trials or Trials(1)
+    assert play_quiet(trials, habit_return) == ("habit", None)
+    verdicts = []
+    for one in candidate_returns:
+        role, verdict = play_quiet(trials, one, length)
+        assert role == "candidate"
+        verdicts.append(verdict)
+    return verdicts
+
+
+# ---------------------------------------------------------------------- the rules
+
+
+def test_noisy_and_quiet_episodes_take_turns_and_the_habit_plays_first():
+    """Two whole episodes are what a tie takes; then the habit is tested again."""
+    trials = Trials(1)
+    roles = [play(trials, 1.0)[0] for _ in range(10)]
+    assert roles[::2] == ["actor"] * 5
+    assert roles[1::2] == ["habit", "candidate", "candidate", "habit", "candidate"]
+
+
+def test_environments_take_turns_by_themselves():
+    trials = Trials(2)
+    play(trials, 1.0, env=1)
+    assert trials.roles == ["actor", "habit"]
+    trials.step(0, 0.5)
+    trials.step(1, 0.25)
+    assert play(trials, 1.0, env=1) == ("habit", None) and trials.habit_returns == [1.25]
+
+
+@pytest.mark.parametrize(
+    ("habit", "candidate", "verdict"),
+    [
+        (100.0, [103.1, 103.1], "accepted"),
+        (100.0, [90.0, 117.0], "accepted"),  # on average
+        (100.0, [102.9, 102.9], "tied"),
+        (100.0, [100.0, 100.0], "tied"),
+        (100.0, [80.1, 80.1], "tied"),
+        (100.0, [79.9], "rejected"),
+        (100.0, [0.0], "rejected"),
+        (-100.0, [-96.9, -96.9], "accepted"),
+        (-100.0, [-97.1, -97.1], "tied"),
+        (-100.0, [-119.9, -119.9], "tied"),
+        (-100.0, [-120.1], "rejected"),
+        (-100.0, [-1000.0], "rejected"),
+        (0.0, [0.0, 0.0], "accepted"),  # nothing is lost by following what learns
+        (0.0, [1.0, 1.0], "accepted"),
+        (-3.0, [0.0, 0.0], "accepted"),
+        (1.0, [0.0], "rejected"),
+    ],
+)
+def test_a_candidate_must_gain_three_percent_and_is_rejected_for_the_loss_of_a_fifth(habit, candidate, verdict):
+    """In at least two episodes; a loss is judged at once."""
+    assert tried(habit, candidate) == [None] * (len(candidate) - 1) + [verdict]
+
+
+@pytest.mark.parametrize(
+    ("candidate", "verdict"),
+    [
+        ([74.0, 76.0], "rejected"),  # 75 and a standard error of 1
+        ([60.0, 90.0], "tied"),  # 75 and a standard error of 15
+    ],
+)
+def test_what_may_be_chance_is_not_held_against_a_candidate(candidate, verdict):
+    assert tried(100.0, candidate, length=PROOF_STEPS // 2) == [None, verdict]
+
+
+@pytest.mark.parametrize(
+    ("habit", "candidates", "verdicts"),
+    [
+        (100.0, [[39.9], [39.9], [39.9], [39.9]], ["rejected", "relapsed"] * 2),
+        (-100.0, [[-160.1], [-160.1]], ["rejected", "relapsed"]),
+        (100.0, [[40.1], [40.1], [40.1]], ["rejected"] * 3),
+        (100.0, [[0.0], [100.0, 100.0], [0.0]], ["rejected", "tied", "rejected"]),
+        (100.0, [[34.0, 36.0], [34.0, 36.0]], ["rejected", "relapsed"]),
+        (100.0, [[20.0, 50.0], [20.0, 50.0]], ["rejected", "rejected"]),  # 35 and a standard error of 15
+    ],
+)
+def test_two_candidates_in_a_row_that_lost_three_fifths_are_a_relapse(habit, candidates, verdicts):
+    trials = Trials(1)
+    assert [tried(habit, one, PROOF_STEPS // len(one), trials)[-1] for one in candidates] == verdicts
+
+
+@pytest.mark.parametrize(("length", "n_needed"), [(1, ENOUGH_PROOFS), (PROOF_STEPS // 5, 5), (PROOF_STEPS // 4, 4)])
+@pytest.mark.parametrize(("paid", "verdict"), [(200.0, "accepted"), (100.0, "tied"), (0.0, "rejected")])
+def test_short_episodes_must_be_many_or_add_up(length, n_needed, paid, verdict):
+    assert tried(100.0, [paid] * n_needed, length) == [None] * (n_needed - 1) + [verdict]
+
+
+def test_what_an_accepted_candidate_was_paid_is_the_new_habits_return_and_the_next_candidate_follows():
+    trials = Trials(1)
+    play_quiet(trials, 100.0)
+    returns = [200.0 + one for one in range(ENOUGH_PROOFS)]
+    assert [play_quiet(trials, one, 1)[1] for one in returns][-1] == "accepted"
+    assert trials.habit_returns == returns[-KEPT_RETURNS:]
+    play(trials, 0.0)
+    assert trials.roles == ["candidate"]
+
+
+@pytest.mark.parametrize("paid", [[100.0, 100.0], [70.0], [0.0]])
+def test_a_habit_that_stays_is_tested_again_and_known_by_the_mean_of_its_last_returns(paid):
+    trials = Trials(1)
+    play_quiet(trials, 100.0)
+    for one in paid:
+        play_quiet(trials, one)
+    assert play_quiet(trials, 60.0) == ("habit", None) and trials.habit_return == 80.0
+    trials.habit_returns = [float(one) for one in range(KEPT_RETURNS)]
+    trials.tests_habit = True
+    play_quiet(trials, 9.0)
+    assert trials.habit_returns == [*range(1, KEPT_RETURNS), 9.0]
+
+
+def test_a_new_candidate_is_taken_before_its_first_episode_and_not_between_its_episodes():
+    trials, asked = Trials(1), []
+    for paid in (0.0, 100.0, 0.0, 100.0, 0.0, 100.0, 0.0):
+        for _ in range(PROOF_STEPS):
+            trials.step(0, paid / PROOF_STEPS)
+        role = trials.roles[0]
+        trials.end(0)
+        asked.append((role, trials.needs_candidate()))
+        trials.begin(0)
+    # at the end of: noise, habit, noise (here it is taken), candidate, noise, candidate (a tie), noise
+    assert asked == [
+        ("actor", False),
+        ("habit", True),
+        ("actor", True),
+        ("candidate", False),
+        ("actor", False),
+        ("candidate", False),
+        ("actor", False),
+    ]
+
+
+def test_an_episode_of_a_candidate_that_was_judged_meanwhile_does_not_count():
+    trials = Trials(2)
+    for role in ("actor", "habit", "actor"):
+        assert [play(trials, 100.0, env=env)[0] for env in (0, 1)] == [role, role]
+    assert trials.roles == ["candidate", "candidate"]
+    assert play(trials, 0.0, env=0) == ("candidate", "rejected")
+    assert play(trials, 1e6, env=1) == ("candidate", None)
+    assert trials.candidate_returns == [] and trials.candidate_steps == 0 and trials.habit_return == 100.0
+
+
+def test_a_reset_of_the_environments_forgets_running_episodes_and_nothing_else():
+    trials = Trials(2)
+    play_quiet(trials, 100.0)
+    play_quiet(trials, 50.0, 3)
+    trials.step(0, 7.0)
+    known = trials.habit_returns, trials.candidate_returns, trials.candidate_steps, trials.generation
+    trials.begin_all()
+    assert trials.roles == ["actor", "actor"] and trials.returns == [0.0, 0.0] and trials.lengths == [0, 0]
+    assert (trials.habit_returns, trials.candidate_returns, trials.candidate_steps, trials.generation) == known
+
+
+def test_trials_that_were_stored_go_on_as_they_would_have():
+    trials = Trials(2)
+    for paid in (1.0, 5.0, 1.0, 2.0):
+        play(trials, paid, 20, env=1)
+    trials.step(0, 0.5)
+    again = Trials(**json.loads(json.dumps(trials.checkpoint_state())))
+    assert again == trials
+    for paid in (9.0, 9.0, 1.0, 4.0, 3.0, 9.0):
+        for env in (0, 1):
+            assert play(trials, paid, env=env) == play(again, paid, env=env)
+    assert again == trials
+
+
+# ---------------------------------------------------------------------- the agent
+
+
+class Unpaid(CountingEnv):
+    """No verdict can be reached in a few episodes of a few steps."""
+
+    def __init__(self, lengths=(5, 9, 3, 12)):
+        super().__init__(lengths=lengths, returns=(0.0,))
+
+
+def imitating(env=CountingEnv, policy_kwargs=None, **keywords):
+    """The constructor's defaults but for sizes: with demonstrations there is a habit."""
+    env = env if isinstance(env, DummyVecEnv) else DummyVecEnv([env])
+    policy_kwargs = {"net_arch": [16, 16], **(policy_kwargs or {})}
+    return ActPC("MlpPolicy", env, demonstrations=demonstrations(), **{**QUICK, **keywords, "policy_kwargs": policy_kwargs})
+
+
+def actions_of(model, circuit):
+    scaled = circuit.project(model.policy.features(th.as_tensor(OBSERVATIONS))).numpy()
+    return model.policy.unscale_action(scaled)
+
+
+def disturb(circuit, shift=0.05):
+    for parameter in circuit.parameters():
+        parameter.add_(shift)
+
+
+def prove(model, *returns):
+    """Whole episodes with these returns, however they were played."""
+    for episode_return in returns:
+        for step in range(1, PROOF_STEPS + 1):
+            is_over = step == PROOF_STEPS
+            model._prove(np.array([episode_return if is_over else 0.0]), np.array([is_over]))
+
+
+def test_predict_is_the_warm_started_clone_until_a_candidate_is_accepted_and_then_the_candidate():
+    model = imitating()
+    model.pretrain()
+    clone = actions_of(model, model.actor.circuit)
+    assert np.array_equal(model.predict(OBSERVATIONS)[0], clone)
+    model.learn(40)
+    assert not np.array_equal(actions_of(model, model.actor.circuit), clone)
+    assert np.array_equal(model.predict(OBSERVATIONS)[0], clone)
+    model.trials = Trials(1)
+    disturb(model.policy.actor_average)
+    prove(model, 0.0, 1.0, 0.0)  # noise, the habit, noise: now the average is frozen as a candidate
+    candidate = actions_of(model, model.policy.actor_average)
+    disturb(model.policy.actor_average)
+    assert np.array_equal(model.predict(OBSERVATIONS)[0], clone)
+    prove(model, 2.0, 0.0)
+    assert np.array_equal(model.predict(OBSERVATIONS)[0], clone)
+    pressure = model.pressure
+    prove(model, 2.0)
+    assert np.array_equal(model.predict(OBSERVATIONS)[0], candidate) and not np.array_equal(candidate, clone)
+    assert model.pressure > pressure
+
+
+@pytest.mark.parametrize(("paid", "is_undone"), [([1.0, 0.0, 1.0], False), ([0.1], False), ([0.1, 0.0, 1.0, 0.0, 0.1], True)])
+def test_a_relapse_puts_the_learning_actor_back_to_the_habit(paid, is_undone):
+    model = imitating()
+    model.pretrain()
+    habit = weights_of(model.actor.habit)
+    learning = model.actor.circuit, model.actor_target, model.policy.actor_average
+    for circuit in learning:
+        disturb(circuit)
+    prove(model, 0.0, 1.0, 0.0, *paid)
+    assert model.trials.generation >= 1
+    assert [differ(habit, weights_of(circuit)) for circuit in learning] == [not is_undone] * 3
+    assert not differ(habit, weights_of(model.actor.habit))
+
+
+def test_the_pressure_grows_with_proofs_and_shrinks_with_failures_between_two_bounds():
+    model = imitating(actor_pressure=2.0)
+    prove(model, 0.0, 1.0, 0.0, 1.0, 0.0, 1.0)
+    assert model.trials.generation == 1 and model.pressure == 2.0  # a tie says nothing
+    shrunk = []
+    for _ in range(30):
+        prove(model, 0.0, 1.0, 0.0, 0.1)
+        shrunk.append(model.pressure)
+    steps = -np.diff([2.0, *shrunk[:3]]) / [2.0, *shrunk[:2]]
+    assert (steps[:2] > 0.0).all() and steps[1] > steps[0]  # a rejection, then a relapse
+    assert shrunk[-1] == pytest.approx(SMALLEST_PRESSURE * 2.0)
+    prove(model, 0.0, 1.0)  # the habit again
+    for paid in range(1, 30):
+        prove(model, *[0.0, 10.0 * 2.0**paid] * 2)
+    assert model.trials.generation == 60 and model.pressure == pytest.approx(LARGEST_PRESSURE * 2.0)
+
+
+class Roles(BaseCallback):
+    """Who played each step."""
+
+    def __init__(self):
+        super().__init__()
+        self.rows = []
+
+    def _on_step(self):
+        self.rows.append(list(self.model.trials.roles))
+        return True
+
+
+@pytest.mark.parametrize("history", [0, 3])
+@pytest.mark.parametrize("n_envs", [1, 2])
+def test_quiet_episodes_are_exactly_the_habits_or_the_candidates_and_the_others_have_noise(n_envs, history):
+    """Both are frozen until a verdict, and here is none: their actions can be worked out afterwards, from the buffer."""
+    lengths = [(5, 9, 3, 12), (8, 4, 11)][:n_envs]
+    env = DummyVecEnv([lambda one=one: Unpaid(one) for one in lengths])
+    model, roles = imitating(env, {"memory_history": history}), Roles()
+    model.learn(60 * n_envs, callback=roles)
+    assert model.trials.generation == 0 and len(roles.rows) == 60
+    rows, envs = (part.ravel() for part in np.mgrid[:60, :n_envs])
+    batch = model.inputs.replayed(model.replay_buffer._gather(rows, envs, None), model.reward_weights, model.gamma)
+    assert (batch.memory is None) == (history == 0)
+    played = np.array([roles.rows[row][env] for row, env in zip(rows, envs, strict=True)])
+    for role, circuit in (("habit", model.actor.habit), ("candidate", model.policy.candidate), ("actor", model.actor.circuit)):
+        assert (played == role).sum() > 4
+        expected = circuit.project(batch.features, batch.memory)[played == role]
+        difference = (batch.actions[played == role] - expected).abs().amax(1)
+        assert (difference < 1e-6).all() if role != "actor" else (difference > 1e-4).all()
+    assert n_envs == 1 or any(one != other for one, other in roles.rows)  # each environment has its own turns
+
+
+def test_the_average_follows_the_actor_with_its_rate():
+    """After k updates of a standing actor the share (1 - rate)^k of the distance is left."""
+    model = imitating()
+    disturb(model.policy.actor_average, 1.0)
+    for _ in range(25):
+        model._update_targets(model.tau)
+    left = (1.0 - AVERAGING_RATE) ** 25
+    for mine, actors in zip(weights_of(model.policy.actor_average), weights_of(model.actor.circuit), strict=True):
+        assert th.allclose(mine - actors, th.full_like(mine, left), atol=1e-5)
+
+
+def test_save_and_load_keep_the_habit_and_what_is_known_of_it(tmp_path):
+    model = imitating().learn(60)
+    disturb(model.actor.habit)
+    disturb(model.policy.candidate, 0.1)
+    model.pressure = 0.7
+    model.save(tmp_path / "agent")
+    loaded = ActPC.load(tmp_path / "agent", env=DummyVecEnv([CountingEnv]))
+    assert np.array_equal(loaded.predict(OBSERVATIONS)[0], model.predict(OBSERVATIONS)[0])
+    for name, tensor in model.policy.state_dict().items():
+        assert th.equal(loaded.policy.state_dict()[name], tensor), name
+    assert loaded.pressure == 0.7 and np.array_equal(loaded.noise_scale, model.noise_scale)
+    assert model.trials.habit_returns and loaded.trials == model.trials
+    loaded.learn(20, reset_num_timesteps=False)
+    assert loaded.trials.habit_returns
+
+
+def test_an_agent_without_its_environment_acts_by_its_habit(tmp_path):
+    model = imitating().learn(20)
+    model.save(tmp_path / "agent")
+    loaded = ActPC.load(tmp_path / "agent")
+    assert np.array_equal(loaded.predict(OBSERVATIONS)[0], model.predict(OBSERVATIONS)[0])
+
+
+@pytest.mark.parametrize("n_envs", [1, 2])
+def test_a_run_stopped_between_verdicts_is_the_run_never_stopped(n_envs, tmp_path, monkeypatch):
+    monkeypatch.setattr(habit_module, "PROOF_STEPS", 1)  # every few episodes a verdict
+
+    def make_agent():
+        return imitating(DummyVecEnv([CountingEnv] * n_envs), {"memory_history": 3}, buffer_size=200)
+
+    straight = learn_straight(make_agent, tmp_path / "straight", 90)
+    resumed = learn_in_two(make_agent, tmp_path / "resumed", 90, stop_at=53)
+    assert straight.trials.generation >= 2
+    assert_same(straight, resumed)
+
+
+# ---------------------------------------------------------------------- what comes with it
+
+
+def test_noise_is_no_wider_than_the_demonstrations_around_the_warm_started_actor():
+    """Actions of one size around an actor that does nothing spread by that size; the least is a fifth of what was asked."""
+    signs = np.random.default_rng(0).choice([-1.0, 1.0], size=(60, 2))
+    for sizes, expected in (((0.05, 0.5), (0.05, 0.1)), ((0.001, 0.08), (0.02, 0.08))):
+        data = dataclasses.replace(demonstrations(), actions=2.0 * signs * sizes)  # of a box from -2 to 2
+        model = ActPC("MlpPolicy", CountingEnv(), demonstrations=data, **QUICK, exploration_noise=0.1)
+        model.pretrain()
+        for parameter in model.actor.circuit.parameters():
+            parameter.zero_()
+        drawn = model._exploration((20_000, 2))
+        assert model.noise_scale == pytest.approx(np.array(expected), rel=1e-4)
+        assert drawn.std(0) == pytest.approx(np.array(expected), rel=0.05)
+
+
+def test_without_a_warm_start_the_noise_is_as_asked_for():
+    for keywords in ({}, {"demonstrations": demonstrations()}):
+        model = make(exploration_noise=0.3, **keywords)
+        assert model._exploration((20_000, 2)).std(0) == pytest.approx([0.3, 0.3], rel=0.05)
+
+
+def test_the_warm_starts_rates_fall_geometrically_and_leave_nothing_behind(monkeypatch):
+    seen, original = [], ActPC._refresh_changes
+
+    def watched(self, n):
+        seen.append((n, *(group["lr"] for group in self.actor.circuit.optimizer.param_groups)))
+        return original(self, n)
+
+    monkeypatch.setattr(ActPC, "_refresh_changes", watched)
+    model = imitating(actor_warm_start=10, learning_rate=8e-4)
+    model.pretrain()
+    rates = [1e-3 * (5e-5 / 1e-3) ** (update / 10) for update in range(10)]
+    assert len(seen) == 10
+    for (n, *of_groups), rate in zip(seen, rates, strict=True):
+        assert n == 256 and of_groups == pytest.approx([rate] * len(of_groups))
+    assert not model.actor.circuit.optimizer.state
+    model.learn(2)
+    assert [group["lr"] for group in model.actor.circuit.optimizer.param_groups] == pytest.approx([2e-4] * len(of_groups))
+    assert {group["lr"] for group in model.critic.first().optimizer.param_groups} == {8e-4}
+
+
+@pytest.mark.parametrize(("delay", "expected"), [(1, 7), (2, 3), (3, 2)])
+def test_the_actor_learns_once_in_so_many_updates_of_the_critic(delay, expected, monkeypatch):
+    updates = {"_update_actor": 0, "_update_critic": 0}
+    for name in updates:
+        monkeypatch.setattr(ActPC, name, lambda self, batch, name=name: updates.update({name: updates[name] + 1}))
+    make(policy_delay=delay, learning_starts=1).learn(8)
+    assert updates == {"_update_actor": expected, "_update_critic": 7}
+
+
+def test_refresh_alone_leaves_the_critic_bit_identical():
+    model = make(demonstrations=demonstrations(), actor_pressure=0.0)
+    critic, target, actor = (weights_of(part) for part in (model.critic, model.critic_target, model.actor.circuit))
+    model.learn(40)
+    assert not differ(critic, weights_of(model.critic)) and not differ(target, weights_of(model.critic_target))
+    assert differ(actor, weights_of(model.actor.circuit))
