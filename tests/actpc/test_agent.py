@@ -357,7 +357,7 @@ def test_the_pressure_has_the_nudge_that_was_asked_for():
 
 def test_every_circuit_learns_from_as_many_rows_as_train_was_asked_for(monkeypatch):
     own = {"net_arch": [16, 16], "generator_kwargs": {"batch_size": 5}}
-    model = make(demonstrations=demonstrations(), actor_pressure=0.0, policy_kwargs=own)
+    model = make(demonstrations=demonstrations(), policy_kwargs=own)
     model.learn(30)
     sizes, settle = {}, NGCCircuit.settle
 
