@@ -312,7 +312,9 @@ class ActPC(OffPolicyAlgorithm):
             self.replay_buffer = self._make_replay_buffer()
         self._convert_train_freq()
         self._create_aliases()
-        self.trials = Trials(self.n_envs) if self.policy.habit else None
+        if self.policy.habit:
+            self.trials = self.trials or Trials(self.n_envs)  # a loaded agent knows what its habit was paid
+            self.trials.n_envs = self.n_envs
         self._setup_demonstrations()
         self.diagnostics = Diagnostics(self.policy)
         self._compiled: CompiledUpdate | None = None
@@ -581,7 +583,7 @@ class ActPC(OffPolicyAlgorithm):
 
     def _prove(self, rewards: np.ndarray, dones: np.ndarray) -> None:
         """The habit follows from what whole episodes were paid: see :mod:`sb3_actpc.actpc.habit`."""
-        if self.trials is None:
+        if self.trials is None or self.num_timesteps <= self.learning_starts:  # random actions prove nothing
             return
         for env, (reward, done) in enumerate(zip(rewards, dones, strict=True)):
             self.trials.step(env, float(reward))

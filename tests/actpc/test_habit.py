@@ -234,6 +234,7 @@ def disturb(circuit, shift=0.05):
 
 def prove(model, *returns):
     """Whole episodes with these returns, however they were played."""
+    model.num_timesteps = max(model.num_timesteps, 1)
     for episode_return in returns:
         for step in range(1, PROOF_STEPS + 1):
             is_over = step == PROOF_STEPS
@@ -278,8 +279,11 @@ def test_a_relapse_puts_the_learning_actor_back_to_the_habit(paid, is_undone):
 
 def test_the_pressure_grows_with_proofs_and_shrinks_with_failures_between_two_bounds():
     model = imitating(actor_pressure=2.0)
+    prove(model, 0.0, 1.0, 0.0, 0.1)
+    assert model.trials.generation == 1 and model.pressure == 2.0  # there was none yet
+    model._n_updates = model.critic_warmup + 1
     prove(model, 0.0, 1.0, 0.0, 1.0, 0.0, 1.0)
-    assert model.trials.generation == 1 and model.pressure == 2.0  # a tie says nothing
+    assert model.trials.generation == 2 and model.pressure == 2.0  # a tie says nothing
     shrunk = []
     for _ in range(30):
         prove(model, 0.0, 1.0, 0.0, 0.1)
@@ -290,7 +294,7 @@ def test_the_pressure_grows_with_proofs_and_shrinks_with_failures_between_two_bo
     prove(model, 0.0, 1.0)  # the habit again
     for paid in range(1, 30):
         prove(model, *[0.0, 10.0 * 2.0**paid] * 2)
-    assert model.trials.generation == 60 and model.pressure == pytest.approx(LARGEST_PRESSURE * 2.0)
+    assert model.trials.generation == 61 and model.pressure == pytest.approx(LARGEST_PRESSURE * 2.0)
 
 
 class Roles(BaseCallback):
@@ -349,8 +353,9 @@ def test_save_and_load_keep_the_habit_and_what_is_known_of_it(tmp_path):
         assert th.equal(loaded.policy.state_dict()[name], tensor), name
     assert loaded.pressure == 0.7 and np.array_equal(loaded.noise_scale, model.noise_scale)
     assert model.trials.habit_returns and loaded.trials == model.trials
+    loaded = ActPC.load(tmp_path / "agent", env=DummyVecEnv([CountingEnv] * 2))  # two environments from now on
     loaded.learn(20, reset_num_timesteps=False)
-    assert loaded.trials.habit_returns
+    assert len(loaded.trials.roles) == 2 and loaded.trials.habit_returns == model.trials.habit_returns
 
 
 def test_an_agent_without_its_environment_acts_by_its_habit(tmp_path):
@@ -358,6 +363,14 @@ def test_an_agent_without_its_environment_acts_by_its_habit(tmp_path):
     model.save(tmp_path / "agent")
     loaded = ActPC.load(tmp_path / "agent")
     assert np.array_equal(loaded.predict(OBSERVATIONS)[0], model.predict(OBSERVATIONS)[0])
+
+
+def test_random_actions_prove_nothing():
+    """What comes before ``learning_starts`` is nobody's: an episode that begins there counts for nothing either."""
+    model, roles = imitating(learning_starts=20), Roles()
+    model.learn(40, callback=roles)  # episodes of 5, 9, 3, 12, 5 and 9 steps: the fourth goes on until step 29
+    assert [row[0] for row in roles.rows] == ["actor"] * 29 + ["habit"] * 5 + ["actor"] * 6
+    assert model.trials.habit_returns == [0.0]
 
 
 @pytest.mark.parametrize("n_envs", [1, 2])
