@@ -297,8 +297,8 @@ MUTANTS = [
     Mutant(
         "the weight of the pressure is ignored",
         AGENT,
-        "| th.Tensor = self.actor_pressure",
-        "| th.Tensor = 1.0",
+        "self._pressure_weight(self.actor_pressure,",
+        "self._pressure_weight(1.0,",
         EQUATIONS,
     ),
     Mutant(
