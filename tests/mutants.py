@@ -297,15 +297,15 @@ MUTANTS = [
     Mutant(
         "the weight of the pressure is ignored",
         AGENT,
-        "self._pressure_weight(self.actor_pressure,",
+        "self._pressure_weight(self.pressure,",
         "self._pressure_weight(1.0,",
         EQUATIONS,
     ),
     Mutant(
         "the noise on the target's action is not bounded",
         AGENT,
-        "noise.clamp(-self.target_noise_clip, self.target_noise_clip)",
-        "noise",
+        "* self.target_policy_noise).clamp(-bound, bound)",
+        "* self.target_policy_noise)",
         f"{LEARNS} -k smoothing",
     ),
     Mutant(
