@@ -236,10 +236,24 @@ MUTANTS = [
     ),
     Mutant(
         "the instrumental signal is a reward",
-        AGENT,
-        "= -self.instrumental_normalizer(",
-        "= self.instrumental_normalizer(",
+        SIGNALS,
+        "else -normalized",
+        "else normalized",
         f"{LEARNS} -k 'signals or part'",
+    ),
+    Mutant(
+        "the unit form pays for errors",
+        SIGNALS,
+        "return 1.0 - normalized",
+        "return normalized",
+        f"{LEARNS} -k unit_form",
+    ),
+    Mutant(
+        "signals are stored as they are, and paid so",
+        AGENT,
+        "rewards_of = self._rewards_of_signals if",
+        "rewards_of = STORED if",
+        f"{LEARNS} -k normalised_when_sampled",
     ),
     Mutant(
         "the target actor never moves",
@@ -389,8 +403,8 @@ MUTANTS = [
     Mutant(
         "demonstrations' instrumental signals are rewards",
         SHOWN,
-        "self.instrumental[rows] = -instrumental",
-        "self.instrumental[rows] = instrumental",
+        "self.instrumental[rows] = instrumental(raw_in)",
+        "self.instrumental[rows] = -instrumental(raw_in)",
         EQUATIONS,
     ),
     # ------------------------------------------------------------------ buffers
