@@ -53,6 +53,7 @@ LEARNS, STORES = "tests/actpc/test_agent.py", "tests/actpc/test_buffers.py"
 COUPLED, SPARSE = "ngc/coupled.py", "envs/sparse_mujoco.py"
 STATISTICS, R_STABILITY = "experiments/report/statistics.py", "experiments/report/r_stability.py"
 SETTLING, LEARNING, SCHEDULED = (f"tests/ngc/test_{name}.py" for name in ("settling", "plasticity", "scheduled"))
+HABIT, TRIALS = "tests/actpc/test_habit.py", "actpc/habit.py"
 CLOSED, EQUATIONS = "tests/ngc/test_closed_forms.py", "tests/actpc/test_equations.py"
 TASKS = "tests/envs/test_sparse_mujoco.py"
 SCORES, STABLE = (f"tests/experiments/report/test_{name}.py" for name in ("statistics", "r_stability"))
@@ -293,16 +294,16 @@ MUTANTS = [
     Mutant(
         "the target actor lacks the warm start",
         AGENT,
-        "self.actor_target.load_state_dict(self.actor.circuit.state_dict())",
-        "pass",
+        "_copy(self.actor.circuit, self.actor_target, self.actor.habit",
+        "_copy(self.actor.circuit, self.actor.habit",
         f"{EQUATIONS} -k warm_start",
     ),
     Mutant("the agent ignores the nudge", AGENT, "memory, self.nudge)", "memory)", f"{LEARNS} -k nudge"),
     Mutant(
         "pressure from the first update on",
         AGENT,
-        "self._n_updates > self.critic_warmup",
-        "self._n_updates > 0",
+        "if self.pressure and self._n_updates > self.critic_warmup",
+        "if self.pressure",
         f"{LEARNS} -k warmup",
     ),
     Mutant(
@@ -318,8 +319,13 @@ MUTANTS = [
     Mutant(
         "the noise on the target's action is not bounded",
         AGENT,
+<<<<<<< HEAD
         "* self.target_policy_noise).clamp(-bound, bound)",
         "* self.target_policy_noise)",
+=======
+        ".clamp(-bound, bound)",
+        "",
+>>>>>>> 0390518 (Mutants of the habit and of the recipe)
         f"{LEARNS} -k smoothing",
     ),
     Mutant(
@@ -343,6 +349,27 @@ MUTANTS = [
         "batch.bootstrap_features, batch.memory",
         f"{EQUATIONS} -k bootstrapped",
     ),
+    # ------------------------------------------------------------------ habit
+    Mutant("quiet episodes are noisy", AGENT, 'role == "actor" for role', "True for role", f"{HABIT} -k quiet"),
+    Mutant("random actions prove something", AGENT, "or self.num_timesteps <= self.learning_starts", "", f"{HABIT} -k random"),
+    Mutant("the habit is not copied", AGENT, "_copy(self.policy.candidate, self.actor.habit)", "pass", f"{HABIT} -k predict"),
+    Mutant("the learning actor acts", POLICIES, "self.circuit if self.habit is None", "self.circuit if True", HABIT),
+    Mutant(
+        "the pressure has no bound",
+        AGENT,
+        "* PRESSURE_FACTORS[verdict], *bounds))",
+        "* PRESSURE_FACTORS[verdict], 0, 99))",
+        HABIT,
+    ),
+    Mutant("one proof is enough", TRIALS, "elif n < N_PROOFS", "elif n < 1", HABIT),
+    Mutant("a tie is a proof", TRIALS, "mean >= habit + PROVEN_GAIN * abs(habit)", "mean >= habit", HABIT),
+    Mutant("chance is held against a candidate", TRIALS, "stdev(own) / n**0.5 if n > 1 else 0.0", "0.0", f"{HABIT} -k chance"),
+    Mutant("old candidates count", TRIALS, " or self.generations[env] != self.generation", "", f"{HABIT} -k meanwhile"),
+    Mutant("short episodes prove at once", TRIALS, "if n < ENOUGH_PROOFS and", "if False and", f"{HABIT} -k short"),
+    Mutant("the noise forgets the spread", AGENT, "self._imitation_spread().reshape(shape[1:])", "9.0", f"{HABIT} -k noise"),
+    Mutant("the warm start's rate stands", AGENT, "* (last / first) ** progress", "", f"{HABIT} -k rates"),
+    Mutant("the delay is ignored", AGENT, "self._n_updates % self.policy_delay == 0", "True", f"{HABIT} -k once"),
+    # ------------------------------------------------------------------ the batch
     Mutant(
         "half of the demonstrations' share",
         AGENT,
@@ -351,17 +378,17 @@ MUTANTS = [
         f"{LEARNS} -k share",
     ),
     Mutant(
-        "without demonstrations nothing is paid",
+        "a prior that nothing was shown rewards",
         AGENT,
-        "return (1.0 if self.alpha_ext is None",
-        "return (0.0 if self.alpha_ext is None",
+        "0.0 if self.demonstrations is None else self.alpha_in",
+        "self.alpha_in",
         f"{LEARNS} -k without_demonstrations",
     ),
     Mutant(
         "acting remembers o_t itself",
         POLICIES,
-        "past = th.as_tensor(history, device=self.device)",
-        "past = th.cat([th.as_tensor(history[:, 1:], device=self.device), features[:, None]], dim=1)",
+        "memory = self.memory(th.as_tensor(history, device=self.device))",
+        "memory = self.memory(th.cat([th.as_tensor(history[:, 1:], device=self.device), features[:, None]], dim=1))",
         f"{LEARNS} -k memory",
     ),
     Mutant(
