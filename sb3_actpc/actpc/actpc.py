@@ -66,7 +66,8 @@ ACTOR_SLOWNESS = 4.0  # how much slower than the others the actor learns, after 
 SMALLEST_EXPLORATION = 0.2  # of ``exploration_noise``, where demonstrations hardly spread
 TARGET_NOISE_CLIP = 2.5  # standard deviations, as TD3's 0.5 for 0.2
 AVERAGING_RATE = 0.001  # per update, of the average of the actor that becomes the habit
-PRESSURE_FACTORS = {"accepted": 1.15, "tied": 1.0, "rejected": 0.85, "relapsed": 0.5}  # what a verdict does to the pressure
+PRESSURE_FACTORS = {"accepted": 1.15, "tied": 1.0, "rejected": 1.0, "relapsed": 0.5}  # what a verdict does to the pressure
+PATIENCE = 4000  # updates that a pressure is given before a relapse can end it
 SMALLEST_PRESSURE, LARGEST_PRESSURE = 0.2, 5.0  # times its first value
 
 
@@ -294,6 +295,7 @@ class ActPC(OffPolicyAlgorithm):
         self.instrumental_normalizer = make_normalizer(signal_normalizer)
         self.pretrained, self.n_pretraining_updates = False, 0
         self.trials: Trials | None = None
+        self.relapsed_at = 0  # number of the update
         self.noise_scale: np.ndarray | None = None  # (A,), of the exploration noise
         if _init_setup_model:
             self._setup_model()
@@ -590,12 +592,15 @@ class ActPC(OffPolicyAlgorithm):
             if not done:
                 continue
             verdict = self.trials.end(env)
-            if verdict is not None and self._n_updates > self.critic_warmup:
+            if verdict == "relapsed" and self._n_updates < max(self.critic_warmup, self.relapsed_at) + PATIENCE:
+                verdict = "rejected"  # there was too little time to learn
+            if verdict is not None:
                 bounds = SMALLEST_PRESSURE * self.actor_pressure, LARGEST_PRESSURE * self.actor_pressure
                 self.pressure = float(np.clip(self.pressure * PRESSURE_FACTORS[verdict], *bounds))
             if verdict == "accepted":
                 _copy(self.policy.candidate, self.actor.habit)
             if verdict == "relapsed":
+                self.relapsed_at = self._n_updates
                 _copy(self.actor.habit, self.actor.circuit, self.actor_target, self.policy.actor_average)
             if self.trials.needs_candidate():
                 _copy(self.policy.actor_average, self.policy.candidate)
@@ -851,6 +856,7 @@ class ActPC(OffPolicyAlgorithm):
             "diagnostics": dict(self.diagnostics.values),
             "trials": None if self.trials is None else self.trials.checkpoint_state(),
             "pressure": self.pressure,
+            "relapsed_at": self.relapsed_at,
             "noise_scale": self.noise_scale,
         }
 
@@ -876,6 +882,7 @@ class ActPC(OffPolicyAlgorithm):
         self.diagnostics.values = dict(state["diagnostics"])
         self.trials = None if state["trials"] is None else Trials(**state["trials"])
         self.pressure, self.noise_scale = state["pressure"], state["noise_scale"]
+        self.relapsed_at = state["relapsed_at"]
 
     @classmethod
     def load_checkpoint(cls: type[SelfActPC], path: str | PathLike[str], env: GymEnv | str, **keywords: Any) -> Restored:
