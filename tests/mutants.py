@@ -319,13 +319,8 @@ MUTANTS = [
     Mutant(
         "the noise on the target's action is not bounded",
         AGENT,
-<<<<<<< HEAD
         "* self.target_policy_noise).clamp(-bound, bound)",
         "* self.target_policy_noise)",
-=======
-        ".clamp(-bound, bound)",
-        "",
->>>>>>> 0390518 (Mutants of the habit and of the recipe)
         f"{LEARNS} -k smoothing",
     ),
     Mutant(
