@@ -17,7 +17,6 @@ import numpy as np
 import pandas as pd
 import torch as th
 from gymnasium.wrappers import TimeLimit
-from scipy.stats import spearmanr
 
 from sb3_actpc.checkpoints.encoding import Decoder, Encoder
 from sb3_actpc.checkpoints.simulators import capture_env, env_layers, restore_env
@@ -450,7 +449,7 @@ def _wins(first: pd.Series, second: pd.Series) -> np.ndarray:
 def _correlation(blocks: list[np.ndarray], column: int, rng: np.random.Generator) -> tuple[float, float]:
     """Spearman's rank correlation between column 0 and another of all blocks (one for each state) together, and its standard
     error over resampled states; NaN where one of the columns is constant."""
-
+    from scipy.stats import spearmanr
     def correlation(parts: list[np.ndarray]) -> float:
         pairs = np.concatenate(parts)[:, [0, column]]
         return float("nan") if len(pairs) < 3 or np.any(np.ptp(pairs, axis=0) == 0) else float(spearmanr(pairs).statistic)
