@@ -817,22 +817,23 @@ def test_hindsight_relabels_goals_and_rewards_of_drawn_transitions_but_neither_s
     assert th.equal(batch.rewards.squeeze(1), achieved.float() - 1.0)  # BitFlipping: 0 at the goal, else -1
 
 
-def test_the_memory_of_the_bootstrapped_step_is_the_one_that_the_same_step_has_as_a_first():
-    """Returns of three steps: m_{t+3} of row t is m_t of row t + 3, in the replay buffer and in the demonstrations."""
-    model = make(policy_kwargs=remembering(4), n_steps=3, demonstrations=demonstrations(), demonstration_fraction=0.5)
+@pytest.mark.parametrize("n_steps", [1, 3])
+def test_the_memory_of_the_bootstrapped_step_is_the_one_that_the_same_step_has_as_a_first(n_steps):
+    """m_{t+n} of row t is m_t of row t + n, in the replay buffer and in the demonstrations."""
+    data = demonstrations()
+    model = make(policy_kwargs=remembering(4), n_steps=n_steps, demonstrations=data, demonstration_fraction=0.5)
     model.learn(60)
-    rows = np.arange(40)
-    zeros = np.zeros(len(rows), int)
-    batch = model.replay_buffer._gather(rows, zeros, None)
-    memory = model.inputs.memory(batch.history, batch.history_mask)
-    next_memory = model.inputs.memory(batch.next_history, batch.next_history_mask)
-    goes_on = np.array([not model.replay_buffer.dones[row : row + 3].any() for row in rows[:-3]])
-    assert goes_on.any() and memory.abs().sum() > 0
-    assert th.allclose(next_memory[:-3][goes_on], memory[3:][goes_on], atol=1e-6)
+    buffer, rows = model.replay_buffer, np.arange(40)
+    samples = buffer._gather(rows, np.zeros(len(rows), int), None)
+    batch = model.inputs.replayed(samples, model.reward_weights, model.gamma)
+    goes_on = np.array([not buffer.dones[row : row + n_steps].any() for row in rows[:-n_steps]])
+    assert goes_on.any() and batch.memory.abs().sum() > 0
+    assert th.allclose(batch.next_memory[:-n_steps][goes_on], batch.memory[n_steps:][goes_on], atol=1e-6)
     rows = np.arange(len(model.expert))
-    shown = model.expert.batch(rows, model.inputs, model.reward_weights, model.gamma, 3)
-    goes_on = rows + 3 < model.expert.ends
-    assert goes_on.any() and th.allclose(shown.next_memory[goes_on], shown.memory[rows[goes_on] + 3], atol=1e-6)
+    shown = model.expert.batch(rows, model.inputs, model.reward_weights, model.gamma, n_steps)
+    goes_on = rows + n_steps < model.expert.ends
+    assert goes_on.any()
+    assert th.allclose(shown.next_memory[goes_on], shown.memory[rows[goes_on] + n_steps], atol=1e-6)
 
 
 def test_a_second_learn_cuts_the_episode_it_interrupts():
