@@ -102,7 +102,7 @@ def test_the_preset_has_the_papers_values(method: str, task: str, env_id: str) -
 # of the run, of the computation, or of nothing that the paper's preset turns on
 NOT_OF_THE_AGENT = set(
     "policy env device seed verbose tensorboard_log stats_window_size optimize_memory_usage replay_buffer_class "
-    "compile demonstrations n_demonstrations action_noise target_noise_clip".split()
+    "compile demonstrations n_demonstrations action_noise".split()
 )
 OF_THE_AGENT = {"settling"}  # among the circuits' keywords
 
