@@ -102,7 +102,7 @@ def test_the_unit_form_pays_one_more_than_the_penalty_for_every_transition(norma
     batches = []
     for form in ("penalty", "unit"):
         keywords = {"instrumental_form": form, "signal_normalization": normalization, "learning_starts": 1000}
-        model = make(demonstrations=demonstrations(), alpha_ep=0.0, **keywords)
+        model = make(demonstrations=demonstrations(), alpha_ep=0.0, alpha_ext=0.0, **keywords)
         model.learn(40)
         np.random.seed(1)
         batches.append(model._sample_batch(32))
@@ -115,7 +115,11 @@ def test_signals_normalised_when_sampled_follow_the_maximum_that_was_seen_last()
     models = {}
     for normalization in ("stored", "sampled"):
         models[normalization] = make(
-            demonstrations=demonstrations(), signal_normalization=normalization, learning_starts=1000, alpha_in=0.0
+            demonstrations=demonstrations(),
+            signal_normalization=normalization,
+            learning_starts=1000,
+            alpha_in=0.0,
+            alpha_ext=0.0,
         )
         models[normalization].learn(30)
     raw = models["sampled"].replay_buffer.epistemic[:30, 0]
