@@ -774,7 +774,7 @@ def test_a_path_of_demonstrations_is_saved_as_it_was_given(tmp_path, monkeypatch
 
 
 def test_learning_says_what_the_reward_is_made_of_and_how_far_pre_training_is(capsys):
-    model = make(demonstrations=demonstrations(), alpha_ep=0.5, actor_warm_start=1200, verbose=1)
+    model = make(demonstrations=demonstrations(), alpha_ep=0.5, alpha_ext=0.0, actor_warm_start=1200, verbose=1)
     began = time.time_ns()
     model.learn(20)
     printed = capsys.readouterr().out

@@ -19,7 +19,7 @@ ROOT = Path(__file__).resolve().parents[2]
 FEWER = {"learning_starts": 60, "batch_size": 8, "buffer_size": 500, "policy_kwargs": {"net_arch": [8]}}
 NOISE = {"noise_type": "normal", "noise_std": 0.1}
 PRESETS: dict[str, dict[str, Any]] = {
-    "actpc": {**FEWER, **NOISE, "settling": "scheduled", "prior_updates": 2, "learning_rate": "lin_1e-3", "n_timesteps": 120},
+    "actpc": {**FEWER, **NOISE, "actor_warm_start": 2, "critic_warmup": 5, "learning_rate": "lin_1e-3", "n_timesteps": 120},
     "her": {**FEWER, "policy": "MultiInputPolicy", "n_timesteps": 110},
     "logo": {"n_steps": 64, "batch_size": 32, "n_timesteps": 64, "discriminator_net_arch": [8]},
 }
