@@ -666,7 +666,7 @@ class ActPC(OffPolicyAlgorithm):
         n_actor, n_critic, n_generator = self._batch_sizes(batch_size)
         for _ in range(gradient_steps):
             self._n_updates += 1
-            self.diagnostics.begin_update(self._n_updates, self.num_timesteps)
+            self.diagnostics.begin_update(self._n_updates, self.num_timesteps, self.policy_delay)
             self._rescore_demonstrations()
             batch = self._sample_batch(batch_size)  # line 17
             due = self._n_updates % self.policy_delay == 0

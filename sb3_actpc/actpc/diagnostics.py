@@ -22,13 +22,16 @@ class Diagnostics:
         self.active = False
         self.values: dict[str, float] = {}
 
-    def begin_update(self, n_updates: int, step: int) -> None:
+    def begin_update(self, n_updates: int, step: int, first: int = 1) -> None:
         """
         Decide whether this update is measured, and if so check all synapses.
 
+        :param n_updates: number of the update, from 1 on
+        :param step: environment step to name
+        :param first: the first update that is measured, one of all circuits
         :raises ValueError: naming the circuit and the step when a synapse is not finite
         """
-        self.active = n_updates % INTERVAL == 1
+        self.active = n_updates % INTERVAL == first
         if not self.active:
             return
         for name, circuit in self.circuits.items():
