@@ -434,7 +434,7 @@ def _restore_noise(model: BaseAlgorithm, node: Any, decoder: Decoder) -> None:
     if noise is None:
         raise ValueError(f"the checkpoint's agent has the action noise {node['object']}, this one none: pass action_noise=")
     if node["object"] == VectorizedActionNoise.__name__ and not isinstance(noise, VectorizedActionNoise):
-        noise = model.action_noise = VectorizedActionNoise(noise, model.n_envs)  # type: ignore[attr-defined]
+        noise = model.action_noise = VectorizedActionNoise(noise, model.n_envs)
     decoder.decode(node, noise)
 
 

@@ -109,8 +109,8 @@ def _run(args: argparse.Namespace) -> Run:
     from sb3_actpc.experiments.runs import Run
     from sb3_actpc.experiments.runs.presets import parse_assignments
 
-    names = ("env", "algo", "preset", "steps", "seed", "demonstrations", "eval_freq", "eval_episodes", "checkpoint_freq")
-    names += ("output", "device", "n_envs", "threads", "gym_packages")
+    names = ["env", "algo", "preset", "steps", "seed", "demonstrations", "eval_freq", "eval_episodes", "checkpoint_freq"]
+    names += ["output", "device", "n_envs", "threads", "gym_packages"]
     given = {name: getattr(args, name) for name in names if getattr(args, name) is not None}
     settings, env_kwargs = parse_assignments(args.set), parse_assignments(args.env_kwarg)
     return Run(**given, settings=settings, env_kwargs=env_kwargs, progress=not args.no_progress)

@@ -55,7 +55,7 @@ def read_comparison(given: Mapping[str, Any]) -> Comparison:
     _check_names([task.env for task in tasks])
     _check_names([str(variant.name) for variant in variants])
     rest = {key: own[key] for key in ("seeds", "output") if key in own}
-    return Comparison(tasks=tasks, variants=variants, shared=shared, **rest)
+    return Comparison(tasks=tuple(tasks), variants=tuple(variants), shared=shared, **rest)
 
 
 def read_comparison_file(path: Path) -> dict[str, Any]:

@@ -147,7 +147,7 @@ class Run(Schema):
     env: str = ""
     algo: Annotated[str, AfterValidator(_algorithm)] = "actpc"
     preset: str | None = None
-    n_timesteps: Count | None = Field(None, validation_alias=AliasChoices("n_timesteps", "steps"))
+    n_timesteps: Count | None = Field(default=None, validation_alias=AliasChoices("n_timesteps", "steps"))
     seed: Annotated[int, BeforeValidator(_number), Field(ge=0, le=MAX_SEED)] = 0
     demonstrations: str = "shipped"
     settings: Keywords = Field(default_factory=dict)
