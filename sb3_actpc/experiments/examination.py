@@ -144,11 +144,11 @@ def examine_run(folder: Path, **options: Any) -> Examination:
     from sb3_actpc.experiments.runs.environments import make_env
     from sb3_actpc.experiments.runs.run import load_run
 
-    record, model = load_run(folder)
+    run, model = load_run(folder)
     if not isinstance(model, ActPC):
         raise ValueError(f"{folder} is not a run of ActPC without VecNormalize: only such an agent's critic can be examined")
-    model.set_env(make_env(record["env"], record["env_kwargs"]))
-    examination = examine(model, record["env"], env_kwargs=record["env_kwargs"], **options)
+    model.set_env(make_env(run.env, run.env_kwargs))
+    examination = examine(model, run.env, env_kwargs=run.env_kwargs, **options)
     with atomic_write(folder / FILE, "w") as file:
         examination.table.to_csv(file, index=False)
     return examination

@@ -67,7 +67,7 @@ def test_several_environments_keep_combined_replay_and_self_imitation() -> None:
         infos: list[dict[str, Any]] = [{}, {}]
         buffer.add(observations, observations, np.full((2, 7), 0.1 * step), np.array(rewards), dones, infos)
     assert list(buffer.self_imitation.returns) == [1.0, 1.0]
-    assert [len(episode) for episode in buffer.self_imitation._episodes] == [2, 4]
+    assert list(buffer.self_imitation.lengths) == [2, 4]
 
 
 def test_several_mujoco_environments_stay_in_this_process() -> None:
