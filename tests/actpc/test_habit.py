@@ -11,7 +11,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_actpc import ActPC
 from sb3_actpc.actpc import habit as habit_module
-from sb3_actpc.actpc.actpc import AVERAGING_RATE, LARGEST_PRESSURE, SMALLEST_PRESSURE
+from sb3_actpc.actpc.actpc import AVERAGING_RATE, LARGEST_PRESSURE, PATIENCE, SMALLEST_PRESSURE
 from sb3_actpc.actpc.habit import ENOUGH_PROOFS, KEPT_RETURNS, PROOF_STEPS, Trials
 from tests.actpc.agents import QUICK, differ, make, weights_of
 from tests.actpc.envs import CountingEnv, demonstrations
@@ -263,38 +263,62 @@ def test_predict_is_the_warm_started_clone_until_a_candidate_is_accepted_and_the
     assert model.pressure > pressure
 
 
-@pytest.mark.parametrize(("paid", "is_undone"), [([1.0, 0.0, 1.0], False), ([0.1], False), ([0.1, 0.0, 1.0, 0.0, 0.1], True)])
-def test_a_relapse_puts_the_learning_actor_back_to_the_habit(paid, is_undone):
+def have_learned(model, n_updates):
+    """So many updates since pressure began, or since the last relapse."""
+    model._n_updates = max(model.critic_warmup, model.relapsed_at) + n_updates
+
+
+TWO_COLLAPSES = [0.0, 1.0, 0.0, 0.1] * 2  # noise, the habit, noise, a candidate that is paid next to nothing, and once more
+
+
+@pytest.mark.parametrize(
+    ("n_updates", "paid", "is_undone"),
+    [
+        (PATIENCE, [0.0, 1.0, 0.0, 1.0, 0.0, 1.0], False),  # a tie
+        (PATIENCE, TWO_COLLAPSES[:4], False),
+        (PATIENCE - 1, TWO_COLLAPSES, False),
+        (PATIENCE, TWO_COLLAPSES, True),
+    ],
+)
+def test_a_relapse_puts_the_actor_back_to_the_habit_once_it_had_time_to_learn(n_updates, paid, is_undone):
     model = imitating()
     model.pretrain()
+    have_learned(model, n_updates)
     habit = weights_of(model.actor.habit)
     learning = model.actor.circuit, model.actor_target, model.policy.actor_average
     for circuit in learning:
         disturb(circuit)
-    prove(model, 0.0, 1.0, 0.0, *paid)
+    prove(model, *paid)
     assert model.trials.generation >= 1
     assert [differ(habit, weights_of(circuit)) for circuit in learning] == [not is_undone] * 3
     assert not differ(habit, weights_of(model.actor.habit))
+    assert (model.pressure < 1.0) == is_undone
 
 
-def test_the_pressure_grows_with_proofs_and_shrinks_with_failures_between_two_bounds():
+def test_the_time_to_learn_begins_anew_with_a_relapse():
+    model = imitating()
+    have_learned(model, PATIENCE)
+    prove(model, *TWO_COLLAPSES)
+    once = model.pressure
+    assert once < 1.0
+    have_learned(model, PATIENCE - 1)
+    prove(model, *TWO_COLLAPSES)
+    assert model.pressure == once
+    have_learned(model, PATIENCE)
+    prove(model, *TWO_COLLAPSES)
+    assert model.pressure < once
+
+
+def test_the_pressure_stays_between_two_bounds():
     model = imitating(actor_pressure=2.0)
-    prove(model, 0.0, 1.0, 0.0, 0.1)
-    assert model.trials.generation == 1 and model.pressure == 2.0  # there was none yet
-    model._n_updates = model.critic_warmup + 1
-    prove(model, 0.0, 1.0, 0.0, 1.0, 0.0, 1.0)
-    assert model.trials.generation == 2 and model.pressure == 2.0  # a tie says nothing
-    shrunk = []
     for _ in range(30):
-        prove(model, 0.0, 1.0, 0.0, 0.1)
-        shrunk.append(model.pressure)
-    steps = -np.diff([2.0, *shrunk[:3]]) / [2.0, *shrunk[:2]]
-    assert (steps[:2] > 0.0).all() and steps[1] > steps[0]  # a rejection, then a relapse
-    assert shrunk[-1] == pytest.approx(SMALLEST_PRESSURE * 2.0)
-    prove(model, 0.0, 1.0)  # the habit again
+        have_learned(model, PATIENCE)
+        prove(model, *TWO_COLLAPSES)
+    assert model.pressure == pytest.approx(SMALLEST_PRESSURE * 2.0)
+    prove(model, 0.0, 1.0)
     for paid in range(1, 30):
         prove(model, *[0.0, 10.0 * 2.0**paid] * 2)
-    assert model.trials.generation == 61 and model.pressure == pytest.approx(LARGEST_PRESSURE * 2.0)
+    assert model.trials.generation == 89 and model.pressure == pytest.approx(LARGEST_PRESSURE * 2.0)
 
 
 class Roles(BaseCallback):
