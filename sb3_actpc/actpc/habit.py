@@ -2,8 +2,9 @@
 
 The circuit that learns is pressed by a critic that can be wrong, so it does not act for others at once. A *candidate*, the
 slow average of the learning actor, is frozen and plays every second episode without exploration noise. When it is paid more
-than the habit, it becomes the habit; when two in a row are paid next to nothing of that, the learning actor starts again from
-the habit. The warm-started clone is the first habit: what the agent does is imitation until something better is proven.
+than the habit, it becomes the habit; when two, with none that held its own between them, are paid next to nothing of that,
+the learning actor starts again from the habit. The warm-started clone is the first habit: what the agent does is imitation
+until something better is proven.
 """
 
 from dataclasses import asdict, dataclass, field
@@ -41,7 +42,7 @@ class Trials:
     habit_returns: list[float] = field(default_factory=list)
     candidate_returns: list[float] = field(default_factory=list)
     candidate_steps: int = 0
-    collapses: int = 0  # candidates in a row that lost ``RELAPSED_LOSS``
+    collapses: int = 0  # candidates that lost ``RELAPSED_LOSS`` since one held its own
     tests_habit: bool = True  # the next quiet episode is the habit's: its return must be known, or known better
 
     def __post_init__(self) -> None:
