@@ -57,7 +57,6 @@ def test_the_runs_of_a_node_that_dies_are_done_elsewhere(tmp_path: Path) -> None
             assert log_rows(run.folder / name) == log_rows(other.folder / name) != []
 
 
-@pytest.mark.slow
 def test_a_cluster_of_its_own_is_started_and_stops_when_told(tmp_path: Path) -> None:
     """A run that is stopped has saved where it was, and goes on there."""
     [run] = small_runs(tmp_path / "out", pause=0.1)
@@ -66,7 +65,7 @@ def test_a_cluster_of_its_own_is_started_and_stops_when_told(tmp_path: Path) -> 
     try:
         assert engine.capacity() == 1
         engine.start(run)
-        deadline = time.monotonic() + 120
+        deadline = time.monotonic() + 600
         is_told = False
         while not outcomes and time.monotonic() < deadline:
             for event in engine.poll(0.5):
