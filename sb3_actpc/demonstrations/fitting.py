@@ -44,11 +44,11 @@ def resolve(
 def findable(source: str | os.PathLike[str] | Demonstrations) -> str | Path | Demonstrations:
     """
     :param source: as :func:`resolve`'s
-    :return: the same, a path made absolute, so that a saved agent finds its demonstrations from any folder
+    :return: the same, a path made absolute, so that a saved agent finds its demonstrations from any folder; what is no
+        source at all as it is, for :func:`resolve` to name
     """
-    if isinstance(source, Demonstrations) or (isinstance(source, str) and _is_minari_id(source)):
-        return source
-    return Path(source).absolute()
+    is_path = isinstance(source, os.PathLike) or (isinstance(source, str) and not _is_minari_id(source))
+    return Path(source).absolute() if is_path else source  # type: ignore[arg-type,return-value]
 
 
 def _is_minari_id(source: str) -> bool:
