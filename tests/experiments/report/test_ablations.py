@@ -23,8 +23,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def run_variants(folder: Path, *variants: Run) -> Results:
     """Of each a run of 56 steps: seven episodes, the first of them random, and an update after each later step."""
     # every update reaches the actor that acts
-    at_once = {"actor_warm_start": 5, "critic_warmup": 0, "policy_delay": 1, "policy_kwargs": {"net_arch": [8], "habit": False}}
-    write_preset(folder / "small.yml", demonstration_fraction=0.25, n_timesteps=56, **at_once)
+    at_once = {"actor_warm_start": 5, "critic_warmup": 0, "policy_delay": 1}
+    policy = {"net_arch": [8], "habit": False}
+    write_preset(folder / "small.yml", demonstration_fraction=0.25, n_timesteps=56, policy_kwargs=policy, **at_once)
     write_demonstrations(folder / "demonstrations.npz")
     entries = [{"base": variant.name, "preset": str(folder / "small.yml")} for variant in variants]
     task = {"env": TASK, "demonstrations": str(folder / "demonstrations.npz")}
