@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import torch as th
 
 N_MIRRORED = 100  # noise vectors per source neuron; the cosine with W^T is (1 + 1 / N_MIRRORED)^-1/2
+LARGEST_MIRRORING = 10**10  # products of numbers, in mirroring one layer
 SYNAPTIC_SCALINGS = ("none", "soft_bound", "column_norm")
 
 
@@ -67,13 +68,18 @@ def mirrored(weights: th.Tensor) -> th.Tensor:
     """
     Error synapses from the answers of ``weights`` to noise: the mean of (W ξ) ξ^T, whose expectation is W.
 
+    Of ``N_MIRRORED`` noises for every source neuron; very large layers, whose products would take minutes, hear fewer and start
+    less aligned.
+
     :param weights: W, (n_out, n_in)
     :return: E^T, (n_out, n_in)
     """
-    feedback, n_sources = th.zeros_like(weights), weights.shape[1]
-    for _ in range(N_MIRRORED):
-        noise = th.randn(n_sources, n_sources, dtype=weights.dtype, device=weights.device)
-        feedback.addmm_((noise @ weights.t()).t(), noise, alpha=1.0 / (N_MIRRORED * n_sources))
+    feedback, (n_out, n_in) = th.zeros_like(weights), weights.shape
+    affordable = max(1, LARGEST_MIRRORING // (n_out * n_in))  # noises
+    n_noises = min(N_MIRRORED * n_in, affordable)
+    for start in range(0, n_noises, n_in):
+        noise = th.randn(min(n_in, n_noises - start), n_in, dtype=weights.dtype, device=weights.device)
+        feedback.addmm_((noise @ weights.t()).t(), noise, alpha=1.0 / n_noises)
     return feedback
 
 

@@ -3,7 +3,8 @@
 import pytest
 import torch as th
 
-from sb3_actpc.ngc import NGCCircuit
+from sb3_actpc.ngc import NGCCircuit, plasticity
+from sb3_actpc.ngc.plasticity import mirrored
 from tests.ngc import oracle
 
 
@@ -181,3 +182,17 @@ def test_working_memory_changes_its_own_synapses_and_the_output():
     assert not th.allclose(circuit.project(x, memory), circuit.project(x, 2 * memory))
     circuit.memory_weight = 0.0
     assert th.equal(circuit.project(x, memory), circuit.project(x, 2 * memory))
+
+
+def test_mirroring_a_very_large_layer_ends_soon_and_still_points_the_right_way(monkeypatch):
+    weights = th.randn(60, 50)
+    every = mirrored(weights)
+    monkeypatch.setattr(plasticity, "LARGEST_MIRRORING", 60 * 50 * 120)  # 120 noises instead of 100 for every source
+    th.manual_seed(0)
+    drawn: list[int] = []
+    randn = th.randn
+    monkeypatch.setattr(th, "randn", lambda rows, *rest, **more: drawn.append(rows) or randn(rows, *rest, **more))
+    some = mirrored(weights)
+    assert sum(drawn) == 120
+    cosines = [float(th.nn.functional.cosine_similarity(e.flatten(), weights.flatten(), 0)) for e in (every, some)]
+    assert cosines[0] > 0.98 > cosines[1] > 0.6  # 1 / sqrt(1 + 50 / 120) = 0.84
