@@ -129,7 +129,7 @@ def _sweep_repeatedly(actor: NGCCircuit, critic: NGCCircuit, motor: SettlingChai
 
 
 def _coupled_rates(circuit: NGCCircuit) -> list[float]:
-    """The circuit's own rates; with the default dynamics, where the pair has no loop to keep stable, a larger one."""
+    """The circuit's own rates; with "error" dynamics, where the pair has no loop to keep stable, a larger one."""
     if circuit.dynamics == "error" and circuit.settling_rate == "auto":
         return [COUPLED_RATE] * circuit.n_hidden
     return circuit.rates.tolist()[: circuit.n_hidden]

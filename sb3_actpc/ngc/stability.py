@@ -6,7 +6,7 @@ from functools import lru_cache
 import torch as th
 
 MAX_AUTO_RATE = 0.3  # activations with kinks chatter at larger rates (batch-mean energy rises by 0.1 %)
-SAFETY = 0.05  # share of the stability limit that "auto" uses: how deep K = 10 settles; see README, "Settling depth"
+SAFETY = 0.05  # share of the stability limit that "auto" uses: how deep K = 10 settles; see docs/paper.md, difference 10
 
 
 def power_iteration_(matrix: th.Tensor, vector: th.Tensor, n_iterations: int = 1) -> th.Tensor:
@@ -72,7 +72,7 @@ def settling_rates(dynamics: str, forward_norms: list[float], feedback_norms: li
     The rates β that ``settling_rate="auto"`` uses, one per hidden layer (first to last).
 
     ``dynamics="state"``: 1 / (1 + ||W|| ||E||) of the weights below the layer, the local curvature of the energy.
-    ``dynamics="error"``: one rate, half of :func:`error_dynamics_limit`. Both at most ``MAX_AUTO_RATE``.
+    ``dynamics="error"``: one rate, the share ``SAFETY`` of :func:`error_dynamics_limit`. Both at most ``MAX_AUTO_RATE``.
     """
     if dynamics == "state":
         return [min(MAX_AUTO_RATE, 1.0 / (1.0 + w * e)) for w, e in zip(forward_norms, feedback_norms, strict=True)]
