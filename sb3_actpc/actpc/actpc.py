@@ -39,7 +39,7 @@ from sb3_actpc.actpc.arguments import (
     check_train_freq,
     checked,
 )
-from sb3_actpc.actpc.buffers import SignalReplay, combined_buffer_class
+from sb3_actpc.actpc.buffers import CombinedHerReplayBuffer, SignalReplay, combined_buffer_class
 from sb3_actpc.actpc.compiled import CompiledUpdate, compiled_update
 from sb3_actpc.actpc.demonstration_replay import DemonstrationReplay
 from sb3_actpc.actpc.diagnostics import Diagnostics
@@ -59,6 +59,7 @@ SelfActPC = TypeVar("SelfActPC", bound="ActPC")
 # of the mean absolute action-value that ``scale_pressure`` divides by: one paid step. Where nothing was paid yet, the critic's
 # noise must not be blown up to full strength
 SMALLEST_VALUE_SCALE = 1.0
+NEED_DEMONSTRATIONS = ("demonstration_fraction", "actor_warm_start", "n_demonstrations", "n_demonstration_transitions")
 EXPERT_SIGNALS_INTERVAL = 1000  # updates between two evaluations of the demonstrations' signals
 PRETRAINING_INTERVAL = 1000  # updates between two lines about pre-training
 WARM_START_RATES, WARM_START_BATCH = (1e-3, 5e-5), 256  # a precise clone: what follows can only be as good as its habit
@@ -86,7 +87,7 @@ class ActPC(OffPolicyAlgorithm):
     ====================================== ============== =======
     ``learning_starts``                    0              100
     ``tau``                                0.02           0.005
-    ``n_steps`` (1 with hindsight)         5              1
+    ``n_steps``                            5              1
     ``actor_warm_start``                   7500           0
     ``critic_warmup``                      3000           0
     ``demonstration_fraction``             0.5            0
@@ -113,7 +114,7 @@ class ActPC(OffPolicyAlgorithm):
         every batch) and ``self_imitation_size`` (100,000 transitions in the memory of the agent's own best episodes; 0 for
         none), and those of SB3's class
     :param optimize_memory_usage: as in SB3
-    :param n_steps: length of n-step returns
+    :param n_steps: length of n-step returns; 1 by default where they cannot be had (hindsight, ``optimize_memory_usage``)
     :param settling: "scheduled" (one ordered sweep of the errors, the zero-divergence schedule or Z-IL of the
         predictive-coding literature) or "iterative" (the paper: K steps of eq. 1)
     :param exploration_noise: standard deviation of the Gaussian noise on the actions in [-1, 1]; with demonstrations at most
@@ -140,7 +141,7 @@ class ActPC(OffPolicyAlgorithm):
     :param instrumental_form: what the prior's normalised errors r pay: "penalty", -r (the paper's equation), or "unit", 1 - r
     :param signal_errors: the signals sum the squared errors of "all" layers (the paper) or of the "output" alone
     :param actor_pressure: weight of the critic's pressure on the actor, at first: with a habit it grows with every proof and
-        shrinks with every failure (``pressure`` is the present one). 0 leaves refresh alone (cloning)
+        halves with every relapse (``pressure`` is the present one). 0 leaves refresh alone (cloning)
     :param scale_pressure: divide the pressure by the batch's mean absolute action-value (at least 1: one paid step)
     :param nudge: scale of the critic's clamped error while actor and critic settle as one (the paper's is 1); None for an
         infinitesimal one, or 1 with ``dynamics="state"``
@@ -375,8 +376,7 @@ class ActPC(OffPolicyAlgorithm):
         self.expert: DemonstrationReplay | None = None
         self._followed = self.demonstrations, self.n_demonstrations, self.n_demonstration_transitions
         if self.demonstrations is None:
-            names = "demonstration_fraction actor_warm_start n_demonstrations n_demonstration_transitions".split()
-            idle = [name for name in names if getattr(self, name)]
+            idle = [name for name in NEED_DEMONSTRATIONS if getattr(self, name)]
             idle += ["observation_normalization"] if self.observation_normalization == "demonstrations" else []
             if idle:
                 raise ValueError(f"{' and '.join(idle)} need demonstrations=; pass a file or leave them out")
@@ -415,7 +415,10 @@ class ActPC(OffPolicyAlgorithm):
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         super().set_env(env, force_reset)
-        if self.demonstrations is not None:  # another environment may pay for other steps
+        # another environment may pay for other steps
+        if self.trials is not None:
+            self.trials = Trials(self.n_envs)
+        if self.demonstrations is not None:
             self._setup_demonstrations()
 
     @property
@@ -511,9 +514,10 @@ class ActPC(OffPolicyAlgorithm):
     def _warm_up_actor(self, progress: float) -> None:
         """One update on imitated actions; ``progress`` is the share of the warm start that is done."""
         first, last = WARM_START_RATES
-        for group in self.actor.circuit.optimizer.param_groups:
-            group["lr"] = first * (last / first) ** progress
-        self.actor.circuit.apply_changes(self._refresh_changes(WARM_START_BATCH))
+        circuit, rate = self.actor.circuit, first * (last / first) ** progress
+        for group, own in zip(circuit.optimizer.param_groups, circuit.parameter_groups(rate), strict=True):
+            group["lr"] = own["lr"]
+        circuit.apply_changes(self._refresh_changes(WARM_START_BATCH))
 
     def _update_prior(self, batch_size: int) -> None:
         assert self.expert is not None
@@ -581,7 +585,9 @@ class ActPC(OffPolicyAlgorithm):
         scored: Any = SimpleNamespace(add=partial(replay_buffer.add, score=score))  # SB3 calls ``add`` and nothing else
         super()._store_transition(scored, buffer_action, new_obs, reward, dones, infos)
         self._rollout_starts = np.array(dones, dtype=bool)
-        self._prove(reward, dones)
+        # a running normaliser pays the same episode differently from day to day
+        paid = reward if self._vec_normalize_env is None else self._vec_normalize_env.get_original_reward()
+        self._prove(paid, dones)
 
     def _prove(self, rewards: np.ndarray, dones: np.ndarray) -> None:
         """The habit follows from what whole episodes were paid: see :mod:`sb3_actpc.actpc.habit`."""
@@ -656,11 +662,13 @@ class ActPC(OffPolicyAlgorithm):
 
     def train(self, gradient_steps: int, batch_size: int = 256) -> None:
         """
-        The updates of Algorithm 1 (lines 17 to 26), ``gradient_steps`` times.
+        The updates of Algorithm 1 (lines 17 to 26), ``gradient_steps`` times; with hindsight from the first ended episode on.
 
         :param gradient_steps: how many updates of every circuit
         :param batch_size: B, of the circuits without one of their own
         """
+        if isinstance(self.replay_buffer, CombinedHerReplayBuffer) and not self.replay_buffer.has_episodes:
+            return
         self.policy.set_training_mode(True)
         self._update_learning_rate([circuit.optimizer for _, circuit in self.policy.named_circuits()])
         n_actor, n_critic, n_generator = self._batch_sizes(batch_size)
@@ -680,6 +688,8 @@ class ActPC(OffPolicyAlgorithm):
                 self._update_generator(parts[2])  # line 24
             if self.target_update_interval == 1:
                 self._update_targets(self.tau)
+            if self.policy.actor_average is not None:
+                _follow(self.policy.actor_average, self.actor.circuit, AVERAGING_RATE)
         self._log_training()
 
     def _batch_sizes(self, batch_size: int) -> tuple[int, int, int]:
@@ -783,8 +793,6 @@ class ActPC(OffPolicyAlgorithm):
         """Move the target circuits by ``tau`` (1 copies)."""
         for target, circuit in zip([self.actor_target, *self.critic_target], [self.actor.circuit, *self.critic], strict=True):
             _follow(target, circuit, tau)
-        if self.policy.actor_average is not None:
-            _follow(self.policy.actor_average, self.actor.circuit, AVERAGING_RATE)
 
     def _on_step(self) -> None:
         """Moves the targets where that goes by environment steps."""
@@ -914,8 +922,8 @@ class ActPC(OffPolicyAlgorithm):
         :param keywords: constructor keywords that replace the stored ones; ``demonstrations`` are not in the file
         """
         with_demonstrations = keywords.get("demonstrations") is not None
-        needing = () if with_demonstrations else ("observation_normalization", "demonstration_fraction", "actor_warm_start")
-        model = load_weights(cls, path, env, without=needing, **keywords)
+        needing = (*NEED_DEMONSTRATIONS, "observation_normalization")
+        model = load_weights(cls, path, env, without=() if with_demonstrations else needing, **keywords)
         model.pretrained = True  # the weights hold what the demonstrations taught
         return model
 

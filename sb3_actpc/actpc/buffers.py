@@ -332,6 +332,11 @@ class CombinedHerReplayBuffer(SignalReplay, HerReplayBuffer):  # type: ignore[mi
     The newest transitions are real ones; of the rest SB3's ``her_ratio`` is relabelled.
     """
 
+    @property
+    def has_episodes(self) -> bool:
+        """Whether an episode has ended, so that there is hindsight."""
+        return bool(self.ep_length.any())
+
     def _draw(self, n: int) -> tuple[np.ndarray, np.ndarray]:
         valid = np.flatnonzero(self.ep_length > 0)
         if not len(valid):

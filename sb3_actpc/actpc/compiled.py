@@ -12,9 +12,8 @@ from sb3_actpc.ngc import HebbianChanges, settle_coupled
 if TYPE_CHECKING:
     from sb3_actpc.actpc.actpc import ActPC
 
-ENOUGH_UPDATES = (
-    200_000  # compiling takes one to three minutes on a CPU, and saves a quarter of an update's products and calls
-)
+# compiling takes one to three minutes on a CPU, and saves a quarter of an update's products and calls
+ENOUGH_UPDATES = 200_000
 
 
 class _Given(NamedTuple):

@@ -7,7 +7,7 @@ import torch as th
 from sb3_actpc.actpc.policies import ActPCPolicy
 from sb3_actpc.ngc import CoupledState, HebbianChanges, NGCCircuit, SettledState, policy_gradient
 
-INTERVAL = 100  # updates between two measurements
+INTERVAL = 100  # updates between two measurements, or the next multiple of the actor's delay
 
 
 class Diagnostics:
@@ -22,16 +22,17 @@ class Diagnostics:
         self.active = False
         self.values: dict[str, float] = {}
 
-    def begin_update(self, n_updates: int, step: int, first: int = 1) -> None:
+    def begin_update(self, n_updates: int, step: int, delay: int = 1) -> None:
         """
         Decide whether this update is measured, and if so check all synapses.
 
         :param n_updates: number of the update, from 1 on
         :param step: environment step to name
-        :param first: the first update that is measured, one of all circuits
+        :param delay: updates for each of the actor, which takes part in every one that is measured
         :raises ValueError: naming the circuit and the step when a synapse is not finite
         """
-        self.active = n_updates % INTERVAL == first
+        interval = delay * -(-INTERVAL // delay)
+        self.active = n_updates % interval == delay % interval
         if not self.active:
             return
         for name, circuit in self.circuits.items():

@@ -28,7 +28,8 @@ class Trials:
     Who plays which episode, and what follows from its return. Holds no circuits: the agent copies them as it is told.
 
     Episodes alternate: with exploration noise by the learning actor, without by the habit or a candidate. Losses are shares
-    of the absolute mean return of the habit. A tie changes nothing: where nothing more is paid, imitation stays.
+    of the absolute mean return of the habit. A tie changes nothing: where nothing more is paid, imitation stays. A habit that
+    was paid nothing at all has nothing to lose: any candidate not below 0 is accepted.
 
     :param n_envs: environments, each with an episode of its own
     """
@@ -62,7 +63,8 @@ class Trials:
 
     def needs_candidate(self) -> bool:
         """Whether the next quiet episode is the first of a new candidate, which is then taken from the learning actor."""
-        return not self.tests_habit and not self.candidate_returns and "candidate" not in self.roles
+        present = zip(self.roles, self.generations, strict=True)  # one that was judged meanwhile may still be playing
+        return not self.tests_habit and not self.candidate_returns and ("candidate", self.generation) not in present
 
     def step(self, env: int, reward: float) -> None:
         """:param env: which environment
@@ -107,7 +109,7 @@ class Trials:
             self.collapses += mean + error < habit - RELAPSED_LOSS * abs(habit)
         elif n < N_PROOFS:
             return None
-        elif habit <= 0.0 <= mean or mean >= habit + PROVEN_GAIN * abs(habit):
+        elif mean >= habit + PROVEN_GAIN * abs(habit):
             verdict, self.habit_returns = "accepted", own[-KEPT_RETURNS:]
         if self.collapses == 2:
             verdict = "relapsed"

@@ -8,7 +8,6 @@ import torch as th
 from sb3_actpc.ngc import SettledState
 
 NORMALIZERS = ("max", "saturating", "quantile")
-SIGNAL_ERRORS = ("all", "output")
 Normalize = Callable[[np.ndarray], np.ndarray]  # element by element, in any shape
 STORED: tuple[Normalize, Normalize] = (np.asarray, np.asarray)  # both signals pay what was stored
 

@@ -18,6 +18,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_actpc import ActPC
+from sb3_actpc.actpc.diagnostics import Diagnostics
 from sb3_actpc.ngc import NGCCircuit, settle_coupled
 from tests.actpc.agents import differ, make, plain, weights_of
 from tests.actpc.envs import CountingEnv, demonstrations
@@ -819,6 +820,25 @@ def test_hindsight_relabels_goals_and_rewards_of_drawn_transitions_but_neither_s
     assert th.equal(batch.epistemic, raw.epistemic) and th.equal(batch.actions, raw.actions)
     achieved = (batch.next_observations["achieved_goal"] == batch.next_observations["desired_goal"]).all(dim=1)
     assert th.equal(batch.rewards.squeeze(1), achieved.float() - 1.0)  # BitFlipping: 0 at the goal, else -1
+
+
+def test_hindsight_learns_from_the_first_episode_that_has_ended():
+    env = BitFlippingEnv(n_bits=6, continuous=True, max_steps=6)
+    model = ActPC("MultiInputPolicy", env, **plain(replay_buffer_class=HerReplayBuffer, learning_starts=0, seed=1))
+    model.learn(5)
+    assert model._n_updates == 0
+    model.learn(15, reset_num_timesteps=False)
+    assert 0 < model._n_updates <= 15
+
+
+@pytest.mark.parametrize("delay", [1, 2, 3, 100, 250])
+def test_what_is_measured_is_an_update_of_the_actor_once_in_a_hundred_or_a_few_more(delay):
+    measured, diagnostics = [], Diagnostics(make().policy)
+    for update in range(1, 2001):
+        diagnostics.begin_update(update, 0, delay)
+        measured += [update] if diagnostics.active else []
+    assert measured[0] == delay and all(update % delay == 0 for update in measured)
+    assert set(np.diff(measured)) == {100 if delay in (1, 2, 100) else 102 if delay == 3 else 250}
 
 
 @pytest.mark.parametrize("n_steps", [1, 3])

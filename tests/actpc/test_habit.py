@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.vec_env import DummyVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 
 from sb3_actpc import ActPC
 from sb3_actpc.actpc import habit as habit_module
@@ -181,6 +181,20 @@ def test_an_episode_of_a_candidate_that_was_judged_meanwhile_does_not_count():
     assert trials.candidate_returns == [] and trials.candidate_steps == 0 and trials.habit_return == 100.0
 
 
+def test_a_candidate_that_still_plays_when_it_is_judged_does_not_keep_the_next_one_away():
+    """The next quiet episode of the other environment must not be played by what was just rejected."""
+    trials = Trials(2)
+    for role in ("actor", "habit", "actor"):
+        assert [play(trials, 100.0, env=env)[0] for env in (0, 1)] == [role, role]
+    assert play(trials, 0.0, env=0) == ("candidate", "rejected")
+    play(trials, 0.0, env=0)
+    assert play(trials, 100.0, env=0) == ("habit", None)
+    trials.end(0)
+    assert trials.roles == ["actor", "candidate"] and trials.needs_candidate()
+    trials.begin(0)
+    assert trials.roles == ["candidate", "candidate"] and not trials.needs_candidate()
+
+
 def test_a_reset_of_the_environments_forgets_running_episodes_and_nothing_else():
     trials = Trials(2)
     play_quiet(trials, 100.0)
@@ -217,7 +231,7 @@ class Unpaid(CountingEnv):
 
 def imitating(env=CountingEnv, policy_kwargs=None, **keywords):
     """The constructor's defaults but for sizes: with demonstrations there is a habit."""
-    env = env if isinstance(env, DummyVecEnv) else DummyVecEnv([env])
+    env = env if isinstance(env, VecEnv) else DummyVecEnv([env])
     policy_kwargs = {"net_arch": [16, 16], **(policy_kwargs or {})}
     return ActPC("MlpPolicy", env, demonstrations=demonstrations(), **{**QUICK, **keywords, "policy_kwargs": policy_kwargs})
 
@@ -354,15 +368,31 @@ def test_quiet_episodes_are_exactly_the_habits_or_the_candidates_and_the_others_
     assert n_envs == 1 or any(one != other for one, other in roles.rows)  # each environment has its own turns
 
 
-def test_the_average_follows_the_actor_with_its_rate():
-    """After k updates of a standing actor the share (1 - rate)^k of the distance is left."""
-    model = imitating()
+@pytest.mark.parametrize("target_update_interval", [1, 1000])
+def test_the_average_follows_the_actor_with_its_rate(target_update_interval):
+    """After k updates of a standing actor the share (1 - rate)^k of the distance is left, however seldom targets move."""
+    model = imitating(policy_delay=10**6, target_update_interval=target_update_interval)
+    model.learn(1)
     disturb(model.policy.actor_average, 1.0)
-    for _ in range(25):
-        model._update_targets(model.tau)
+    model.train(25, 16)
     left = (1.0 - AVERAGING_RATE) ** 25
     for mine, actors in zip(weights_of(model.policy.actor_average), weights_of(model.actor.circuit), strict=True):
         assert th.allclose(mine - actors, th.full_like(mine, left), atol=1e-5)
+
+
+def test_a_normalised_reward_proves_by_what_was_really_paid():
+    model = imitating(VecNormalize(DummyVecEnv([CountingEnv]), norm_obs=False))
+    model.learn(60)  # episodes of 5, 9, 3 and 12 steps in turn, paid 0, 1, 0 and 2; every second one is quiet
+    assert model.trials.habit_returns == [1.0]
+    assert model.trials.candidate_returns == [2.0, 1.0, 2.0]
+
+
+def test_another_environment_may_pay_otherwise():
+    model = imitating().learn(60)
+    assert model.trials.habit_returns
+    habit = weights_of(model.actor.habit)
+    model.set_env(DummyVecEnv([CountingEnv]))
+    assert model.trials == Trials(1) and not differ(habit, weights_of(model.actor.habit))
 
 
 def test_save_and_load_keep_the_habit_and_what_is_known_of_it(tmp_path):
@@ -441,16 +471,16 @@ def test_the_warm_starts_rates_fall_geometrically_and_leave_nothing_behind(monke
         return original(self, n)
 
     monkeypatch.setattr(ActPC, "_refresh_changes", watched)
-    model = imitating(actor_warm_start=10, learning_rate=8e-4)
+    model = imitating(policy_kwargs={"circuit_kwargs": {"feedback_rate": 0.9}}, actor_warm_start=10, learning_rate=8e-4)
     model.pretrain()
     rates = [1e-3 * (5e-5 / 1e-3) ** (update / 10) for update in range(10)]
     assert len(seen) == 10
     for (n, *of_groups), rate in zip(seen, rates, strict=True):
-        assert n == 256 and of_groups == pytest.approx([rate] * len(of_groups))
+        assert n == 256 and of_groups == pytest.approx([rate, 0.9 * rate])
     assert not model.actor.circuit.optimizer.state
     model.learn(2)
-    assert [group["lr"] for group in model.actor.circuit.optimizer.param_groups] == pytest.approx([2e-4] * len(of_groups))
-    assert {group["lr"] for group in model.critic.first().optimizer.param_groups} == {8e-4}
+    assert [group["lr"] for group in model.actor.circuit.optimizer.param_groups] == pytest.approx([2e-4, 0.9 * 2e-4])
+    assert [group["lr"] for group in model.critic.first().optimizer.param_groups] == pytest.approx([8e-4, 0.9 * 8e-4])
 
 
 @pytest.mark.parametrize(("delay", "expected"), [(1, 7), (2, 3), (3, 2)])

@@ -73,7 +73,8 @@ def test_weights_are_loaded_without_running_code(tmp_path: Path, request: pytest
 
 
 def test_weights_with_demonstrations_go_on_learning_from_new_ones(tmp_path: Path) -> None:
-    model = make_actpc(CountingEnv, demonstrations=demonstrations(), observation_normalization="demonstrations")
+    few = {"n_demonstrations": 2, "n_demonstration_transitions": 30}
+    model = make_actpc(CountingEnv, demonstrations=demonstrations(), observation_normalization="demonstrations", **few)
     model.learn(30).save_weights(tmp_path / "agent.safetensors")
     alone = ActPC.from_weights(tmp_path / "agent.safetensors", make_vec_env(CountingEnv))
     again = ActPC.from_weights(tmp_path / "agent.safetensors", make_vec_env(CountingEnv), demonstrations=demonstrations())
