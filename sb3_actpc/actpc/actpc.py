@@ -144,7 +144,7 @@ class ActPC(OffPolicyAlgorithm):
         halves with every relapse (``pressure`` is the present one). 0 leaves refresh alone (cloning)
     :param scale_pressure: divide the pressure by the batch's mean absolute action-value (at least 1: one paid step)
     :param nudge: scale of the critic's clamped error while actor and critic settle as one (the paper's is 1); None for an
-        infinitesimal one, or 1 with ``dynamics="state"``
+        infinitesimal one, or 1 with ``dynamics="state"``. A sweep ("scheduled") is always infinitesimal
     :param critic_warmup: updates before the critic's pressure reaches the actor
     :param bootstrap: "joint" (target critic at the target actor's next action, the appendix) or "literal" (at the action
         taken, the main text's equation)
@@ -489,7 +489,7 @@ class ActPC(OffPolicyAlgorithm):
             return
         if self._vec_normalize_env is not None and self._vec_normalize_env.norm_obs:
             warnings.warn(
-                "VecNormalize's observation statistics drift under the frozen prior: use VecNormalize(norm_obs=False) with "
+                "VecNormalize's observation statistics drift under what is learned now: use VecNormalize(norm_obs=False) with "
                 "observation_normalization='demonstrations'",
                 stacklevel=2,
             )

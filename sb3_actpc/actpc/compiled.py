@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch as th
+from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 
 from sb3_actpc.actpc.features import Batch
 from sb3_actpc.ngc import HebbianChanges, settle_coupled
@@ -100,14 +101,22 @@ def compiled_update(agent: ActPC, total_timesteps: int) -> CompiledUpdate | None
     sweeps = all(circuit.settling == "scheduled" for _, circuit in agent.policy.named_circuits())
     if agent.compile is True and not sweeps:
         raise ValueError("compile=True needs settling='scheduled': steps that stop at a tolerance are no fixed graph")
-    per_step = max(agent.gradient_steps, 1) / agent.train_freq.frequency  # type: ignore[union-attr]
-    earned = agent.compile == "auto" and total_timesteps * per_step >= ENOUGH_UPDATES
+    earned = agent.compile == "auto" and total_timesteps * _updates_per_step(agent) >= ENOUGH_UPDATES
     if not sweeps or not (earned or agent.compile is True):
         return None
     if agent.device.type == "cpu" and not _has_compiler():
         agent.logger.info("compile: no C++ compiler here, updates run eagerly")
         return None
     return CompiledUpdate(agent)
+
+
+def _updates_per_step(agent: ActPC) -> float:
+    """Updates for each transition collected; of episodes, whose length nobody knows beforehand, one."""
+    every = agent.train_freq
+    assert isinstance(every, TrainFreq)
+    if agent.gradient_steps < 0 or every.unit is TrainFrequencyUnit.EPISODE:
+        return 1.0
+    return agent.gradient_steps / (every.frequency * agent.n_envs)
 
 
 def _has_compiler() -> bool:

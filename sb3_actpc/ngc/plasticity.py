@@ -32,9 +32,9 @@ class HebbianChanges:
         """All changes but the error synapses', which follow from the weights'."""
         return [*self.weights, *self.biases, *self.memory]
 
-    def add_(self, other: "HebbianChanges", weight: float = 1.0) -> "HebbianChanges":
-        """Add ``weight`` times the ``other`` changes of the same circuit, in place."""
-        th._foreach_add_(self.tensors(), other.tensors(), alpha=weight)
+    def add_(self, other: "HebbianChanges") -> "HebbianChanges":
+        """Add the ``other`` changes of the same circuit, in place."""
+        th._foreach_add_(self.tensors(), other.tensors())
         return self
 
     def scale_(self, factor: float | th.Tensor) -> "HebbianChanges":

@@ -53,6 +53,22 @@ def test_auto_compiles_from_enough_updates_on_and_only_sweeps():
     assert compiled_update(model, ENOUGH_UPDATES) is None
 
 
+@pytest.mark.parametrize(
+    ("keywords", "per_step"),
+    [
+        ({"gradient_steps": 4}, 4.0),
+        ({"gradient_steps": 2, "train_freq": 4}, 0.5),
+        ({"gradient_steps": -1, "train_freq": 4}, 1.0),
+        ({"gradient_steps": 100, "train_freq": (1, "episode")}, 1.0),
+        ({"gradient_steps": 1, "n_envs": 2}, 0.5),
+    ],
+)
+def test_auto_counts_the_updates_that_a_run_will_make(keywords, per_step):
+    model = agent(compile="auto", **keywords)
+    enough = int(ENOUGH_UPDATES / per_step)
+    assert compiled_update(model, enough - 1) is None and compiled_update(model, enough) is not None
+
+
 def test_without_a_compiler_updates_stay_eager(monkeypatch):
     monkeypatch.setattr("sb3_actpc.actpc.compiled._has_compiler", lambda: False)
     model, said = agent(compile=True), []
