@@ -851,6 +851,20 @@ class ActPC(OffPolicyAlgorithm):
     ) -> SelfActPC:
         return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
 
+    @classmethod
+    def load(cls: type[SelfActPC], path: str | PathLike[str], *args: Any, **kwargs: Any) -> SelfActPC:  # type: ignore[override]
+        """
+        As in SB3, which unpickles: load files that you trust.
+
+        :raises ValueError: for a file of a version whose classes are not here
+        """
+        try:
+            return super().load(path, *args, **kwargs)  # type: ignore[arg-type]
+        except ModuleNotFoundError as error:
+            if not (error.name or "").startswith("sb3_actpc"):
+                raise
+            raise ValueError(f"{path} is of another version of sb3_actpc ({error}): load it with that one") from error
+
     def checkpoint_state(self) -> dict[str, Any]:
         """What a checkpoint (:mod:`sb3_actpc.checkpoints`) keeps beside SB3's state: plain values and arrays."""
         expert = self.expert

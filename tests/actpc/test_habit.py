@@ -2,6 +2,8 @@
 
 import dataclasses
 import json
+import sys
+import types
 
 import numpy as np
 import pytest
@@ -410,6 +412,19 @@ def test_save_and_load_keep_the_habit_and_what_is_known_of_it(tmp_path):
     loaded = ActPC.load(tmp_path / "agent", env=DummyVecEnv([CountingEnv] * 2))  # two environments from now on
     loaded.learn(20, reset_num_timesteps=False)
     assert len(loaded.trials.roles) == 2 and loaded.trials.habit_returns == model.trials.habit_returns
+
+
+def test_a_file_of_another_version_says_so(tmp_path, monkeypatch):
+    """Its classes had other places."""
+    gone = types.ModuleType("sb3_actpc.gone")
+    gone.Old = type("Old", (), {"__module__": gone.__name__, "__qualname__": "Old"})
+    with monkeypatch.context() as then:
+        then.setitem(sys.modules, gone.__name__, gone)
+        model = imitating()
+        model.memory_of_old = gone.Old()
+        model.save(tmp_path / "agent")
+    with pytest.raises(ValueError, match=r"agent is of another version of sb3_actpc \(No module named 'sb3_actpc.gone'\)"):
+        ActPC.load(tmp_path / "agent")
 
 
 def test_an_agent_without_its_environment_acts_by_its_habit(tmp_path):
