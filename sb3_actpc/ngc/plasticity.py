@@ -68,8 +68,8 @@ def mirrored(weights: th.Tensor) -> th.Tensor:
     """
     Error synapses from the answers of ``weights`` to noise: the mean of (W ξ) ξ^T, whose expectation is W.
 
-    Of ``N_MIRRORED`` noises for every source neuron; very large layers, whose products would take minutes, hear fewer and start
-    less aligned.
+    There are ``N_MIRRORED`` noises for every source neuron; very large layers, whose products would take minutes, hear fewer
+    and start less aligned.
 
     :param weights: W, (n_out, n_in)
     :return: E^T, (n_out, n_in)
