@@ -600,7 +600,8 @@ class ActPC(OffPolicyAlgorithm):
             verdict = self.trials.end(env)
             if verdict == "relapsed" and self._n_updates < max(self.critic_warmup, self.relapsed_at) + PATIENCE:
                 verdict = "rejected"  # there was too little time to learn
-            if verdict is not None:
+            unpaid = verdict == "accepted" and not self.trials.habit_return  # nothing is proven where nothing is paid
+            if verdict is not None and not unpaid:
                 bounds = SMALLEST_PRESSURE * self.actor_pressure, LARGEST_PRESSURE * self.actor_pressure
                 self.pressure = float(np.clip(self.pressure * PRESSURE_FACTORS[verdict], *bounds))
             if verdict == "accepted":

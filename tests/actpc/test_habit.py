@@ -513,3 +513,16 @@ def test_refresh_alone_leaves_the_critic_bit_identical():
     model.learn(40)
     assert not differ(critic, weights_of(model.critic)) and not differ(target, weights_of(model.critic_target))
     assert differ(actor, weights_of(model.actor.circuit))
+
+
+def test_a_habit_that_is_paid_nothing_gives_way_but_nothing_presses_harder():
+    model = imitating()
+    model.learn(20)
+    model._n_updates = model.critic_warmup + 1
+    model.trials = Trials(1, roles=["candidate"], generations=[0], lengths=[0], returns=[0.0], tests_habit=False)
+    model.trials.candidate_returns, model.trials.candidate_steps = [0.0], PROOF_STEPS
+    pressure = model.pressure
+    with th.no_grad():
+        candidate = model.policy.candidate.weights[0].add_(1.0).clone()
+    model._prove(np.zeros(1), np.ones(1, dtype=bool))
+    assert th.equal(model.actor.habit.weights[0], candidate) and model.pressure == pressure
