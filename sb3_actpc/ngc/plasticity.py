@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import torch as th
 
 N_MIRRORED = 100  # noise vectors per source neuron; the cosine with W^T is (1 + 1 / N_MIRRORED)^-1/2
-LARGEST_MIRRORING = 10**10  # products of numbers, in mirroring one layer
+LARGEST_MIRRORING = 10**10  # products of numbers, in mirroring one layer; a random number costs about a hundred of them
 SYNAPTIC_SCALINGS = ("none", "soft_bound", "column_norm")
 
 
@@ -75,7 +75,7 @@ def mirrored(weights: th.Tensor) -> th.Tensor:
     :return: E^T, (n_out, n_in)
     """
     feedback, (n_out, n_in) = th.zeros_like(weights), weights.shape
-    affordable = max(1, LARGEST_MIRRORING // (n_out * n_in))  # noises
+    affordable = max(1, LARGEST_MIRRORING // (max(n_out, 100) * n_in))  # noises
     n_noises = min(N_MIRRORED * n_in, affordable)
     for start in range(0, n_noises, n_in):
         noise = th.randn(min(n_in, n_noises - start), n_in, dtype=weights.dtype, device=weights.device)

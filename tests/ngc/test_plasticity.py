@@ -187,7 +187,7 @@ def test_working_memory_changes_its_own_synapses_and_the_output():
 def test_mirroring_a_very_large_layer_ends_soon_and_still_points_the_right_way(monkeypatch):
     weights = th.randn(60, 50)
     every = mirrored(weights)
-    monkeypatch.setattr(plasticity, "LARGEST_MIRRORING", 60 * 50 * 120)  # 120 noises instead of 100 for every source
+    monkeypatch.setattr(plasticity, "LARGEST_MIRRORING", 100 * 50 * 120)  # 120 noises instead of 100 for every source
     th.manual_seed(0)
     drawn: list[int] = []
     randn = th.randn
