@@ -255,7 +255,7 @@ class ActPC(OffPolicyAlgorithm):
             replay_buffer_kwargs=replay_buffer_kwargs,
             optimize_memory_usage=optimize_memory_usage,
             n_steps=n_steps,
-            policy_kwargs={"habit": shown, **(policy_kwargs or {})},
+            policy_kwargs={"habit": True, **(policy_kwargs or {})} if shown else policy_kwargs,
             stats_window_size=stats_window_size,
             tensorboard_log=tensorboard_log,
             verbose=verbose,
