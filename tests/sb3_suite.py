@@ -37,8 +37,8 @@ torch.set_num_threads(1)
 stable_baselines3.TD3 = ActPC
 """
 
-# tests of TD3 whose ids do not name the class; but for test_save_load_large_model: four circuits with targets and error synapses
-# of their own, each with three layers of 8192 units, take more memory than a test machine has
+# tests of TD3 whose ids do not name the class; but for test_save_load_large_model: four circuits with targets and error
+# synapses of their own, each with three layers of 8192 units, take more memory than a test machine has
 SELECTED_BY_NAME = ("test_tensorboard[td3]", "test_td3_train_with_batch_norm")
 
 # at most nine; each reason is about TD3
