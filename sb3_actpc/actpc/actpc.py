@@ -39,7 +39,7 @@ from sb3_actpc.actpc.arguments import (
     check_train_freq,
     checked,
 )
-from sb3_actpc.actpc.buffers import CombinedHerReplayBuffer, SignalReplay, combined_buffer_class
+from sb3_actpc.actpc.buffers import CombinedHerReplayBuffer, SignalReplay, combined_buffer_class, relabels
 from sb3_actpc.actpc.compiled import CompiledUpdate, compiled_update
 from sb3_actpc.actpc.demonstration_replay import DemonstrationReplay
 from sb3_actpc.actpc.diagnostics import Diagnostics
@@ -233,12 +233,11 @@ class ActPC(OffPolicyAlgorithm):
         _init_setup_model: bool = True,
     ) -> None:
         shown = demonstrations is not None
-        relabels = "HerReplayBuffer" in str(replay_buffer_class) or optimize_memory_usage
 
         def default(given: Any, with_demonstrations: Any, without: Any) -> Any:
             return given if given is not None else with_demonstrations if shown else without
 
-        n_steps = default(n_steps, 1 if relabels else 5, 1)
+        n_steps = default(n_steps, 1 if relabels(replay_buffer_class) or optimize_memory_usage else 5, 1)
         super().__init__(
             policy,
             env,

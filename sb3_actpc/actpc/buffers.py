@@ -378,6 +378,16 @@ _COUNTERPARTS: dict[type[ReplayBuffer], type[SignalReplay]] = {
     DictReplayBuffer: CombinedDictReplayBuffer,
     HerReplayBuffer: CombinedHerReplayBuffer,
 }
+_BY_NAME = {kind.__name__: kind for kind in _COUNTERPARTS}
+
+
+def relabels(given: Any) -> bool:
+    """
+    :param given: the class the user asked for, or its name, or None
+    :return: whether it is one of hindsight
+    """
+    kind = _BY_NAME.get(given) if isinstance(given, str) else given
+    return isinstance(kind, type) and issubclass(kind, HerReplayBuffer)
 
 
 def combined_buffer_class(
@@ -391,12 +401,12 @@ def combined_buffer_class(
     :raises ValueError: for a class that does not keep ActPC's signals
     """
     if isinstance(given, str):
-        if given not in (names := {kind.__name__: kind for kind in _COUNTERPARTS}):
-            raise ValueError(f"replay_buffer_class={given!r} is unknown; choose one of {list(names)}")
-        given = names[given]
+        if given not in _BY_NAME:
+            raise ValueError(f"replay_buffer_class={given!r} is unknown; choose one of {list(_BY_NAME)}")
+        given = _BY_NAME[given]
     if given is not None and not (isinstance(given, type) and issubclass(given, ReplayBuffer)):
         raise ValueError(f"replay_buffer_class={given!r} must be None or a subclass of SB3's ReplayBuffer")
-    if n_steps > 1 and given is not None and issubclass(given, HerReplayBuffer):
+    if n_steps > 1 and relabels(given):
         raise ValueError(f"n_steps={n_steps} does not work with hindsight relabelling; use n_steps=1")
     if given is None and isinstance(observation_space, spaces.Dict):
         return CombinedDictReplayBuffer

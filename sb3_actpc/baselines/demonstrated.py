@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from sb3_actpc.baselines.demonstration_buffers import (
     WithDemonstrations,
     demonstration_buffer_class,
 )
-from sb3_actpc.demonstrations import Demonstrations, findable, fit_demonstrations
+from sb3_actpc.demonstrations import Demonstrations, fit_demonstrations
 
 
 class LearnsFromDemonstrations(BaseAlgorithm):
@@ -32,13 +33,17 @@ class LearnsFromDemonstrations(BaseAlgorithm):
         n_demonstrations: int | None,
         n_demonstration_transitions: int | None,
     ) -> None:
-        self.demonstrations = None if demonstrations is None else findable(demonstrations)
+        # a saved agent holds the path as it was given, and no object of one system's paths
+        self.demonstrations = os.fspath(demonstrations) if isinstance(demonstrations, Path) else demonstrations
         self.n_demonstrations, self.n_demonstration_transitions = n_demonstrations, n_demonstration_transitions
 
     def _fitted_demonstrations(self) -> Demonstrations:
         assert self.demonstrations is not None
         limits = self.n_demonstrations, self.n_demonstration_transitions
-        return fit_demonstrations(self.demonstrations, self.env, self.observation_space, self.action_space, *limits)
+        try:
+            return fit_demonstrations(self.demonstrations, self.env, self.observation_space, self.action_space, *limits)
+        except FileNotFoundError as error:
+            raise FileNotFoundError(f"{error}; or pass demonstrations=, which load(path, env=env, ...) takes too") from error
 
 
 class DemonstratedAlgorithm(LearnsFromDemonstrations, OffPolicyAlgorithm):

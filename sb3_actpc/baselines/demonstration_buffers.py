@@ -160,15 +160,16 @@ def demonstration_buffer_class(
         return DemonstrationNStepReplayBuffer if n_steps > 1 else DemonstrationReplayBuffer
     if isinstance(given, type) and issubclass(given, WithDemonstrations):
         return given
-    same = {
-        "ReplayBuffer": DemonstrationReplayBuffer,
-        "DictReplayBuffer": DemonstrationDictReplayBuffer,
-        "HerReplayBuffer": DemonstrationHerReplayBuffer,
+    same: dict[Any, type[WithDemonstrations]] = {
+        ReplayBuffer: DemonstrationReplayBuffer,
+        DictReplayBuffer: DemonstrationDictReplayBuffer,
+        HerReplayBuffer: DemonstrationHerReplayBuffer,
     }
-    name = given if isinstance(given, str) else given.__name__
-    if name not in same:
-        raise ValueError(f"replay_buffer_class={name!r} cannot hold demonstrations: choose None or one of {sorted(same)}")
-    return same[name]
+    names = {kind.__name__: kind for kind in same}
+    kind = names.get(given) if isinstance(given, str) else given
+    if kind not in same:
+        raise ValueError(f"replay_buffer_class={given!r} cannot hold demonstrations: choose None or one of {sorted(names)}")
+    return same[kind]
 
 
 def join_batches(own: Any, shown: Any) -> Any:

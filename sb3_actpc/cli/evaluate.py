@@ -64,7 +64,7 @@ def _check_video_options(args: argparse.Namespace) -> None:
 
 
 def _record(folder: Path, video: Path, args: argparse.Namespace) -> None:
-    from sb3_actpc.demonstrations.dataset import Demonstrations
+    from sb3_actpc.demonstrations import resolve
     from sb3_actpc.experiments.runs.presets import find_demonstrations
     from sb3_actpc.experiments.runs.run import load_run
     from sb3_actpc.experiments.runs.video import RenderingUnavailable, record_video
@@ -73,10 +73,10 @@ def _record(folder: Path, video: Path, args: argparse.Namespace) -> None:
     size = {} if args.size is None else {"width": args.size, "height": args.size}
     demonstrations = None
     if args.beside_demonstrator:
-        path = find_demonstrations(run.env, run.demonstrations)
-        if path is None:
+        source = find_demonstrations(run.env, run.demonstrations)
+        if source is None:
             raise ValueError(f"{folder} was trained without demonstrations: leave --beside-demonstrator out")
-        demonstrations = Demonstrations.load(path)
+        demonstrations = resolve(source)
     env_kwargs = {**run.env_kwargs, **size}
     try:
         n_frames = record_video(model, run.env, env_kwargs, video, args.seed, args.frames, demonstrations)

@@ -45,7 +45,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "--demonstrations",
         default="shipped",
         metavar="FILE",
-        help="file, 'weak' (the package's weaker ones) or 'none' (default: the ones in the package)",
+        help="file, id of a Minari dataset, 'weak' (the package's weaker ones) or 'none' (default: the ones in the package)",
     )
     parser.add_argument(
         "--gym-packages", nargs="+", metavar="MODULE", help="import these, which register environments; also from this folder"

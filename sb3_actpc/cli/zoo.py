@@ -252,6 +252,7 @@ def _parser() -> argparse.ArgumentParser:
 
 def _zoo_settings(ours: argparse.Namespace) -> dict[str, Any]:
     """The entry of rl_zoo3's settings file: the preset's, and what rl_zoo3 would not know."""
+    from sb3_actpc.actpc.buffers import relabels
     from sb3_actpc.experiments.runs import Run, resolve
     from sb3_actpc.experiments.runs.algorithms import load_algorithm
     from sb3_actpc.experiments.runs.environments import make_env
@@ -266,7 +267,7 @@ def _zoo_settings(ours: argparse.Namespace) -> dict[str, Any]:
         settings["normalize"] = resolved.normalize or True
     if "demonstrations" in known:
         demonstrations = find_demonstrations(ours.env, ours.demonstrations)
-        settings["demonstrations"] = None if demonstrations is None else str(demonstrations.absolute())
+        settings["demonstrations"] = str(demonstrations.absolute()) if isinstance(demonstrations, Path) else demonstrations
     with closing(make_env(ours.env, resolved.env_kwargs)) as env:
         settings["policy"] = fitting_policy(settings["policy"], env.observation_space)
         env.reset(seed=0)
@@ -274,7 +275,7 @@ def _zoo_settings(ours: argparse.Namespace) -> dict[str, Any]:
             # the Monitor wants a tuple, which a settings file cannot hold but as the Python that rl_zoo3 evaluates
             settings["monitor_kwargs"] = "dict(info_keywords=('is_success',))"
     # hindsight cannot sample before its first whole episode
-    uses_hindsight = ours.algo == "her" or "Her" in str(settings.get("replay_buffer_class", ""))
+    uses_hindsight = ours.algo == "her" or relabels(settings.get("replay_buffer_class"))
     if ours.trained_agent and "learning_starts" in known and not uses_hindsight:
         settings["learning_starts"] = 0
     return settings

@@ -4,7 +4,7 @@ All of it ends in the one form of :class:`Demonstrations`.
 """
 
 from sb3_actpc.demonstrations.dataset import Demonstrations, shipped_demonstrations
-from sb3_actpc.demonstrations.fitting import findable, fit_demonstrations, resolve, scaled_actions
+from sb3_actpc.demonstrations.fitting import fit_demonstrations, is_minari_id, resolve, scaled_actions
 from sb3_actpc.demonstrations.robomimic import read_robomimic, write_robomimic
 from sb3_actpc.demonstrations.robosuite_states import read_robosuite
 from sb3_actpc.demonstrations.scripted import MIXED_DEMONSTRATORS, ScriptedDemonstrator, collect_scripted
@@ -14,8 +14,8 @@ __all__ = [
     "Demonstrations",
     "ScriptedDemonstrator",
     "collect_scripted",
-    "findable",
     "fit_demonstrations",
+    "is_minari_id",
     "read_robomimic",
     "read_robosuite",
     "resolve",

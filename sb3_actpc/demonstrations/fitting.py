@@ -5,13 +5,13 @@ from __future__ import annotations
 import dataclasses
 import os
 import re
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from gymnasium import spaces
 
-from sb3_actpc.demonstrations.dataset import Demonstrations, base_name
+from sb3_actpc.demonstrations.dataset import DATA_FOLDER, Demonstrations, base_name
 from sb3_actpc.envs import SPARSE_MUJOCO_IDS, dense_env_id
 
 if TYPE_CHECKING:
@@ -34,25 +34,25 @@ def resolve(
     """
     if isinstance(source, Demonstrations):
         return source
-    if isinstance(source, str) and _is_minari_id(source):
+    if is_minari_id(source):
         return Demonstrations.from_minari(source, observation_space=observation_space)
     if isinstance(source, (str, os.PathLike)):
-        return Demonstrations.load(source)
+        return Demonstrations.load(_here(Path(source)))
     raise ValueError(f"demonstrations must be a file path, a Minari id or a Demonstrations object, found {source!r}")
 
 
-def findable(source: str | os.PathLike[str] | Demonstrations) -> str | Path | Demonstrations:
+def is_minari_id(source: Any) -> bool:
     """
     :param source: as :func:`resolve`'s
-    :return: the same, a path made absolute, so that a saved agent finds its demonstrations from any folder; what is no
-        source at all as it is, for :func:`resolve` to name
+    :return: whether it is a text that names a Minari dataset, and no file
     """
-    is_path = isinstance(source, os.PathLike) or (isinstance(source, str) and not _is_minari_id(source))
-    return Path(source).absolute() if is_path else source  # type: ignore[arg-type,return-value]
+    return isinstance(source, str) and MINARI_ID.fullmatch(source) is not None and not os.path.exists(source)
 
 
-def _is_minari_id(source: str) -> bool:
-    return MINARI_ID.fullmatch(source) is not None and not os.path.exists(source)
+def _here(path: Path) -> Path:
+    """A file of the package lies elsewhere on the machine where an agent was trained."""
+    parts, own = PureWindowsPath(path).parts, DATA_FOLDER.parts[-2:]  # which knows both kinds of slash
+    return path if path.exists() or parts[-3:-1] != own else DATA_FOLDER / parts[-1]
 
 
 def fit_demonstrations(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -29,7 +30,8 @@ def read_minari(
         the errors see ``Demonstrations.from_minari``
     """
     if isinstance(dataset, str):
-        dataset = _load(dataset)
+        minari_files(dataset)
+        dataset = import_minari().load_dataset(dataset)
     source = f"Minari dataset {dataset.spec.dataset_id}"
     metadata = dataset.storage.metadata
     paths = metadata.get("observation_keys", box_paths(dataset.observation_space))
@@ -104,14 +106,22 @@ def episode_buffer(episode: dict[str, Any], observation_space: spaces.Space[Any]
     )
 
 
-def _load(dataset_id: str) -> Any:
-    minari = import_minari()
-    try:
-        return minari.load_dataset(dataset_id)
-    except FileNotFoundError:
+def minari_files(dataset_id: str) -> list[Path]:
+    """
+    :param dataset_id: of a Minari dataset
+    :return: the files that hold it
+    :raises ImportError: when Minari is not installed
+    :raises FileNotFoundError: when there is no such dataset; the message says how to fetch it
+    """
+    import_minari()
+    from minari.storage import get_dataset_path
+
+    files = sorted(path for path in (get_dataset_path(dataset_id) / "data").rglob("*") if path.is_file())
+    if not files:
         raise FileNotFoundError(
             f"no Minari dataset {dataset_id!r} on this machine: fetch it with `minari download {dataset_id}`"
-        ) from None
+        )
+    return files
 
 
 def _has_json_spec(env: gym.Env[Any, Any] | None) -> bool:

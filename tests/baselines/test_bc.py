@@ -158,6 +158,18 @@ def test_it_plays_the_same_after_loading_and_goes_on_learning(kind: type[BC], tm
     assert not np.array_equal(model.predict(rows)[0], loaded.predict(rows)[0])
 
 
+def test_a_saved_agent_names_its_demonstrations_as_they_were_given(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    record(ENV).save("mine.npz")
+    BC("MlpPolicy", ENV, demonstrations=Path("mine.npz"), policy_kwargs=SMALL, device="cpu").save("cloned")
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir("elsewhere")
+    assert BC.load("../cloned", device="cpu").demonstrations == "mine.npz"  # to be played it needs none
+    with pytest.raises(FileNotFoundError, match=r"at mine.npz; or pass demonstrations=, which load\(path, env=env"):
+        BC.load("../cloned", env=gym.make(ENV), device="cpu")
+    assert BC.load("../cloned", env=gym.make(ENV), demonstrations="../mine.npz", device="cpu").learn(1).num_timesteps == 1
+
+
 def test_two_runs_with_one_seed_are_equal() -> None:
     first, second = (make(BCRNN, input_noise=0.1).learn(10).policy.state_dict() for _ in range(2))
     assert all(th.equal(first[name], second[name]) for name in first)

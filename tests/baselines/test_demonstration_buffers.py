@@ -5,6 +5,7 @@ import pytest
 import torch as th
 from gymnasium import spaces
 from stable_baselines3 import DDPG, SAC, TD3
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_actpc.baselines import TD3Demo
@@ -102,6 +103,8 @@ def test_the_buffer_is_chosen_by_a_plain_name_or_by_the_observations() -> None:
     assert demonstration_buffer_class(None, BOX, n_steps=3) is DemonstrationNStepReplayBuffer
     with pytest.raises(ValueError, match="'Shelf' cannot hold demonstrations: choose"):
         demonstration_buffer_class("Shelf", BOX)
+    with pytest.raises(ValueError, match=r"Own.HerReplayBuffer'> cannot hold demonstrations: choose"):
+        demonstration_buffer_class(type("Own.HerReplayBuffer", (ReplayBuffer,), {}), goals)
     with pytest.raises(ValueError, match="n_steps=3"):
         demonstration_buffer_class(None, goals, n_steps=3)
 

@@ -6,8 +6,10 @@ import pytest
 import torch as th
 from stable_baselines3.common.env_checker import check_env
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
-from sb3_actpc import ActPC
+from sb3_actpc import ActPC, shipped_demonstrations
+from sb3_actpc.actpc.buffers import CombinedDictReplayBuffer, CombinedHerReplayBuffer
 from sb3_actpc.baselines import HER
 from sb3_actpc.baselines.prioritized import PrioritizedHerReplayBuffer, SumTree
 from sb3_actpc.demonstrations import fit_demonstrations
@@ -265,3 +267,12 @@ def test_her_solves_fetch_reach_within_its_20000_steps(tmp_path) -> None:
     config = Run(env="FetchReach-v4", algo="her", eval_episodes=50, progress=False, output=str(tmp_path / "run"))
     result = train_run(config, print)
     assert result["success_rate"] >= 0.9
+
+
+def test_hindsight_is_known_by_its_class_and_not_by_a_name() -> None:
+    """A user's class of any name has one-step returns by default, as hindsight needs; others keep five."""
+    shown = shipped_demonstrations("SparseReacher-v5")
+    own, plain = type("Relabelled", (CombinedHerReplayBuffer,), {}), type("NoHerReplayBuffer", (CombinedDictReplayBuffer,), {})
+    for kind, n_steps in ((own, 1), ("HerReplayBuffer", 1), (HerReplayBuffer, 1), (plain, 5)):
+        kwargs = {"demonstrations": shown, "replay_buffer_class": kind, "buffer_size": 200, "device": "cpu"}
+        assert ActPC("MultiInputPolicy", "GoalReacher-v5", **kwargs).n_steps == n_steps

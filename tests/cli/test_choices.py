@@ -1,15 +1,19 @@
 """What a user may choose on the command line: steps, settings, own environments, more steps, TensorBoard."""
 
 import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
+import gymnasium as gym
+import numpy as np
 import pytest
 from stable_baselines3 import TD3
 
 import sb3_actpc
 from sb3_actpc.cli import main
+from sb3_actpc.demonstrations import Demonstrations
 from sb3_actpc.experiments.runs import Run, finish_run
 from tests.cli.line import ENV_ID, RUN, rows_of, train
 
@@ -57,6 +61,29 @@ def test_public_names_are_completed() -> None:
 def test_what_there_is_can_be_listed(kind: str, found: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["list", kind]) == 0
     assert found in capsys.readouterr().out
+
+
+@pytest.mark.filterwarnings("ignore:.*is set to None:UserWarning", "ignore:env_spec is None:UserWarning")
+def test_a_minari_dataset_is_named_by_its_id(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("h5py")
+    pytest.importorskip("minari")
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(Path("sets").absolute()))
+    shown = Demonstrations.record(lambda _: np.zeros(1), ENV_ID, 2, only_successes=False)
+    shown.to_minari("line/still-v0")
+    quick = ["train", "--env", ENV_ID, "--steps", "20", "--set", "actor_warm_start=3", "--no-progress", "--output", "mine"]
+    assert main([*quick, "--demonstrations", "line/moving-v0"]) == 2
+    assert "fetch it with `minari download line/moving-v0`" in capsys.readouterr().err
+    assert main([*quick, "--demonstrations", "line/still-v0"]) == 0
+    record = json.loads(Path("mine/config.json").read_text(encoding="utf-8"))
+    assert (record["demonstrations"], record["demonstrators_return"]) == ("line/still-v0", 20.0)
+    agent = sb3_actpc.ActPC.load("mine/model.zip", env=gym.make(ENV_ID))
+    assert agent.demonstrations == "line/still-v0" and len(agent.expert) == len(shown)
+    resume = ["train", "--resume", "mine", "--steps", "10", "--no-progress"]
+    assert main(resume) == 0
+    shutil.rmtree("sets")
+    shown.select(1).to_minari("line/still-v0")  # another set under the same name
+    assert main(resume) == 2
+    assert "the demonstrations (line/still-v0) are not those that the run began with" in capsys.readouterr().err
 
 
 def test_the_zoos_help_lists_its_commands(capsys: pytest.CaptureFixture[str]) -> None:

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from sb3_actpc.demonstrations import Demonstrations, resolve
+from sb3_actpc.demonstrations import Demonstrations, resolve, shipped_demonstrations
 from sb3_actpc.demonstrations.minari import episode_buffer
 from sb3_actpc.demonstrations.npz import FORMAT_VERSION
 from sb3_actpc.utils.files import atomic_write
@@ -695,6 +695,14 @@ def test_a_file_whose_name_looks_like_a_minari_id_is_a_file(tmp_path: Path, monk
     monkeypatch.chdir(tmp_path)
     make_demonstrations().save("mine-v0")
     assert_equal(resolve("mine-v0"), make_demonstrations())
+
+
+@pytest.mark.parametrize("folder", ["/home/someone/site-packages/sb3_actpc/data/", "C:\\lib\\sb3_actpc\\data\\"])
+def test_the_packages_files_are_found_wherever_it_is_installed(folder: str) -> None:
+    own = shipped_demonstrations("SparseReacher-v5")
+    assert_equal(resolve(folder + own.name), Demonstrations.load(own))
+    with pytest.raises(FileNotFoundError):
+        resolve(folder.replace("data", "other") + own.name)
 
 
 def test_demonstrations_are_imported_without_what_is_heavy() -> None:

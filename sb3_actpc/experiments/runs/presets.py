@@ -17,7 +17,8 @@ from stable_baselines3.common.utils import LinearSchedule
 from torch import nn
 
 from sb3_actpc.checkpoints import why_no_checkpoints
-from sb3_actpc.demonstrations.dataset import shipped_demonstrations
+from sb3_actpc.demonstrations import is_minari_id, shipped_demonstrations
+from sb3_actpc.demonstrations.minari import minari_files
 from sb3_actpc.envs import sparse_env_id
 from sb3_actpc.experiments.runs.algorithms import check_keywords, load_algorithm
 from sb3_actpc.experiments.runs.environments import make_env
@@ -114,7 +115,7 @@ def resolve(run: Run) -> Run:
         "normalize": normalize,
         "eval_freq": eval_freq,
         "checkpoint_freq": 0 if without else eval_freq if run.checkpoint_freq is None else run.checkpoint_freq,
-        "demonstrations_sha256": file_hash(find_demonstrations(run.env, run.demonstrations)),
+        "demonstrations_sha256": demonstrations_hash(run),
         "is_resolved": True,
     }
     return Run(**{**merged(run), **filled})
@@ -232,25 +233,37 @@ def with_changes(settings: Mapping[str, Any], changes: Mapping[str, Any]) -> dic
     return changed
 
 
-def find_demonstrations(env_id: str, choice: str) -> Path | None:
-    """The demonstrations file of a run.
+def find_demonstrations(env_id: str, choice: str) -> Path | str | None:
+    """The demonstrations of a run.
 
     :param env_id: Gymnasium id of the task
     :param choice: ``"shipped"`` (for a task whose name begins with ``Sparse``, or its goal version), ``"weak"`` (a weaker
-        demonstrator's), ``"none"``, or a path
-    :return: the file, or None for none
+        demonstrator's), ``"none"``, a path, or the id of a Minari dataset
+    :return: the file, the id, or None for none
     :raises FileNotFoundError: when the path does not exist, or a sparse task has no shipped file
     """
     if choice == "none":
         return None
     if choice == "weak":
         return shipped_demonstrations(sparse_env_id(env_id), weak=True)
+    if is_minari_id(choice):
+        return choice
     if choice != "shipped":
         if not Path(choice).is_file():
             raise FileNotFoundError(f"no demonstrations file at {choice}")
         return Path(choice)
     env_id = sparse_env_id(env_id)
     return shipped_demonstrations(env_id) if env_id.rpartition(":")[2].startswith("Sparse") else None
+
+
+def demonstrations_hash(run: Run) -> str | None:
+    """
+    :param run: with its environment and its demonstrations
+    :return: SHA-256 of what they hold, None for none
+    :raises FileNotFoundError: when they are not there
+    """
+    found = find_demonstrations(run.env, run.demonstrations)
+    return None if found is None else file_hash(*(minari_files(found) if isinstance(found, str) else [found]))
 
 
 def preset_names() -> list[str]:

@@ -40,13 +40,16 @@ def git_state(checkout: Path = CHECKOUT) -> tuple[str | None, bool | None]:
     return commit, bool(changes)
 
 
-def file_hash(path: Path | None) -> str | None:
+def file_hash(*paths: Path) -> str:
     """
-    :param path: a file, or None
-    :return: SHA-256 of its content in hex digits, None for None
-    :raises OSError: when it cannot be read
+    :param paths: files
+    :return: SHA-256 of their content, one after the other, in hex digits
+    :raises OSError: when one cannot be read
     """
-    return None if path is None else hashlib.sha256(path.read_bytes()).hexdigest()
+    content = hashlib.sha256()
+    for path in paths:
+        content.update(path.read_bytes())
+    return content.hexdigest()
 
 
 def _git(checkout: Path, *arguments: str) -> str:

@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from sb3_actpc.experiments.runs.evaluation import PROGRESS
-from sb3_actpc.experiments.runs.presets import find_demonstrations
-from sb3_actpc.experiments.runs.provenance import file_hash
+from sb3_actpc.experiments.runs.presets import demonstrations_hash
 from sb3_actpc.experiments.runs.schema import VERSION, Run
 from sb3_actpc.utils.files import atomic_write
 
@@ -68,11 +67,10 @@ def check_demonstrations(run: Run) -> None:
     :raises FileNotFoundError: when its demonstrations are gone
     :raises ValueError: when they are not those that it began with
     """
-    path = find_demonstrations(run.env, run.demonstrations)
-    if file_hash(path) != run.demonstrations_sha256:
+    if demonstrations_hash(run) != run.demonstrations_sha256:
         raise ValueError(
-            f"{run.folder}: the demonstrations ({path}) are not those that the run began with: put them back, or start the "
-            "run again in another folder"
+            f"{run.folder}: the demonstrations ({run.demonstrations}) are not those that the run began with: put them back, "
+            "or start the run again in another folder"
         )
 
 

@@ -16,7 +16,7 @@ from stable_baselines3.common.logger import CSVOutputFormat, KVWriter, Logger, T
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_actpc.checkpoints import CheckpointCallback, DamagedCheckpoint, list_bundles, restore, why_no_checkpoints
-from sb3_actpc.demonstrations.dataset import Demonstrations
+from sb3_actpc.demonstrations import resolve as resolve_demonstrations
 from sb3_actpc.experiments.runs.algorithms import load_algorithm
 from sb3_actpc.experiments.runs.environments import check_env_id, make_eval_envs, make_train_env
 from sb3_actpc.experiments.runs.episode_log import EpisodeLog
@@ -303,14 +303,14 @@ def run_folder(run: Run) -> Path:
     return folder
 
 
-def demonstrators_return(path: Path | None) -> float | None:
+def demonstrators_return(source: Path | str | None) -> float | None:
     """Mean dense return of the demonstrated episodes.
 
-    :param path: demonstrations file, or None
-    :return: the mean, or None when there is no file or it does not hold dense rewards
+    :param source: demonstrations file, id of a Minari dataset, or None
+    :return: the mean, or None when there is none or it does not hold dense rewards
     :raises ValueError: when the file is not valid
     """
-    returns = None if path is None else Demonstrations.load(path).dense_returns
+    returns = None if source is None else resolve_demonstrations(source).dense_returns
     return None if returns is None else float(returns.mean())
 
 

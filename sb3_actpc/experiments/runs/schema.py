@@ -110,7 +110,8 @@ class Run(Schema):
     :param preset: name of a file of ``hyperparams/``, or a path ending in ``.yml``; by default the name of the algorithm
     :param n_timesteps: environment steps to train for, also called ``steps``; by default the preset's
     :param seed: seed of the agent and of the training environment
-    :param demonstrations: ``"shipped"`` or ``"weak"`` (the files in the package for a sparse task), ``"none"``, or a path
+    :param demonstrations: ``"shipped"`` or ``"weak"`` (the files in the package for a sparse task), ``"none"``, a path,
+        or the id of a Minari dataset
     :param settings: the algorithm's keywords that replace the preset's; ``"policy_kwargs.net_arch"`` replaces one value in a
         mapping. Once filled in: all of them
     :param env_kwargs: keywords of the environment, added to the preset's
