@@ -149,8 +149,8 @@ MUTANTS = [
     Mutant(
         "errors of the state dynamics have the other sign of the prediction",
         DYNAMICS,
-        "self.synapses.weights[layer - 1].t(), alpha=-1.0)",
-        "self.synapses.weights[layer - 1].t())",
+        "settings.bfloat16, sign=-1.0)",
+        "settings.bfloat16)",
         f"{SETTLING} -k 'one_step or fixed_point'",
     ),
     Mutant(

@@ -12,6 +12,7 @@ from sb3_actpc.ngc.activations import ACTIVATIONS, get_activation
 from sb3_actpc.ngc.dynamics import DYNAMICS, ChainSettings, SettledState, SettlingChain
 from sb3_actpc.ngc.krylov import settle_krylov
 from sb3_actpc.ngc.plasticity import SYNAPTIC_SCALINGS, HebbianChanges, bound_columns_, hebbian_changes, mirrored, soft_bound_
+from sb3_actpc.ngc.products import MATMUL_PRECISIONS, check_matmul_precision
 from sb3_actpc.ngc.stability import arrival_fractions, power_iteration_, settling_rates
 from sb3_actpc.ngc.synapses import Synapses, predict
 
@@ -62,6 +63,9 @@ class NGCCircuit(nn.Module):
     :param weight_decay: λ: before every change W, M and E shrink by 1 - ηλ (η the learning rate, as in AdamW); biases do not.
         E and W^T get changes in the same direction, so that what they were born with is what parts them; the decay forgets
         it in some 1/(ηλ) updates (Kolen & Pollack, 1994), and learned error synapses align
+    :param matmul_precision: "float32", or "bfloat16": wide products (no side below 64) but the output's prediction multiply
+        and give numbers rounded to 8 bits, summed in float32; synapses, optimiser and all else stay float32. Half the time
+        of a product, on processors with avx512_bf16 or AMX
     :param n_memory: size of the working memory fed to every layer; 0 for none
     :param memory_weight: α_m
     :param n_feedback_inputs: error synapses also reach the last this-many inputs (the critic's action columns)
@@ -94,6 +98,7 @@ class NGCCircuit(nn.Module):
         synaptic_scaling: str = "none",
         weight_bound: float = 1.0,
         weight_decay: float = 0.0,
+        matmul_precision: str = "float32",
         n_memory: int = 0,
         memory_weight: float = 1.0,
         n_feedback_inputs: int = 0,
@@ -106,6 +111,8 @@ class NGCCircuit(nn.Module):
         _check_choice("feedback_start", feedback_start, FEEDBACK_STARTS)
         _check_choice("activation", activation, tuple(ACTIVATIONS))
         _check_choice("output_activation", output_activation, tuple(ACTIVATIONS))
+        _check_choice("matmul_precision", matmul_precision, MATMUL_PRECISIONS)
+        check_matmul_precision(matmul_precision)
         if not isinstance(hidden, Sequence) or isinstance(hidden, str):
             raise ValueError(f"hidden={hidden!r} must be a list of layer sizes")
         _check_sizes(1, n_inputs=n_inputs, n_outputs=n_outputs, n_settling_steps=n_settling_steps)
@@ -143,6 +150,7 @@ class NGCCircuit(nn.Module):
         self.settling_rate, self.leak, self.derivative_free = settling_rate, leak, derivative_free
         self.feedback, self.feedback_scale, self.feedback_rate = feedback, feedback_scale, feedback_rate
         self.synaptic_scaling, self.weight_bound, self.weight_decay = synaptic_scaling, weight_bound, weight_decay
+        self.bfloat16 = matmul_precision == "bfloat16"
         self.n_memory, self.memory_weight = n_memory, memory_weight
         self.n_feedback_inputs = n_feedback_inputs
         self._create_synapses()
@@ -219,7 +227,7 @@ class NGCCircuit(nn.Module):
         """
         biases = self.synapses.layer_biases(memory, self.memory_weight)
         for weights, bias in zip(self.synapses.weights[:-1], biases[:-1], strict=True):
-            latents = predict(x, weights, bias)
+            latents = predict(x, weights, bias, self.bfloat16)
             x = self.activation.apply(latents, latents)
         output = predict(x, self.synapses.weights[-1], biases[-1])
         return self.output_activation.apply(output, output)
@@ -261,6 +269,7 @@ class NGCCircuit(nn.Module):
             self.derivative_free,
             self.feedback_scale,
             self.memory_weight,
+            self.bfloat16,
         )
         return SettlingChain(self.synapses, settings, x, memory)
 
@@ -296,7 +305,7 @@ class NGCCircuit(nn.Module):
         errors = state.postsynaptic
         if self.compensate_arrival:
             errors = [e if share == 1.0 else e / share for e, share in zip(errors, state.arrived, strict=True)]
-        return hebbian_changes(errors, state.activations, state.memory, self.memory_weight)
+        return hebbian_changes(errors, state.activations, state.memory, self.memory_weight, self.bfloat16)
 
     def parameter_groups(self, learning_rate: float) -> list[dict[str, Any]]:
         """

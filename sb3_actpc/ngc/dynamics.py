@@ -6,6 +6,7 @@ from typing import NamedTuple
 import torch as th
 
 from sb3_actpc.ngc.activations import Activation
+from sb3_actpc.ngc.products import add_product, multiply
 from sb3_actpc.ngc.synapses import Synapses, predict
 
 DYNAMICS = ("krylov", "error", "state")
@@ -54,6 +55,7 @@ class ChainSettings(NamedTuple):
     derivative_free: bool = False
     feedback_scale: float = 1.0
     memory_weight: float = 1.0
+    bfloat16: bool = False
 
 
 class SettlingChain:
@@ -82,7 +84,7 @@ class SettlingChain:
         self.latents: list[th.Tensor] = [x]
         self.activations: list[th.Tensor] = [x]
         for weights, bias in zip(synapses.weights[:-1], self.biases[:-1], strict=True):
-            latents = predict(self.activations[-1], weights, bias)
+            latents = predict(self.activations[-1], weights, bias, settings.bfloat16)
             self.latents.append(latents)
             self.activations.append(settings.activation.apply(latents, th.empty_like(latents)))
         self.output_prediction = predict(self.activations[-1], synapses.weights[-1], self.biases[-1])
@@ -134,7 +136,7 @@ class SettlingChain:
         """:meth:`feedback_to` from any error ``below`` of the layer that ``layer`` predicts, (B, n_below)."""
         settings = self.settings
         matrix = self.synapses.feedback_matrix(layer, settings.feedback_scale, tied=exact)
-        signal = th.mm(below, matrix, out=out)
+        signal = multiply(below, matrix, settings.bfloat16, out)
         if exact or not settings.derivative_free:
             settings.activation.damp(signal, self.latents[layer], self.activations[layer])
         return signal
@@ -165,10 +167,11 @@ class SettlingChain:
                 th.add(self.first_prediction, error, out=latents)
             elif settings.dynamics != "state":
                 th.add(error, self.biases[layer - 1], out=latents)
-                latents.addmm_(self.activations[layer - 1], self.synapses.weights[layer - 1].t())
+                add_product(latents, self.activations[layer - 1], self.synapses.weights[layer - 1].t(), settings.bfloat16)
             else:
                 th.sub(latents, self.biases[layer - 1], out=error)
-                error.addmm_(self.activations[layer - 1], self.synapses.weights[layer - 1].t(), alpha=-1.0)
+                below, weights = self.activations[layer - 1], self.synapses.weights[layer - 1]
+                add_product(error, below, weights.t(), settings.bfloat16, sign=-1.0)
             self.activations[layer] = settings.activation.apply(latents, self.activations[layer])
         if output:
             self._predict_output()

@@ -12,6 +12,7 @@ import torch as th
 
 from sb3_actpc.ngc.activations import Activation
 from sb3_actpc.ngc.dynamics import SettlingChain
+from sb3_actpc.ngc.products import add_product
 
 
 def settle_krylov(chain: SettlingChain, n_steps: int, tolerance: float) -> int:
@@ -60,10 +61,8 @@ def _respond(chain: SettlingChain, drive: th.Tensor) -> tuple[th.Tensor, list[th
     for layer, error in enumerate(errors[:-1], start=1):
         move = error.clone()
         if layer > 1:
-            move.addmm_(
-                _slope(settings.activation, moves[-1], chain.latents[layer - 1], chain.activations[layer - 1]),
-                weights[layer - 1].t(),
-            )
+            below = _slope(settings.activation, moves[-1], chain.latents[layer - 1], chain.activations[layer - 1])
+            add_product(move, below, weights[layer - 1].t(), settings.bfloat16)
         moves.append(move)
     answer = _slope(settings.activation, moves[-1], chain.latents[n_hidden], chain.activations[n_hidden]) @ weights[-1].t()
     for _ in range(2):  # g' once in the prediction, once in the error that reaches the synapses

@@ -4,6 +4,8 @@ from dataclasses import dataclass
 
 import torch as th
 
+from sb3_actpc.ngc.products import multiply
+
 N_MIRRORED = 100  # noise vectors per source neuron; the cosine with W^T is (1 + 1 / N_MIRRORED)^-1/2
 LARGEST_MIRRORING = 10**10  # products of numbers, in mirroring one layer; a random number costs about a hundred of them
 SYNAPTIC_SCALINGS = ("none", "soft_bound", "column_norm")
@@ -44,7 +46,11 @@ class HebbianChanges:
 
 
 def hebbian_changes(
-    errors: list[th.Tensor], activations: list[th.Tensor], memory: th.Tensor | None, memory_weight: float
+    errors: list[th.Tensor],
+    activations: list[th.Tensor],
+    memory: th.Tensor | None,
+    memory_weight: float,
+    bfloat16: bool = False,
 ) -> HebbianChanges:
     """
     ΔW = e φ(z)^T, Δb = e, ΔM = α_m e m^T, each the mean over the batch (paper: eq. for ΔW and the appendix).
@@ -53,12 +59,13 @@ def hebbian_changes(
     :param activations: presynaptic activity, each (B, n_in)
     :param memory: (B, n_memory) or None
     :param memory_weight: α_m
+    :param bfloat16: see :func:`~sb3_actpc.ngc.products.multiply`
     :return: the changes to be added
     """
     inverse_batch = 1.0 / len(errors[0])
     scaled = [error * inverse_batch for error in errors]
     return HebbianChanges(
-        weights=[error.t() @ activity for error, activity in zip(scaled, activations, strict=True)],
+        weights=[multiply(error.t(), activity, bfloat16) for error, activity in zip(scaled, activations, strict=True)],
         biases=[error.sum(0) for error in scaled],
         memory=[] if memory is None else [memory_weight * (error.t() @ memory) for error in scaled],
     )

@@ -4,6 +4,8 @@ from typing import NamedTuple
 
 import torch as th
 
+from sb3_actpc.ngc.products import multiply
+
 
 class Synapses(NamedTuple):
     """
@@ -52,6 +54,8 @@ class Synapses(NamedTuple):
         return self.weights[layer] if tied or scale == 1.0 else scale * self.weights[layer]
 
 
-def predict(activations: th.Tensor, weights: th.Tensor, bias: th.Tensor) -> th.Tensor:
-    """z̄ = W φ(z) + b, with ``bias`` (n_out,) or, memory included, (B, n_out)."""
+def predict(activations: th.Tensor, weights: th.Tensor, bias: th.Tensor, bfloat16: bool = False) -> th.Tensor:
+    """z̄ = W φ(z) + b, with ``bias`` (n_out,) or, memory included, (B, n_out); see :func:`multiply` for ``bfloat16``."""
+    if bfloat16:
+        return multiply(activations, weights.t(), bfloat16).add_(bias)
     return th.addmm(bias, activations, weights.t())
