@@ -54,6 +54,7 @@ COUPLED, SPARSE = "ngc/coupled.py", "envs/sparse_mujoco.py"
 STATISTICS, R_STABILITY = "experiments/report/statistics.py", "experiments/report/r_stability.py"
 SETTLING, LEARNING, SCHEDULED = (f"tests/ngc/test_{name}.py" for name in ("settling", "plasticity", "scheduled"))
 HABIT, TRIALS = "tests/actpc/test_habit.py", "actpc/habit.py"
+REGIONS, REGION = "tests/actpc/test_trust_region.py", "actpc/trust_region.py"
 CLOSED, EQUATIONS = "tests/ngc/test_closed_forms.py", "tests/actpc/test_equations.py"
 TASKS = "tests/envs/test_sparse_mujoco.py"
 SCORES, STABLE = (f"tests/experiments/report/test_{name}.py" for name in ("statistics", "r_stability"))
@@ -302,8 +303,8 @@ MUTANTS = [
     Mutant(
         "pressure from the first update on",
         AGENT,
-        "if self.pressure and self._n_updates > self.critic_warmup",
-        "if self.pressure",
+        "if self.actor_pressure and self._n_updates > self.critic_warmup",
+        "if self.actor_pressure",
         f"{LEARNS} -k warmup",
     ),
     Mutant(
@@ -312,8 +313,8 @@ MUTANTS = [
     Mutant(
         "the weight of the pressure is ignored",
         AGENT,
-        "self._pressure_weight(self.pressure,",
-        "self._pressure_weight(1.0,",
+        "weight: float | th.Tensor = self.actor_pressure",
+        "weight: float | th.Tensor = 1.0",
         EQUATIONS,
     ),
     Mutant(
@@ -349,19 +350,44 @@ MUTANTS = [
     Mutant("random actions prove something", AGENT, "or self.num_timesteps <= self.learning_starts", "", f"{HABIT} -k random"),
     Mutant("the habit is not copied", AGENT, "_copy(self.policy.candidate, self.actor.habit)", "pass", f"{HABIT} -k predict"),
     Mutant("the learning actor acts", POLICIES, "self.circuit if self.habit is None", "self.circuit if True", HABIT),
-    Mutant(
-        "the pressure has no bound",
-        AGENT,
-        "* PRESSURE_FACTORS[verdict], *bounds))",
-        "* PRESSURE_FACTORS[verdict], 0, 99))",
-        HABIT,
-    ),
     Mutant("one proof is enough", TRIALS, "elif n < N_PROOFS", "elif n < 1", HABIT),
-    Mutant("a tie is a proof", TRIALS, "mean >= habit + PROVEN_GAIN * abs(habit)", "mean >= habit", HABIT),
-    Mutant("chance is held against a candidate", TRIALS, "stdev(own) / n**0.5 if n > 1 else 0.0", "0.0", f"{HABIT} -k chance"),
+    Mutant("a tie is a proof", TRIALS, "gain >= max(SMALLEST_GAIN * unit, error)", "gain >= error", HABIT),
+    Mutant("chance is a proof", TRIALS, "gain >= max(SMALLEST_GAIN * unit, error)", "gain >= SMALLEST_GAIN * unit", HABIT),
+    Mutant(
+        "chance is held against a candidate", TRIALS, "gain + error < -GREAT_LOSS", "gain < -GREAT_LOSS", f"{HABIT} -k chance"
+    ),
+    Mutant("a candidate plays on for ever", TRIALS, "and n < MOST_PROOFS", "", f"{HABIT} -k plays_on"),
+    Mutant("candidates before anything is learned", TRIALS, "not has_learned or len", "len", f"{HABIT} -k before"),
+    Mutant(
+        "the spread of the habit does not count",
+        TRIALS,
+        "samples = self.candidate_returns, self.habit_returns",
+        "samples = [self.candidate_returns]",
+        f"{HABIT} -k spread",
+    ),
+    Mutant("all dimensions spread alike", REGION, "residuals.square().mean(0)", "residuals.square().mean()", REGIONS),
+    Mutant(
+        "the deviation has no unit", REGION, "(actions - habit_actions) / self.spread", "(actions - habit_actions)", REGIONS
+    ),
+    Mutant(
+        "the pressure grows outside",
+        REGION,
+        "1.0 - self.deviation / self.radius",
+        "self.deviation / self.radius - 1.0",
+        REGIONS,
+    ),
+    Mutant("the multiplier is let go", REGION, ".clamp_(*MULTIPLIERS)", "", REGIONS),
+    Mutant("ties change nothing", REGION, '"tied": 2.0', '"tied": 1.0', REGIONS),
+    Mutant("unpaid ties widen", AGENT, "verdict is not None and is_paid", "verdict is not None", f"{HABIT} -k resized"),
     Mutant("old candidates count", TRIALS, " or self.generations[env] != self.generation", "", f"{HABIT} -k meanwhile"),
     Mutant("short episodes prove at once", TRIALS, "if n < ENOUGH_PROOFS and", "if False and", f"{HABIT} -k short"),
-    Mutant("the noise forgets the spread", AGENT, "self._imitation_spread().reshape(shape[1:])", "9.0", f"{HABIT} -k noise"),
+    Mutant(
+        "the noise forgets the spread",
+        AGENT,
+        "region.spread.clamp_max(self.exploration_noise)",
+        "self.exploration_noise + 0.0 * region.spread",
+        f"{HABIT} -k noise",
+    ),
     Mutant("the warm start's rate stands", AGENT, "* (last / first) ** progress", "", f"{HABIT} -k rates"),
     Mutant("the delay is ignored", AGENT, "self._n_updates % self.policy_delay == 0", "True", f"{HABIT} -k once"),
     # ------------------------------------------------------------------ the batch

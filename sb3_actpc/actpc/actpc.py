@@ -51,7 +51,7 @@ from sb3_actpc.actpc.self_imitation import Episodes, Observations, map_observati
 from sb3_actpc.checkpoints import Restored, between_updates, load_checkpoint, load_weights, save_weights
 from sb3_actpc.demonstrations import fit_demonstrations
 from sb3_actpc.demonstrations.dataset import Demonstrations
-from sb3_actpc.ngc import HebbianChanges, NGCCircuit, settle_coupled
+from sb3_actpc.ngc import CoupledState, HebbianChanges, NGCCircuit, settle_coupled
 from sb3_actpc.utils.checks import check_finite, check_kinds, named_in_errors
 
 SelfActPC = TypeVar("SelfActPC", bound="ActPC")
@@ -64,12 +64,8 @@ EXPERT_SIGNALS_INTERVAL = 1000  # updates between two evaluations of the demonst
 PRETRAINING_INTERVAL = 1000  # updates between two lines about pre-training
 WARM_START_RATES, WARM_START_BATCH = (1e-3, 5e-5), 256  # a precise clone: what follows can only be as good as its habit
 ACTOR_SLOWNESS = 4.0  # how much slower than the others the actor learns, after a warm start
-SMALLEST_EXPLORATION = 0.2  # of ``exploration_noise``, where demonstrations hardly spread
 TARGET_NOISE_CLIP = 2.5  # standard deviations, as TD3's 0.5 for 0.2
 AVERAGING_RATE = 0.001  # per update, of the average of the actor that becomes the habit
-PRESSURE_FACTORS = {"accepted": 1.15, "tied": 1.0, "rejected": 1.0, "relapsed": 0.5}  # what a verdict does to the pressure
-PATIENCE = 4000  # updates that a pressure is given before a relapse can end it
-SMALLEST_PRESSURE, LARGEST_PRESSURE = 0.2, 5.0  # times its first value
 
 
 class ActPC(OffPolicyAlgorithm):
@@ -140,8 +136,8 @@ class ActPC(OffPolicyAlgorithm):
         by what the normaliser has seen until then)
     :param instrumental_form: what the prior's normalised errors r pay: "penalty", -r (the paper's equation), or "unit", 1 - r
     :param signal_errors: the signals sum the squared errors of "all" layers (the paper) or of the "output" alone
-    :param actor_pressure: weight of the critic's pressure on the actor, at first: with a habit it grows with every proof and
-        halves with every relapse (``pressure`` is the present one). 0 leaves refresh alone (cloning)
+    :param actor_pressure: weight of the critic's pressure on the actor, at first: with a habit a trust region
+        (:mod:`sb3_actpc.actpc.trust_region`) regulates it (``pressure`` is the present one). 0 leaves refresh alone (cloning)
     :param scale_pressure: divide the pressure by the batch's mean absolute action-value (at least 1: one paid step)
     :param nudge: scale of the critic's clamped error while actor and critic settle as one (the paper's is 1); None for an
         infinitesimal one, or 1 with ``dynamics="state"``. A sweep ("scheduled") is always infinitesimal
@@ -155,10 +151,10 @@ class ActPC(OffPolicyAlgorithm):
     :param compile: run the updates of sweeping circuits as one graph of ``torch.compile`` (see
         :mod:`~sb3_actpc.actpc.compiled`): True, False or "auto", where the run is long enough to earn it
     :param policy_kwargs: keywords of :class:`~sb3_actpc.actpc.policies.ActPCPolicy`: ``net_arch``, ``n_critics``, ``habit``,
-        ``memory_history`` (the working memory), ``circuit_kwargs`` (of every :class:`~sb3_actpc.ngc.NGCCircuit`:
-        ``n_settling_steps``, ``feedback``, ``dynamics``, ``activation``, ``synaptic_scaling``, ...), ``actor_kwargs``,
-        ``critic_kwargs``, ``generator_kwargs`` and ``prior_kwargs`` (of one, and its ``net_arch``, ``learning_rate`` and
-        ``batch_size``)
+        ``trust_radius``, ``memory_history`` (the working memory), ``circuit_kwargs`` (of every
+        :class:`~sb3_actpc.ngc.NGCCircuit`: ``n_settling_steps``, ``feedback``, ``dynamics``, ``activation``,
+        ``synaptic_scaling``, ...), ``actor_kwargs``, ``critic_kwargs``, ``generator_kwargs`` and ``prior_kwargs`` (of one, and
+        its ``net_arch``, ``learning_rate`` and ``batch_size``)
     :param stats_window_size: as in SB3
     :param tensorboard_log: as in SB3
     :param verbose: as in SB3; from 1 on, ``learn`` also says what the reward is made of
@@ -278,7 +274,7 @@ class ActPC(OffPolicyAlgorithm):
         self.alpha_in = alpha_in
         self.alpha_ext = alpha_ext
         self.signal_errors = signal_errors
-        self.actor_pressure = self.pressure = actor_pressure
+        self.actor_pressure = actor_pressure
         self.scale_pressure = scale_pressure
         self.nudge = nudge
         self.critic_warmup: int = default(critic_warmup, 3000, 0)
@@ -295,8 +291,6 @@ class ActPC(OffPolicyAlgorithm):
         self.instrumental_normalizer = make_normalizer(signal_normalizer)
         self.pretrained, self.n_pretraining_updates = False, 0
         self.trials: Trials | None = None
-        self.relapsed_at = 0  # number of the update
-        self.noise_scale: np.ndarray | None = None  # (A,), of the exploration noise
         if _init_setup_model:
             self._setup_model()
 
@@ -508,6 +502,8 @@ class ActPC(OffPolicyAlgorithm):
         if self.actor_warm_start:
             self.actor.circuit.optimizer.state.clear()  # its moments are those of other learning rates
         _copy(self.actor.circuit, self.actor_target, self.actor.habit, self.policy.actor_average)
+        if self.policy.trust_region is not None and self.actor_warm_start:
+            self.policy.trust_region.fit(self._imitation_residuals())
         self.pretrained = True
 
     def _warm_up_actor(self, progress: float) -> None:
@@ -537,7 +533,10 @@ class ActPC(OffPolicyAlgorithm):
             players = {"actor": self.actor.circuit, "candidate": self.policy.candidate, "habit": self.actor.habit}
             circuits = [players[role] for role in roles]
             scaled, self._rollout_state = self.actor.roll_out(
-                self._last_obs, self._rollout_state, self._rollout_starts, circuits  # type: ignore[arg-type]
+                self._last_obs,
+                self._rollout_state,
+                self._rollout_starts,
+                circuits,  # type: ignore[arg-type]
             )
         if warming_up:
             scaled = self.policy.scale_action(np.array([self.action_space.sample() for _ in range(n_envs)]))
@@ -550,20 +549,18 @@ class ActPC(OffPolicyAlgorithm):
 
     def _exploration(self, shape: tuple[int, ...]) -> np.ndarray:
         """Gaussian noise, no wider in any dimension than the demonstrations spread around the warm-started actor."""
-        if self.noise_scale is None:
-            self.noise_scale = np.full(shape[1:], self.exploration_noise, dtype=np.float32)
-            if self.expert is not None and self.actor_warm_start:
-                spread = self._imitation_spread().reshape(shape[1:])
-                self.noise_scale = np.clip(spread, SMALLEST_EXPLORATION * self.exploration_noise, self.exploration_noise)
-        return np.random.normal(size=shape).astype(np.float32) * self.noise_scale
+        noise = np.random.normal(size=shape).astype(np.float32)
+        region = self.policy.trust_region
+        if region is None:
+            return noise * np.float32(self.exploration_noise)
+        return noise * region.spread.clamp_max(self.exploration_noise).cpu().numpy().reshape(shape[1:])
 
-    def _imitation_spread(self) -> np.ndarray:
-        """Root of the mean squared difference of demonstrated actions and the actor's, (A,)."""
+    def _imitation_residuals(self) -> th.Tensor:
+        """Demonstrated actions minus the actor's, (N, A), of 4096 at most."""
         assert self.expert is not None
         rows = np.random.randint(0, len(self.expert), size=min(len(self.expert), 4096))
         batch = self.expert.batch(rows, self.inputs, self.reward_weights, self.gamma)
-        errors = batch.actions - self.actor.circuit.project(batch.features, batch.memory)
-        return errors.square().mean(0).sqrt().cpu().numpy()
+        return batch.actions - self.actor.circuit.project(batch.features, batch.memory)
 
     def _store_transition(
         self,
@@ -596,18 +593,12 @@ class ActPC(OffPolicyAlgorithm):
             self.trials.step(env, float(reward))
             if not done:
                 continue
-            verdict = self.trials.end(env)
-            if verdict == "relapsed" and self._n_updates < max(self.critic_warmup, self.relapsed_at) + PATIENCE:
-                verdict = "rejected"  # there was too little time to learn
-            unpaid = verdict == "accepted" and not self.trials.habit_return  # nothing is proven where nothing is paid
-            if verdict is not None and not unpaid:
-                bounds = SMALLEST_PRESSURE * self.actor_pressure, LARGEST_PRESSURE * self.actor_pressure
-                self.pressure = float(np.clip(self.pressure * PRESSURE_FACTORS[verdict], *bounds))
+            verdict = self.trials.end(env, has_learned=self._n_updates > self.critic_warmup)
+            region, is_paid = self.policy.trust_region, self.trials.habit_return != 0.0
+            if region is not None and verdict is not None and is_paid:  # nothing is proven where nothing is paid
+                region.resize(verdict)
             if verdict == "accepted":
                 _copy(self.policy.candidate, self.actor.habit)
-            if verdict == "relapsed":
-                self.relapsed_at = self._n_updates
-                _copy(self.actor.habit, self.actor.circuit, self.actor_target, self.policy.actor_average)
             if self.trials.needs_candidate():
                 _copy(self.policy.actor_average, self.policy.candidate)
             self.trials.begin(env)
@@ -734,10 +725,10 @@ class ActPC(OffPolicyAlgorithm):
         changes = self._refresh_changes(len(batch.features)) if self.refresh_weight and self._imitated() else None
         if changes is not None:
             self.diagnostics.change_norms("refresh", changes.scale_(self.refresh_weight))
-        if self.pressure and self._n_updates > self.critic_warmup:
+        if self.actor_pressure and self._n_updates > self.critic_warmup:
             coupled = settle_coupled(self.actor.circuit, self.critic.first(), batch.features, batch.memory, self.nudge)
             pressure = self.actor.circuit.hebbian_update(coupled.actor)
-            weight = self._pressure_weight(self.pressure, coupled.action_values)
+            weight = self._pressure_weight(coupled, batch)
             self.diagnostics.coupled(coupled, pressure, batch.features, batch.memory)
             if changes is None:
                 self.diagnostics.settled("actor", coupled.actor)
@@ -746,9 +737,19 @@ class ActPC(OffPolicyAlgorithm):
         if changes is not None:
             self.actor.circuit.apply_changes(changes)
 
-    def _pressure_weight(self, pressure: float | th.Tensor, action_values: th.Tensor) -> float | th.Tensor:
-        """``pressure``, by option over the batch's mean absolute action-value."""
-        return pressure / action_values.abs().mean().clamp_min(SMALLEST_VALUE_SCALE) if self.scale_pressure else pressure
+    @property
+    def pressure(self) -> float:
+        """The present weight of the critic's pressure."""
+        region = self.policy.trust_region
+        return self.actor_pressure * (1.0 if region is None else float(region.multiplier))
+
+    def _pressure_weight(self, coupled: CoupledState, batch: Batch) -> float | th.Tensor:
+        """As the trust region has it, and by option over the batch's mean absolute action-value."""
+        weight: float | th.Tensor = self.actor_pressure
+        if self.policy.trust_region is not None and self.actor.habit is not None:
+            habit_actions = self.actor.habit.project(batch.features, batch.memory)
+            weight = weight * self.policy.trust_region.regulate(coupled.actions, habit_actions)
+        return weight / coupled.action_values.abs().mean().clamp_min(SMALLEST_VALUE_SCALE) if self.scale_pressure else weight
 
     def _update_critic(self, batch: Batch) -> None:
         """Policy circuit(s): settle on the bootstrapped targets (lines 21 and 22). Without pressure nobody asks them."""
@@ -837,6 +838,8 @@ class ActPC(OffPolicyAlgorithm):
             self.logger.record("train/self_imitation_best_return", memory.best_return)
         if self.trials is not None:
             self.logger.record("train/pressure", self.pressure)
+            if self.policy.trust_region is not None:
+                self.logger.record("train/trust_radius", float(self.policy.trust_region.radius))
             self.logger.record("train/habit_return", self.trials.habit_return)
             self.logger.record("train/habit_generation", self.trials.generation)
 
@@ -877,9 +880,6 @@ class ActPC(OffPolicyAlgorithm):
             "expert_signals": None if expert is None else [expert.epistemic, expert.instrumental, expert.has_signals],
             "diagnostics": dict(self.diagnostics.values),
             "trials": None if self.trials is None else self.trials.checkpoint_state(),
-            "pressure": self.pressure,
-            "relapsed_at": self.relapsed_at,
-            "noise_scale": self.noise_scale,
         }
 
     def restore_checkpoint_state(self, state: dict[str, Any]) -> None:
@@ -903,8 +903,6 @@ class ActPC(OffPolicyAlgorithm):
             vars(normalizer).update(values)
         self.diagnostics.values = dict(state["diagnostics"])
         self.trials = None if state["trials"] is None else Trials(**state["trials"])
-        self.pressure, self.noise_scale = state["pressure"], state["noise_scale"]
-        self.relapsed_at = state["relapsed_at"]
 
     @classmethod
     def load_checkpoint(cls: type[SelfActPC], path: str | PathLike[str], env: GymEnv | str, **keywords: Any) -> Restored:

@@ -25,8 +25,6 @@ class _Given(NamedTuple):
     generator: Batch
     imitated: tuple[th.Tensor, th.Tensor, th.Tensor | None] | None  # features, actions, memory
     target_noise: th.Tensor | None  # (B, A)
-    pressure: th.Tensor  # 0-d
-    refresh: th.Tensor  # 0-d
 
 
 class CompiledUpdate:
@@ -57,8 +55,7 @@ class CompiledUpdate:
         agent = self.agent
         # drawn in the order of the eager update
         imitated = None if actor is None else agent._sample_imitated(len(actor.features))
-        weights = [th.tensor(float(weight), device=agent.device) for weight in (agent.pressure, agent.refresh_weight)]
-        given = _Given(actor, critic, generator, imitated, agent._target_noise(critic), *weights)
+        given = _Given(actor, critic, generator, imitated, agent._target_noise(critic))
         circuits = [*agent.critic, *([agent.generator] if agent.alpha_ep else [])]
         if actor is not None:
             circuits.insert(0, agent.actor.circuit)
@@ -82,9 +79,10 @@ class CompiledUpdate:
         refresh = actor.hebbian_update(actor.settle(*given.imitated))
         coupled = settle_coupled(actor, agent.critic.first(), batch.features, batch.memory)
         pressure = actor.hebbian_update(coupled.actor)
-        weight = agent._pressure_weight(given.pressure, coupled.action_values)
+        weight = agent._pressure_weight(coupled, batch)
         changes = [
-            given.refresh * mine + weight * theirs for mine, theirs in zip(refresh.tensors(), pressure.tensors(), strict=True)
+            agent.refresh_weight * mine + weight * theirs
+            for mine, theirs in zip(refresh.tensors(), pressure.tensors(), strict=True)
         ]
         n = len(refresh.weights)
         return HebbianChanges(changes[:n], changes[n : 2 * n], changes[2 * n :])

@@ -2,24 +2,23 @@
 
 The circuit that learns is pressed by a critic that can be wrong, so it does not act for others at once. A *candidate*, the
 slow average of the learning actor, is frozen and plays every second episode without exploration noise. When it is paid more
-than the habit, it becomes the habit; when two, with none that held its own between them, are paid next to nothing of that,
-the learning actor starts again from the habit. The warm-started clone is the first habit: what the agent does is imitation
-until something better is proven.
+than the habit, by more than chance would have it, it becomes the habit. The warm-started clone is the first habit: what the
+agent does is imitation until something better is proven.
 """
 
 from dataclasses import asdict, dataclass, field
-from statistics import fmean, stdev
+from statistics import fmean
 from typing import Any, Literal
 
 Role = Literal["actor", "candidate", "habit"]
-Verdict = Literal["accepted", "tied", "rejected", "relapsed"]
+Verdict = Literal["accepted", "tied", "rejected"]
 
-N_PROOFS = 2  # episodes of a candidate at least, before it is accepted
+N_PROOFS, MOST_PROOFS = 2, 6  # episodes of a candidate before it is accepted, and while it may still be
 PROOF_STEPS = 500  # environment steps of a candidate at least, before it is judged
 ENOUGH_PROOFS = 10  # episodes after which a candidate is judged however short they were
 KEPT_RETURNS = 5  # of the habit's episodes
-# shares of the habit's mean return: what a candidate must gain, and with what losses it is rejected, or has collapsed
-PROVEN_GAIN, REJECTED_LOSS, RELAPSED_LOSS = 0.03, 0.2, 0.6
+# shares of the habit's mean return: what counts as a gain or a loss, and with what loss a candidate is rejected at once
+SMALLEST_GAIN, GREAT_LOSS = 0.01, 0.2
 
 
 @dataclass
@@ -27,9 +26,9 @@ class Trials:
     """
     Who plays which episode, and what follows from its return. Holds no circuits: the agent copies them as it is told.
 
-    Episodes alternate: with exploration noise by the learning actor, without by the habit or a candidate. Losses are shares
-    of the absolute mean return of the habit. A tie changes nothing: where nothing more is paid, imitation stays. A habit that
-    was paid nothing at all has nothing to lose: any candidate not below 0 is accepted.
+    Episodes alternate: with exploration noise by the learning actor, without by the habit or a candidate. A gain must pass a
+    share of the habit's absolute mean return and its own standard error, of the variance that candidate and habit have in
+    common; while it only passes the first, the candidate plays on.
 
     :param n_envs: environments, each with an episode of its own
     """
@@ -43,7 +42,6 @@ class Trials:
     habit_returns: list[float] = field(default_factory=list)
     candidate_returns: list[float] = field(default_factory=list)
     candidate_steps: int = 0
-    collapses: int = 0  # candidates that lost ``RELAPSED_LOSS`` since one held its own
     tests_habit: bool = True  # the next quiet episode is the habit's: its return must be known, or known better
 
     def __post_init__(self) -> None:
@@ -72,19 +70,20 @@ class Trials:
         self.returns[env] += reward
         self.lengths[env] += 1
 
-    def end(self, env: int) -> Verdict | None:
+    def end(self, env: int, has_learned: bool) -> Verdict | None:
         """
         The episode of ``env`` has ended.
 
-        :return: "accepted": the candidate becomes the habit; "tied": it is dropped, being neither better nor much worse;
-            "rejected": it is dropped, being worse; "relapsed": the second collapse, the learning actor goes back to the
-            habit; None: nothing follows yet
+        :param has_learned: whether the learning actor differs from the habit by more than imitation; there are no candidates
+            before
+        :return: "accepted": the candidate becomes the habit; "tied": it is dropped, being neither proven better nor worse;
+            "rejected": it is dropped, being worse; None: nothing follows yet
         """
         role, episode_return, length = self.roles[env], self.returns[env], self.lengths[env]
         self.returns[env], self.lengths[env] = 0.0, 0
         if role == "habit":
             self.habit_returns = [*self.habit_returns, episode_return][-KEPT_RETURNS:]
-            self.tests_habit = False
+            self.tests_habit = not has_learned or len(self.habit_returns) < N_PROOFS
         if role != "candidate" or self.generations[env] != self.generation:
             return None
         self.candidate_returns.append(episode_return)
@@ -101,24 +100,25 @@ class Trials:
         own, n = self.candidate_returns, len(self.candidate_returns)
         if n < ENOUGH_PROOFS and self.candidate_steps < PROOF_STEPS:
             return None
-        mean, habit = fmean(own), self.habit_return
-        error = stdev(own) / n**0.5 if n > 1 else 0.0
+        gain, error, unit = fmean(own) - self.habit_return, self._standard_error(), abs(self.habit_return)
         verdict: Verdict = "tied"
-        if mean + error < habit - REJECTED_LOSS * abs(habit):
+        if gain + error < -GREAT_LOSS * unit or (n >= N_PROOFS and gain < -SMALLEST_GAIN * unit):
             verdict = "rejected"
-            self.collapses += mean + error < habit - RELAPSED_LOSS * abs(habit)
-        elif n < N_PROOFS:
+        elif n < N_PROOFS or (error > gain >= SMALLEST_GAIN * unit and n < MOST_PROOFS):
             return None
-        elif mean >= habit + PROVEN_GAIN * abs(habit):
+        elif gain > 0.0 and gain >= max(SMALLEST_GAIN * unit, error):
             verdict, self.habit_returns = "accepted", own[-KEPT_RETURNS:]
-        if self.collapses == 2:
-            verdict = "relapsed"
-        if verdict != "rejected":
-            self.collapses = 0
-        self.tests_habit = verdict != "accepted"
+        self.tests_habit = verdict != "accepted" and len(self.habit_returns) < KEPT_RETURNS
         self.candidate_returns, self.candidate_steps = [], 0
         self.generation += 1
         return verdict
+
+    def _standard_error(self) -> float:
+        """Of the difference of the two means, from the variance within both."""
+        samples = self.candidate_returns, self.habit_returns
+        squares = sum((one - fmean(sample)) ** 2 for sample in samples for one in sample)
+        degrees = max(sum(map(len, samples)) - 2, 1)
+        return (squares / degrees * sum(1 / len(sample) for sample in samples if sample)) ** 0.5
 
     def checkpoint_state(self) -> dict[str, Any]:
         """Everything, as plain values."""

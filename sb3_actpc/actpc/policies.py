@@ -20,12 +20,14 @@ from sb3_actpc.actpc.arguments import (
     MAX_CRITICS,
     Between,
     Settings,
+    Weight,
     check_circuit,
     check_extractor,
     check_net_arch,
     check_optimizer,
     checked,
 )
+from sb3_actpc.actpc.trust_region import TrustRegion
 from sb3_actpc.ngc import NGCCircuit, WorkingMemory
 from sb3_actpc.ngc.activations import ACTIVATIONS
 from sb3_actpc.utils.checks import LARGEST_SIZE, check_kinds, named_in_errors
@@ -254,6 +256,8 @@ class ActPCPolicy(BasePolicy):
     :param prior_kwargs: the same for the prior
     :param memory_history: H observations in the working memory of actor, generator and prior; 0 for none
     :param habit: keep the best proven actor beside the one that learns (:mod:`sb3_actpc.actpc.habit`)
+    :param trust_radius: of the first :class:`~sb3_actpc.actpc.trust_region.TrustRegion` around the habit, in variances of the
+        demonstrated actions; 0 for none: the pressure is fixed
     :param features_extractor_class: fixed features extractor (it is never trained)
     :param features_extractor_kwargs: its keywords
     :param normalize_images: divide image observations by 255
@@ -280,6 +284,7 @@ class ActPCPolicy(BasePolicy):
         prior_kwargs: Annotated[Settings | None, check_circuit] = None,
         memory_history: Annotated[int, Between(0, LARGEST_SIZE)] = 0,
         habit: bool = False,
+        trust_radius: Weight = 0.25,
         features_extractor_class: Annotated[type[BaseFeaturesExtractor], check_extractor] = FlattenExtractor,
         features_extractor_kwargs: Settings | None = None,
         normalize_images: bool = True,
@@ -306,7 +311,7 @@ class ActPCPolicy(BasePolicy):
         self.net_arch, self.n_critics, self.memory_history = net_arch, n_critics, memory_history
         self.circuit_kwargs = dict(circuit_kwargs or {})
         self.kwargs_of = dict(zip(CIRCUITS, (actor_kwargs, critic_kwargs, generator_kwargs, prior_kwargs), strict=True))
-        self.habit, self.lr_schedule = habit, lr_schedule
+        self.habit, self.trust_radius, self.lr_schedule = habit, trust_radius, lr_schedule
         self._build()
 
     def _build(self) -> None:
@@ -337,6 +342,7 @@ class ActPCPolicy(BasePolicy):
         # the slow average of the learning actor, and a frozen copy of it that has to prove itself
         self.actor_average = copy.deepcopy(self.actor.circuit) if self.habit else None
         self.candidate = copy.deepcopy(self.actor.circuit) if self.habit else None
+        self.trust_region = TrustRegion(n_actions, self.trust_radius) if self.habit and self.trust_radius else None
         for name, circuit in self.named_circuits():
             circuit.optimizer = self._optimizer(name.partition(".")[0], circuit)
 
@@ -397,6 +403,7 @@ class ActPCPolicy(BasePolicy):
             circuit_kwargs=self.circuit_kwargs,
             memory_history=self.memory_history,
             habit=self.habit,
+            trust_radius=self.trust_radius,
             optimizer_class=self.optimizer_class,
             optimizer_kwargs=self.optimizer_kwargs,
             features_extractor_class=self.features_extractor_class,
