@@ -30,7 +30,7 @@ def test_the_spread_is_the_residuals_root_mean_square_in_every_dimension_and_has
 
 
 def test_the_deviation_is_counted_in_variances_of_each_dimension():
-    """One standard deviation in every dimension is a deviation of 1, whatever its spread; the running mean forgets its start."""
+    """One standard deviation in every dimension is a deviation of 1, whatever its spread; the start is forgotten."""
     region = region_with([0.1, 0.5])
     region.regulate(th.tensor([[0.1, -0.5]] * 4), ZEROS)
     assert float(region.deviation) == pytest.approx(DEVIATION_RATE)
