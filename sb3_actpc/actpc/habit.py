@@ -16,7 +16,7 @@ Verdict = Literal["accepted", "tied", "rejected"]
 N_PROOFS, MOST_PROOFS = 2, 6  # episodes of a candidate before it is accepted, and while it may still be
 PROOF_STEPS = 500  # environment steps of a candidate at least, before it is judged
 ENOUGH_PROOFS = 10  # episodes after which a candidate is judged however short they were
-KEPT_RETURNS = 5  # of the habit's episodes
+HABIT_PROOFS, KEPT_RETURNS = 5, 20  # episodes of the habit that are asked for between candidates, and kept
 # shares of the habit's mean return: what counts as a gain or a loss, and with what loss a candidate is rejected at once
 SMALLEST_GAIN, GREAT_LOSS = 0.01, 0.2
 
@@ -108,7 +108,7 @@ class Trials:
             return None
         elif gain > 0.0 and gain >= max(SMALLEST_GAIN * unit, error):
             verdict, self.habit_returns = "accepted", own[-KEPT_RETURNS:]
-        self.tests_habit = verdict != "accepted" and len(self.habit_returns) < KEPT_RETURNS
+        self.tests_habit = verdict != "accepted" and len(self.habit_returns) < HABIT_PROOFS
         self.candidate_returns, self.candidate_steps = [], 0
         self.generation += 1
         return verdict

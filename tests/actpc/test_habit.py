@@ -14,7 +14,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 from sb3_actpc import ActPC
 from sb3_actpc.actpc import habit as habit_module
 from sb3_actpc.actpc.actpc import AVERAGING_RATE
-from sb3_actpc.actpc.habit import ENOUGH_PROOFS, KEPT_RETURNS, MOST_PROOFS, N_PROOFS, PROOF_STEPS, Trials
+from sb3_actpc.actpc.habit import ENOUGH_PROOFS, HABIT_PROOFS, KEPT_RETURNS, MOST_PROOFS, N_PROOFS, PROOF_STEPS, Trials
 from sb3_actpc.actpc.trust_region import RADIUS_FACTORS
 from tests.actpc.agents import QUICK, differ, make, weights_of
 from tests.actpc.envs import CountingEnv, demonstrations
@@ -62,14 +62,14 @@ def test_noisy_and_quiet_episodes_take_turns_and_the_habit_plays_first():
     assert roles[::2] == ["actor"] * 13
     tie = ["candidate", "candidate"]
     assert roles[1::2] == ["habit", "habit", *tie, "habit", *tie, "habit", *tie, "habit", *tie]
-    assert len(trials.habit_returns) == KEPT_RETURNS
+    assert len(trials.habit_returns) == HABIT_PROOFS
 
 
 def test_before_anything_is_learned_the_quiet_episodes_are_the_habits():
     trials = Trials(1)
     roles = [play(trials, float(paid), has_learned=False)[0] for paid in range(2 * KEPT_RETURNS + 4)]
     assert roles == ["actor", "habit"] * (KEPT_RETURNS + 2)
-    assert trials.habit_returns == [5.0, 7.0, 9.0, 11.0, 13.0]  # the last ones
+    assert trials.habit_returns == [float(paid) for paid in range(5, 2 * KEPT_RETURNS + 4, 2)]  # the last ones
 
 
 def test_environments_take_turns_by_themselves():
@@ -156,7 +156,7 @@ def test_what_an_accepted_candidate_was_paid_is_the_new_habits_return_and_the_ne
     play_quiet(trials, 100.0)
     returns = [200.0 + one for one in range(ENOUGH_PROOFS)]
     assert [play_quiet(trials, one, 1)[1] for one in returns][-1] == "accepted"
-    assert trials.habit_returns == returns[-KEPT_RETURNS:]
+    assert trials.habit_returns == returns
     play(trials, 0.0)
     assert trials.roles == ["candidate"]
 
