@@ -380,7 +380,7 @@ MUTANTS = [
     Mutant("ties change nothing", REGION, '"tied": 2.0', '"tied": 1.0', REGIONS),
     Mutant("unpaid ties widen", AGENT, "verdict is not None and is_paid", "verdict is not None", f"{HABIT} -k resized"),
     Mutant("old candidates count", TRIALS, " or self.generations[env] != self.generation", "", f"{HABIT} -k meanwhile"),
-    Mutant("short episodes prove at once", TRIALS, "if n < ENOUGH_PROOFS and", "if False and", f"{HABIT} -k short"),
+    Mutant("short episodes prove at once", TRIALS, "if not is_tried and", "if False and", f"{HABIT} -k short"),
     Mutant(
         "the noise forgets the spread",
         AGENT,

@@ -98,11 +98,13 @@ class Trials:
 
     def _judge(self) -> Verdict | None:
         own, n = self.candidate_returns, len(self.candidate_returns)
-        if n < ENOUGH_PROOFS and self.candidate_steps < PROOF_STEPS:
-            return None
         gain, error, unit = fmean(own) - self.habit_return, self._standard_error(), abs(self.habit_return)
+        great_loss = gain + error < -GREAT_LOSS * unit
+        is_tried = n >= ENOUGH_PROOFS or self.candidate_steps >= PROOF_STEPS
+        if not is_tried and not (n >= N_PROOFS and great_loss):
+            return None
         verdict: Verdict = "tied"
-        if gain + error < -GREAT_LOSS * unit or (n >= N_PROOFS and gain < -SMALLEST_GAIN * unit):
+        if great_loss or (n >= N_PROOFS and gain < -SMALLEST_GAIN * unit):
             verdict = "rejected"
         elif n < N_PROOFS or (error > gain >= SMALLEST_GAIN * unit and n < MOST_PROOFS):
             return None

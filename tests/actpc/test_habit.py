@@ -145,9 +145,14 @@ def test_the_spread_of_the_habits_own_returns_counts_too():
 
 
 @pytest.mark.parametrize(("length", "n_needed"), [(1, ENOUGH_PROOFS), (PROOF_STEPS // 5, 5), (PROOF_STEPS // 4, 4)])
-@pytest.mark.parametrize(("paid", "verdict"), [(200.0, "accepted"), (100.0, "tied"), (0.0, "rejected")])
+@pytest.mark.parametrize(("paid", "verdict"), [(200.0, "accepted"), (100.0, "tied"), (90.0, "rejected")])
 def test_short_episodes_must_be_many_or_add_up(length, n_needed, paid, verdict):
     assert tried(100.0, [paid] * n_needed, length) == [None] * (n_needed - 1) + [verdict]
+
+
+@pytest.mark.parametrize("length", [1, PROOF_STEPS // 4])
+def test_of_a_great_loss_two_short_episodes_are_proof(length):
+    assert tried(100.0, [0.0, 0.0], length) == [None, "rejected"]
 
 
 def test_what_an_accepted_candidate_was_paid_is_the_new_habits_return_and_the_next_candidate_follows():
