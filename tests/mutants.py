@@ -231,9 +231,9 @@ MUTANTS = [
     Mutant("the largest of the critics bootstraps", AGENT, "reduce(th.minimum", "reduce(th.maximum", f"{LEARNS} -k smallest"),
     Mutant(
         "the epistemic signal is a punishment",
-        AGENT,
-        "epistemic = self.epistemic_normalizer(",
-        "epistemic = -self.epistemic_normalizer(",
+        SIGNALS,
+        "epistemic = self.epistemic(",
+        "epistemic = -self.epistemic(",
         f"{LEARNS} -k 'signals or part'",
     ),
     Mutant(
@@ -299,7 +299,7 @@ MUTANTS = [
         "_copy(self.actor.circuit, self.actor.habit",
         f"{EQUATIONS} -k warm_start",
     ),
-    Mutant("the agent ignores the nudge", AGENT, "memory, self.nudge)", "memory)", f"{LEARNS} -k nudge"),
+    Mutant("the agent ignores the nudge", AGENT, "memory, self.policy.nudge)", "memory)", f"{LEARNS} -k nudge"),
     Mutant(
         "pressure from the first update on",
         AGENT,

@@ -35,7 +35,6 @@ from sb3_actpc.actpc.arguments import (
     check_env,
     check_learning_rate,
     check_noise,
-    check_nudge,
     check_train_freq,
     checked,
 )
@@ -46,7 +45,7 @@ from sb3_actpc.actpc.diagnostics import Diagnostics
 from sb3_actpc.actpc.features import Batch, CircuitInputs
 from sb3_actpc.actpc.habit import Trials
 from sb3_actpc.actpc.policies import POLICIES, ActPCActor, ActPCPolicy, Critics, check_policy, check_policy_kwargs
-from sb3_actpc.actpc.reward_signals import STORED, Normalize, instrumental_reward, make_normalizer, summed_squared_errors
+from sb3_actpc.actpc.reward_signals import InternalSignals, summed_squared_errors
 from sb3_actpc.actpc.self_imitation import Episodes, Observations, map_observations, sample_union
 from sb3_actpc.checkpoints import Restored, between_updates, load_checkpoint, load_weights, save_weights
 from sb3_actpc.demonstrations import fit_demonstrations
@@ -131,16 +130,11 @@ class ActPC(OffPolicyAlgorithm):
     :param alpha_ep: weight of the epistemic signal
     :param alpha_in: weight of the instrumental signal
     :param alpha_ext: weight of the task's reward (the paper's is 0 with demonstrations)
-    :param signal_normalizer: "max" (running maximum, the paper), "saturating" (r / (r + 1)) or "quantile"
-    :param signal_normalization: "stored" (once, when a transition is seen, the paper) or "sampled" (whenever it is replayed,
-        by what the normaliser has seen until then)
-    :param instrumental_form: what the prior's normalised errors r pay: "penalty", -r (the paper's equation), or "unit", 1 - r
-    :param signal_errors: the signals sum the squared errors of "all" layers (the paper) or of the "output" alone
+    :param signal_kwargs: keywords of :class:`~sb3_actpc.actpc.reward_signals.InternalSignals`: ``normalizer``,
+        ``normalization``, ``instrumental_form``, ``errors``; the defaults are the paper's
     :param actor_pressure: weight of the critic's pressure on the actor, at first: with a habit a trust region
         (:mod:`sb3_actpc.actpc.trust_region`) regulates it (``pressure`` is the present one). 0 leaves refresh alone (cloning)
     :param scale_pressure: divide the pressure by the batch's mean absolute action-value (at least 1: one paid step)
-    :param nudge: scale of the critic's clamped error while actor and critic settle as one (the paper's is 1); None for an
-        infinitesimal one, or 1 with ``dynamics="state"``. A sweep ("scheduled") is always infinitesimal
     :param critic_warmup: updates before the critic's pressure reaches the actor
     :param bootstrap: "joint" (target critic at the target actor's next action, the appendix) or "literal" (at the action
         taken, the main text's equation)
@@ -151,7 +145,7 @@ class ActPC(OffPolicyAlgorithm):
     :param compile: run the updates of sweeping circuits as one graph of ``torch.compile`` (see
         :mod:`~sb3_actpc.actpc.compiled`): True, False or "auto", where the run is long enough to earn it
     :param policy_kwargs: keywords of :class:`~sb3_actpc.actpc.policies.ActPCPolicy`: ``net_arch``, ``n_critics``, ``habit``,
-        ``trust_radius``, ``memory_history`` (the working memory), ``circuit_kwargs`` (of every
+        ``trust_radius``, ``nudge``, ``memory_history`` (the working memory), ``circuit_kwargs`` (of every
         :class:`~sb3_actpc.ngc.NGCCircuit`: ``n_settling_steps``, ``feedback``, ``dynamics``, ``activation``,
         ``synaptic_scaling``, ...), ``actor_kwargs``, ``critic_kwargs``, ``generator_kwargs`` and ``prior_kwargs`` (of one, and
         its ``net_arch``, ``learning_rate`` and ``batch_size``)
@@ -206,13 +200,9 @@ class ActPC(OffPolicyAlgorithm):
         alpha_ep: Weight = 0.0,
         alpha_in: Weight = 0.0,
         alpha_ext: float = 1.0,
-        signal_normalizer: Literal["max", "saturating", "quantile"] = "max",
-        signal_normalization: Literal["stored", "sampled"] = "stored",
-        instrumental_form: Literal["penalty", "unit"] = "penalty",
-        signal_errors: Literal["all", "output"] = "all",
+        signal_kwargs: Settings | None = None,
         actor_pressure: Weight = 1.0,
         scale_pressure: bool = True,
-        nudge: Annotated[float | None, check_nudge] = None,
         critic_warmup: Annotated[int | None, Between(0)] = None,
         policy_delay: Size = 2,
         bootstrap: Literal["joint", "literal"] = "joint",
@@ -273,10 +263,8 @@ class ActPC(OffPolicyAlgorithm):
         self.alpha_ep = alpha_ep
         self.alpha_in = alpha_in
         self.alpha_ext = alpha_ext
-        self.signal_errors = signal_errors
         self.actor_pressure = actor_pressure
         self.scale_pressure = scale_pressure
-        self.nudge = nudge
         self.critic_warmup: int = default(critic_warmup, 3000, 0)
         self.policy_delay = policy_delay
         self.bootstrap = bootstrap
@@ -284,11 +272,9 @@ class ActPC(OffPolicyAlgorithm):
         self.target_update_interval = target_update_interval
         self.observation_normalization: str = default(observation_normalization, "demonstrations", "none")
         self.compile = compile
-        self.signal_normalizer = signal_normalizer
-        self.signal_normalization = signal_normalization
-        self.instrumental_form = instrumental_form
-        self.epistemic_normalizer = make_normalizer(signal_normalizer)
-        self.instrumental_normalizer = make_normalizer(signal_normalizer)
+        self.signal_kwargs = signal_kwargs
+        with named_in_errors(f"signal_kwargs={signal_kwargs!r}"):
+            self.signals = InternalSignals(**(signal_kwargs or {}))
         self.pretrained, self.n_pretraining_updates = False, 0
         self.trials: Trials | None = None
         if _init_setup_model:
@@ -619,20 +605,11 @@ class ActPC(OffPolicyAlgorithm):
         features, next_features = (inputs.features(inputs.observations(o)) for o in (observations, next_observations))
         memory = inputs.memory(*inputs.past(past, mask))
         raw_ep, raw_in = self._raw_signals(features, inputs.tensor(actions), next_features, memory)
-        epistemic = self.epistemic_normalizer(raw_ep) if alpha_ep else raw_ep
-        instrumental = raw_in
-        if alpha_in:
-            instrumental = instrumental_reward(self.instrumental_normalizer(raw_in), self.instrumental_form)
+        epistemic, instrumental = self.signals.score(raw_ep, raw_in, alpha_ep, alpha_in)
         check_finite("generator", "signals", epistemic, self.num_timesteps)
         check_finite("prior", "signals", instrumental, self.num_timesteps)
         self.diagnostics.follow(epistemic_signal=epistemic.mean(), instrumental_signal=instrumental.mean())
-        return (raw_ep, raw_in) if self.signal_normalization == "sampled" else (epistemic, instrumental)
-
-    @property
-    def _rewards_of_signals(self) -> tuple[Normalize, Normalize]:
-        """What summed squared errors of generator and prior pay by what the normalisers have seen; these do not move."""
-        instrumental = self.instrumental_normalizer.rescale
-        return self.epistemic_normalizer.rescale, lambda raw: instrumental_reward(instrumental(raw), self.instrumental_form)
+        return (raw_ep, raw_in) if self.signals.normalization == "sampled" else (epistemic, instrumental)
 
     def _raw_signals(
         self, features: th.Tensor, actions: th.Tensor, next_features: th.Tensor, memory: th.Tensor | None
@@ -642,11 +619,11 @@ class ActPC(OffPolicyAlgorithm):
         epistemic, instrumental = np.zeros((2, len(features)), dtype=np.float32)
         if alpha_ep:
             state = self.generator.settle(th.cat([features, actions], dim=1), next_features, memory)
-            epistemic = summed_squared_errors(state, self.signal_errors).cpu().numpy()
+            epistemic = summed_squared_errors(state, self.signals.errors).cpu().numpy()
         if alpha_in:
             state = self.prior.settle(features, next_features, memory)
             self.diagnostics.settled("prior", state)
-            instrumental = summed_squared_errors(state, self.signal_errors).cpu().numpy()
+            instrumental = summed_squared_errors(state, self.signals.errors).cpu().numpy()
         return epistemic, instrumental
 
     # ------------------------------------------------------------------ learning
@@ -700,7 +677,7 @@ class ActPC(OffPolicyAlgorithm):
         if self.expert is None or not self.demonstration_fraction or not any(self.reward_weights[1:]):
             return
         if self._n_updates % EXPERT_SIGNALS_INTERVAL == 1 or not self.expert.has_signals:
-            self.expert.refresh_signals(self._raw_signals, self.inputs, *self._rewards_of_signals)
+            self.expert.refresh_signals(self._raw_signals, self.inputs, *self.signals.paid)
 
     def _sample_batch(self, batch_size: int) -> Batch:
         """Replayed transitions, the newest among them, then the share that comes from the demonstrations."""
@@ -708,8 +685,7 @@ class ActPC(OffPolicyAlgorithm):
         sizes = self._batch_sizes(batch_size)
         largest, inputs, weights = max(sizes), self.inputs, self.reward_weights
         n_expert = round(self.demonstration_fraction * largest) if self.expert is not None else 0
-        rewards_of = self._rewards_of_signals if self.signal_normalization == "sampled" else STORED
-        replayed = self.replay_buffer.sample(largest - n_expert, self._vec_normalize_env, rewards_of)
+        replayed = self.replay_buffer.sample(largest - n_expert, self._vec_normalize_env, self.signals.replayed)
         batch = inputs.replayed(replayed, weights, self.gamma)
         internal = batch.rewards - weights[0] * replayed.rewards
         self.diagnostics.follow(internal_reward=internal.mean, task_reward=replayed.rewards.mean)
@@ -726,7 +702,7 @@ class ActPC(OffPolicyAlgorithm):
         if changes is not None:
             self.diagnostics.change_norms("refresh", changes.scale_(self.refresh_weight))
         if self.actor_pressure and self._n_updates > self.critic_warmup:
-            coupled = settle_coupled(self.actor.circuit, self.critic.first(), batch.features, batch.memory, self.nudge)
+            coupled = settle_coupled(self.actor.circuit, self.critic.first(), batch.features, batch.memory, self.policy.nudge)
             pressure = self.actor.circuit.hebbian_update(coupled.actor)
             weight = self._pressure_weight(coupled, batch)
             self.diagnostics.coupled(coupled, pressure, batch.features, batch.memory)
@@ -876,7 +852,7 @@ class ActPC(OffPolicyAlgorithm):
             "n_pretraining_updates": self.n_pretraining_updates,
             "rollout_state": self._rollout_state,
             "rollout_starts": self._rollout_starts,
-            "normalizers": [dict(vars(self.epistemic_normalizer)), dict(vars(self.instrumental_normalizer))],
+            "signals": self.signals.checkpoint_state(),
             "expert_signals": None if expert is None else [expert.epistemic, expert.instrumental, expert.has_signals],
             "diagnostics": dict(self.diagnostics.values),
             "trials": None if self.trials is None else self.trials.checkpoint_state(),
@@ -898,9 +874,7 @@ class ActPC(OffPolicyAlgorithm):
             self.expert.epistemic, self.expert.instrumental, self.expert.has_signals = signals
         self.pretrained, self.n_pretraining_updates = state["pretrained"], state["n_pretraining_updates"]
         self._rollout_state, self._rollout_starts = state["rollout_state"], state["rollout_starts"]
-        normalizers = self.epistemic_normalizer, self.instrumental_normalizer
-        for normalizer, values in zip(normalizers, state["normalizers"], strict=True):
-            vars(normalizer).update(values)
+        self.signals.restore_checkpoint_state(state["signals"])
         self.diagnostics.values = dict(state["diagnostics"])
         self.trials = None if state["trials"] is None else Trials(**state["trials"])
 

@@ -24,6 +24,7 @@ from sb3_actpc.actpc.arguments import (
     check_circuit,
     check_extractor,
     check_net_arch,
+    check_nudge,
     check_optimizer,
     checked,
 )
@@ -255,6 +256,8 @@ class ActPCPolicy(BasePolicy):
     :param generator_kwargs: the same for the generator
     :param prior_kwargs: the same for the prior
     :param memory_history: H observations in the working memory of actor, generator and prior; 0 for none
+    :param nudge: scale of the critic's clamped error while actor and critic settle as one (the paper's is 1); None for an
+        infinitesimal one, or 1 with ``dynamics="state"``. A sweep ("scheduled") is always infinitesimal
     :param habit: keep the best proven actor beside the one that learns (:mod:`sb3_actpc.actpc.habit`)
     :param trust_radius: of the first :class:`~sb3_actpc.actpc.trust_region.TrustRegion` around the habit, in variances of the
         demonstrated actions; 0 for none: the pressure is fixed
@@ -285,6 +288,7 @@ class ActPCPolicy(BasePolicy):
         memory_history: Annotated[int, Between(0, LARGEST_SIZE)] = 0,
         habit: bool = False,
         trust_radius: Weight = 0.25,
+        nudge: Annotated[float | None, check_nudge] = None,
         features_extractor_class: Annotated[type[BaseFeaturesExtractor], check_extractor] = FlattenExtractor,
         features_extractor_kwargs: Settings | None = None,
         normalize_images: bool = True,
@@ -311,7 +315,8 @@ class ActPCPolicy(BasePolicy):
         self.net_arch, self.n_critics, self.memory_history = net_arch, n_critics, memory_history
         self.circuit_kwargs = dict(circuit_kwargs or {})
         self.kwargs_of = dict(zip(CIRCUITS, (actor_kwargs, critic_kwargs, generator_kwargs, prior_kwargs), strict=True))
-        self.habit, self.trust_radius, self.lr_schedule = habit, trust_radius, lr_schedule
+        self.habit, self.trust_radius, self.nudge = habit, trust_radius, nudge
+        self.lr_schedule = lr_schedule
         self._build()
 
     def _build(self) -> None:
@@ -404,6 +409,7 @@ class ActPCPolicy(BasePolicy):
             memory_history=self.memory_history,
             habit=self.habit,
             trust_radius=self.trust_radius,
+            nudge=self.nudge,
             optimizer_class=self.optimizer_class,
             optimizer_kwargs=self.optimizer_kwargs,
             features_extractor_class=self.features_extractor_class,

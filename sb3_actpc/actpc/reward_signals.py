@@ -1,13 +1,14 @@
 """The internal reward: epistemic and instrumental signals from the errors of settled circuits, and their normalisers."""
 
 from collections.abc import Callable
+from typing import Any, Literal
 
 import numpy as np
 import torch as th
 
+from sb3_actpc.actpc.arguments import checked
 from sb3_actpc.ngc import SettledState
 
-NORMALIZERS = ("max", "saturating", "quantile")
 Normalize = Callable[[np.ndarray], np.ndarray]  # element by element, in any shape
 STORED: tuple[Normalize, Normalize] = (np.asarray, np.asarray)  # both signals pay what was stored
 
@@ -93,15 +94,62 @@ class RunningQuantile:
         return np.minimum(raw / max(self.estimate, 1e-12), 1.0)
 
 
-Normalizer = RunningMaximum | Saturating | RunningQuantile
-
-
-def make_normalizer(name: str) -> Normalizer:
+class InternalSignals:
     """
-    :param name: one of ``NORMALIZERS``
-    :raises ValueError: for another name
+    What both signals are made of, and what their normalisers have seen.
+
+    :param normalizer: "max" (running maximum, the paper), "saturating" (r / (r + 1)) or "quantile"
+    :param normalization: "stored" (once, when a transition is seen, the paper) or "sampled" (whenever it is replayed, by what
+        the normalisers have seen until then)
+    :param instrumental_form: see :func:`instrumental_reward`
+    :param errors: the squared errors of "all" layers are summed (the paper) or of the "output" alone
+    :raises ValueError: for another value
     """
-    kinds: dict[str, type[Normalizer]] = {"max": RunningMaximum, "saturating": Saturating, "quantile": RunningQuantile}
-    if name not in kinds:
-        raise ValueError(f"signal_normalizer={name!r} is unknown; choose one of {list(NORMALIZERS)}")
-    return kinds[name]()
+
+    @checked
+    def __init__(
+        self,
+        normalizer: Literal["max", "saturating", "quantile"] = "max",
+        normalization: Literal["stored", "sampled"] = "stored",
+        instrumental_form: Literal["penalty", "unit"] = "penalty",
+        errors: Literal["all", "output"] = "all",
+    ) -> None:
+        kind = {"max": RunningMaximum, "saturating": Saturating, "quantile": RunningQuantile}[normalizer]
+        self.epistemic, self.instrumental = kind(), kind()
+        self.normalization, self.instrumental_form, self.errors = normalization, instrumental_form, errors
+
+    def score(
+        self, epistemic: np.ndarray, instrumental: np.ndarray, alpha_ep: float, alpha_in: float
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """
+        :param epistemic: summed squared errors r̂ of the generator, (n_envs,); the normalisers follow them
+        :param instrumental: those of the prior
+        :param alpha_ep: a signal without weight stays as it is
+        :param alpha_in: likewise
+        :return: what both pay, (n_envs,) each
+        """
+        if alpha_ep:
+            epistemic = self.epistemic(epistemic)
+        if alpha_in:
+            instrumental = instrumental_reward(self.instrumental(instrumental), self.instrumental_form)
+        return epistemic, instrumental
+
+    @property
+    def paid(self) -> tuple[Normalize, Normalize]:
+        """What summed squared errors of generator and prior pay by what the normalisers have seen; these do not move."""
+        rescale = self.instrumental.rescale
+        return self.epistemic.rescale, lambda raw: instrumental_reward(rescale(raw), self.instrumental_form)
+
+    @property
+    def replayed(self) -> tuple[Normalize, Normalize]:
+        """What stored signals pay when they are replayed."""
+        return self.paid if self.normalization == "sampled" else STORED
+
+    def checkpoint_state(self) -> list[dict[str, Any]]:
+        """What the normalisers have seen."""
+        return [dict(vars(self.epistemic)), dict(vars(self.instrumental))]
+
+    def restore_checkpoint_state(self, state: list[dict[str, Any]]) -> None:
+        """:param state: what :meth:`checkpoint_state` returned"""
+        for normalizer, values in zip((self.epistemic, self.instrumental), state, strict=True):
+            vars(normalizer).update(values)

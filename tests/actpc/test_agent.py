@@ -84,7 +84,7 @@ def test_signals_are_the_summed_squared_errors_over_a_maximum_that_starts_at_one
 def test_output_errors_alone_give_smaller_signals():
     signals = []
     for which in ("all", "output"):
-        model = make(signal_errors=which, signal_normalizer="saturating", learning_starts=1000)
+        model = make(signal_kwargs={"errors": which, "normalizer": "saturating"}, learning_starts=1000)
         model.learn(20)
         signals.append(model.replay_buffer.epistemic[:20].copy())
     assert (signals[1] < signals[0]).all()
@@ -92,7 +92,7 @@ def test_output_errors_alone_give_smaller_signals():
 
 @pytest.mark.parametrize("normalizer", ["max", "saturating", "quantile"])
 def test_every_normalizer_keeps_signals_in_their_range(normalizer):
-    model = make(demonstrations=demonstrations(), signal_normalizer=normalizer)
+    model = make(demonstrations=demonstrations(), signal_kwargs={"normalizer": normalizer})
     model.learn(60)
     assert 0 < model.replay_buffer.epistemic[:60].max() <= 1 and -1 <= model.replay_buffer.instrumental[:60].min() < 0
 
@@ -102,8 +102,9 @@ def test_the_unit_form_pays_one_more_than_the_penalty_for_every_transition(norma
     """1 - r = 1 + (-r): the same settled errors and the same normaliser, so the two differ by 1 everywhere."""
     batches = []
     for form in ("penalty", "unit"):
-        keywords = {"instrumental_form": form, "signal_normalization": normalization, "learning_starts": 1000}
-        model = make(demonstrations=demonstrations(), alpha_ep=0.0, alpha_ext=0.0, **keywords)
+        signals = {"instrumental_form": form, "normalization": normalization}
+        keywords = {"alpha_ep": 0.0, "alpha_ext": 0.0, "learning_starts": 1000}
+        model = make(demonstrations=demonstrations(), signal_kwargs=signals, **keywords)
         model.learn(40)
         np.random.seed(1)
         batches.append(model._sample_batch(32))
@@ -117,7 +118,7 @@ def test_signals_normalised_when_sampled_follow_the_maximum_that_was_seen_last()
     for normalization in ("stored", "sampled"):
         models[normalization] = make(
             demonstrations=demonstrations(),
-            signal_normalization=normalization,
+            signal_kwargs={"normalization": normalization},
             learning_starts=1000,
             alpha_in=0.0,
             alpha_ext=0.0,
@@ -129,7 +130,7 @@ def test_signals_normalised_when_sampled_follow_the_maximum_that_was_seen_last()
     assert np.allclose(models["stored"].replay_buffer.epistemic[:30, 0], raw / running, rtol=1e-5)
     model = models["sampled"]
     for maximum in (running[-1], 10 * running[-1]):
-        model.epistemic_normalizer.maximum = maximum
+        model.signals.epistemic.maximum = maximum
         np.random.seed(1)
         rows = np.concatenate([[29], np.random.randint(0, 30, size=31)])
         np.random.seed(1)
@@ -138,7 +139,8 @@ def test_signals_normalised_when_sampled_follow_the_maximum_that_was_seen_last()
 
 @pytest.mark.parametrize("form", ["penalty", "unit"])
 def test_demonstrated_transitions_are_paid_in_the_same_form(form):
-    model = make(demonstrations=demonstrations(), demonstration_fraction=0.5, instrumental_form=form, alpha_ep=0.0)
+    signals = {"instrumental_form": form}
+    model = make(demonstrations=demonstrations(), demonstration_fraction=0.5, signal_kwargs=signals, alpha_ep=0.0)
     model.learn(30)
     paid = model.expert.instrumental
     assert (0 <= paid.min() and paid.max() <= 1) if form == "unit" else (-1 <= paid.min() and paid.max() <= 0)
@@ -343,9 +345,9 @@ def test_refresh_imitates_the_agents_own_best_episodes_beside_the_demonstrations
 
 def test_the_pressure_has_the_nudge_that_was_asked_for():
     """With SGD at rate 1 the step is the change; a whole nudge moves the settled state, an infinitesimal one does not."""
-    policy_kwargs = {"net_arch": [16, 16], "optimizer_class": th.optim.SGD}
+    policy_kwargs = {"net_arch": [16, 16], "optimizer_class": th.optim.SGD, "nudge": 1.0}
     options = {"settling": "iterative", "learning_rate": 1.0, "replay_buffer_kwargs": NO_MEMORY, "learning_starts": 100}
-    model = make(nudge=1.0, policy_kwargs=policy_kwargs, **options)
+    model = make(policy_kwargs=policy_kwargs, **options)
     model.learn(50)
     batch, actor = model._sample_batch(16), model.actor.circuit
     whole, smallest = (
@@ -660,7 +662,8 @@ def test_discrete_actions_and_images_get_one_clear_line():
     ("keywords", "named"),
     [
         ({"bootstrap": "both"}, "bootstrap='both'"),
-        ({"signal_normalizer": "mean"}, "signal_normalizer='mean'"),
+        ({"signal_kwargs": {"normalizer": "mean"}}, "signal_kwargs={'normalizer': 'mean'}: normalizer='mean'"),
+        ({"signal_kwargs": {"normaliser": "max"}}, "signal_kwargs.*unexpected keyword argument 'normaliser'"),
         ({"target_update_interval": 0}, "target_update_interval=0"),
         ({"demonstration_fraction": 1.5}, "demonstration_fraction=1.5"),
         ({"refresh_weight": -1.0}, "refresh_weight=-1.0"),
@@ -672,7 +675,7 @@ def test_discrete_actions_and_images_get_one_clear_line():
         ),
         ({"action_noise": NormalActionNoise(np.zeros(3), np.ones(3))}, r"shapes \(3,\) and \(3,\), an action has \(2,\)"),
         ({"policy_kwargs": {"n_critics": 0}}, "n_critics=0"),
-        ({"nudge": 0.0}, "nudge=0.0"),
+        ({"policy_kwargs": {"nudge": 0.0}}, "nudge=0.0"),
         ({"actor_warm_start": 10}, "actor_warm_start need demonstrations="),
         ({"n_demonstrations": 3}, "n_demonstrations need demonstrations="),
         (

@@ -65,7 +65,7 @@ def test_actpc(tmp_path: Path, n_envs: int, normalize: bool, stop_at: int) -> No
             "policy_kwargs": {"net_arch": [16, 16], "circuit_kwargs": {"feedback": "tied"}},
             "target_policy_noise": 0.0,
         },
-        {"n_steps": 3, "signal_normalizer": "quantile"},
+        {"n_steps": 3, "signal_kwargs": {"normalizer": "quantile"}},
         {"n_steps": 4, "policy_kwargs": {"net_arch": [16, 16], "memory_history": 3}},
         {"optimize_memory_usage": True, "replay_buffer_kwargs": {"handle_timeout_termination": False}},
         {"demonstration_fraction": 0.0, "actor_warm_start": 0, "observation_normalization": "none"},
