@@ -657,7 +657,7 @@ class ActPC(OffPolicyAlgorithm):
             if self.target_update_interval == 1:
                 self._update_targets(self.tau)
             if self.policy.actor_average is not None:
-                _follow(self.policy.actor_average, self.actor.circuit, AVERAGING_RATE)
+                _follow([self.policy.actor_average], [self.actor.circuit], AVERAGING_RATE)
         self._log_training()
 
     def _batch_sizes(self, batch_size: int) -> tuple[int, int, int]:
@@ -685,7 +685,8 @@ class ActPC(OffPolicyAlgorithm):
         sizes = self._batch_sizes(batch_size)
         largest, inputs, weights = max(sizes), self.inputs, self.reward_weights
         n_expert = round(self.demonstration_fraction * largest) if self.expert is not None else 0
-        replayed = self.replay_buffer.sample(largest - n_expert, self._vec_normalize_env, self.signals.replayed)
+        signals = self.signals.replayed if any(weights[1:]) else None
+        replayed = self.replay_buffer.sample(largest - n_expert, self._vec_normalize_env, signals)
         batch = inputs.replayed(replayed, weights, self.gamma)
         internal = batch.rewards - weights[0] * replayed.rewards
         self.diagnostics.follow(internal_reward=internal.mean, task_reward=replayed.rewards.mean)
@@ -768,8 +769,7 @@ class ActPC(OffPolicyAlgorithm):
 
     def _update_targets(self, tau: float) -> None:
         """Move the target circuits by ``tau`` (1 copies)."""
-        for target, circuit in zip([self.actor_target, *self.critic_target], [self.actor.circuit, *self.critic], strict=True):
-            _follow(target, circuit, tau)
+        _follow([self.actor_target, *self.critic_target], [self.actor.circuit, *self.critic], tau)
 
     def _on_step(self) -> None:
         """Moves the targets where that goes by environment steps."""
@@ -923,11 +923,10 @@ class ActPC(OffPolicyAlgorithm):
         return ["policy", *(f"policy.{name}.optimizer" for name in names)], []
 
 
-def _follow(target: NGCCircuit, circuit: NGCCircuit, tau: float) -> None:
-    """Move all synapses of ``target`` by the share ``tau`` of the way towards those of ``circuit``."""
-    for mine, theirs in zip(target.synapses, circuit.synapses, strict=True):
-        if mine:
-            th._foreach_lerp_(mine, theirs, tau)
+def _follow(targets: list[NGCCircuit], circuits: list[NGCCircuit], tau: float) -> None:
+    """Move all synapses of the ``targets`` by the share ``tau`` of the way towards those of the ``circuits``."""
+    mine, theirs = ([p for circuit in part for kind in circuit.synapses for p in kind] for part in (targets, circuits))
+    th._foreach_lerp_(mine, theirs, tau)
 
 
 def _copy(source: NGCCircuit | None, *targets: NGCCircuit | None) -> None:

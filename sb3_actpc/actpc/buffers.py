@@ -187,12 +187,13 @@ class SignalReplay(ReplayBuffer):
     # ------------------------------------------------------------------ sampling
 
     def sample(  # type: ignore[override]
-        self, batch_size: int, env: VecNormalize | None = None, rewards_of: tuple[Normalize, Normalize] = STORED
+        self, batch_size: int, env: VecNormalize | None = None, rewards_of: tuple[Normalize, Normalize] | None = STORED
     ) -> SignalReplaySamples:
         """
         :param batch_size: B
         :param env: VecNormalize whose statistics normalise observations and the task's rewards
-        :param rewards_of: what stored epistemic and instrumental signals pay, element by element; themselves by default
+        :param rewards_of: what stored epistemic and instrumental signals pay, element by element; themselves by default. None
+            where nobody asks: the signals are 0, and with n-step returns nothing is gathered one step on
         :return: B transitions; with ``combined``, those of the last step (of every environment) come first
         """
         newest = np.arange(min(self.n_envs if self.combined else 0, batch_size))
@@ -221,7 +222,7 @@ class SignalReplay(ReplayBuffer):
         rows: np.ndarray,
         envs: np.ndarray,
         env: VecNormalize | None,
-        rewards_of: tuple[Normalize, Normalize] = STORED,
+        rewards_of: tuple[Normalize, Normalize] | None = STORED,
     ) -> SignalReplaySamples:
         last, mask = rows, None
         history, history_mask = self._history_at(rows, envs, env)
@@ -229,6 +230,11 @@ class SignalReplay(ReplayBuffer):
         if self.n_steps > 1:
             last, mask = self._n_step_window(rows, envs)
             next_history = self._history_at(last, envs, env, including=True)
+        epistemic = instrumental = np.zeros((len(rows), 1), dtype=np.float32)
+        if rewards_of is not None:
+            epistemic = self._summed(self.epistemic, rows, envs, mask, rewards_of[0])
+            instrumental = self._summed(self.instrumental, rows, envs, mask, rewards_of[1])
+        one_step_on = mask is not None and rewards_of is not None
         return SignalReplaySamples(
             observations=self._observations_at(rows, envs, env),
             actions=self.to_torch(self.actions[rows, envs]),
@@ -238,11 +244,11 @@ class SignalReplay(ReplayBuffer):
                 self._summed(self.rewards, rows, envs, mask, lambda rewards: self._normalize_reward(rewards, env))
             ),
             discounts=None if mask is None else self.to_torch(self.gamma ** mask.sum(1, keepdims=True)),
-            epistemic=self.to_torch(self._summed(self.epistemic, rows, envs, mask, rewards_of[0])),
-            instrumental=self.to_torch(self._summed(self.instrumental, rows, envs, mask, rewards_of[1])),
+            epistemic=self.to_torch(epistemic),
+            instrumental=self.to_torch(instrumental),
             history=history,
             history_mask=history_mask,
-            following_observations=None if mask is None else self._next_observations_at(rows, envs, env),
+            following_observations=self._next_observations_at(rows, envs, env) if one_step_on else None,
             next_history=next_history[0],
             next_history_mask=next_history[1],
         )

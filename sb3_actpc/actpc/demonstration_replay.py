@@ -69,10 +69,10 @@ class DemonstrationReplay:
         counts = window < self.ends[rows][:, None]
         last = rows + counts.sum(1) - 1
         rewards = self._rewards(window.clip(max=len(self) - 1), inputs, weights) * counts * gamma**steps
-        next_features = bootstrap_features = self._next_features(rows, inputs)
+        next_features = bootstrap_features = self._next_features(last, inputs)
         next_past: tuple[Any, Any] = (None, None)
         if n_steps > 1:
-            bootstrap_features = self._next_features(last, inputs)
+            next_features = self._next_features(rows, inputs) if weights[1] else bootstrap_features
             next_past = inputs.past(*self.episodes.past(last, self.history, including=True))
         memory, next_memory = inputs.memories(*inputs.past(samples.history, samples.history_mask), features, *next_past)
         return Batch(

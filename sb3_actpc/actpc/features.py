@@ -17,7 +17,8 @@ class Batch(NamedTuple):
 
     :param features: normalised observations, (B, n_features)
     :param actions: (B, A), in [-1, 1]
-    :param next_features: one step on, which generator and prior predict, (B, n_features)
+    :param next_features: one step on, which generator and prior predict, (B, n_features); with n-step returns and no weight
+        of the epistemic signal nobody predicts it, and it is ``bootstrap_features``
     :param bootstrap_features: where the critic's target is bootstrapped: one step on, or n, (B, n_features)
     :param memory: m_t, (B, n_memory), or None
     :param next_memory: the memory where the target is bootstrapped, m_{t+1} or m_{t+n}, (B, n_memory), or None
@@ -151,7 +152,7 @@ class CircuitInputs:
         pasts = samples.history, samples.history_mask, features, samples.next_history, samples.next_history_mask
         memory, next_memory = self.memories(*pasts)
         next_features = bootstrap_features = self.features(samples.next_observations)
-        if samples.following_observations is not None:
+        if weights[1] and samples.following_observations is not None:
             next_features = self.features(samples.following_observations)
         return Batch(
             features=features,

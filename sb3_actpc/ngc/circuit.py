@@ -310,11 +310,14 @@ class NGCCircuit(nn.Module):
     def parameter_groups(self, learning_rate: float) -> list[dict[str, Any]]:
         """
         Parameter groups for a ``torch.optim`` optimiser. The error synapses' rate is γ_e times the weights': an adaptive
-        optimiser cancels a constant factor on the change itself. ``lr_scale`` tells a scheduler that ratio.
+        optimiser cancels a constant factor on the change itself. ``lr_scale`` tells a scheduler that ratio. With γ_e = 1
+        there is one group, which an optimiser steps faster than two.
         """
         forward = [*self.synapses.weights, *self.synapses.biases, *self.synapses.memory]
         groups: list[dict[str, Any]] = [{"params": forward, "lr": learning_rate, "lr_scale": 1.0}]
-        if len(self.synapses.feedback):
+        if self.feedback_rate == 1.0:
+            forward += self.synapses.feedback
+        elif len(self.synapses.feedback):
             scale = self.feedback_rate
             groups.append({"params": self.synapses.feedback, "lr": learning_rate * scale, "lr_scale": scale})
         return groups

@@ -63,7 +63,7 @@ def hebbian_changes(
     :return: the changes to be added
     """
     inverse_batch = 1.0 / len(errors[0])
-    scaled = [error * inverse_batch for error in errors]
+    scaled = th._foreach_mul(errors, inverse_batch)
     return HebbianChanges(
         weights=[multiply(error.t(), activity, bfloat16) for error, activity in zip(scaled, activations, strict=True)],
         biases=[error.sum(0) for error in scaled],

@@ -418,7 +418,7 @@ def test_demonstrated_returns_reach_n_steps_ahead_and_end_with_the_episode():
     data = demonstrations(n_episodes=2, length=5)
     data = dataclasses.replace(data, rewards=np.arange(10.0), terminations=np.arange(10) == 9)
     model = make(demonstrations=data, n_steps=3, alpha_ext=1.0)
-    batch = model.expert.batch(np.array([0, 3, 9]), model.inputs, (1.0, 0.0, 0.0), 0.5, n_steps=3)
+    batch = model.expert.batch(np.array([0, 3, 9]), model.inputs, (1.0, 1.0, 0.0), 0.5, n_steps=3)  # no signals yet
     assert batch.rewards.ravel().tolist() == [0 + 0.5 * 1 + 0.25 * 2, 3 + 0.5 * 4, 9]
     assert batch.discounts.ravel().tolist() == [0.125, 0.25, 0.5]
     assert batch.dones.ravel().tolist() == [0, 0, 1]
@@ -428,7 +428,7 @@ def test_demonstrated_returns_reach_n_steps_ahead_and_end_with_the_episode():
 
 def test_with_n_step_returns_generator_and_prior_still_predict_one_step():
     """Their surprise is measured one step on; trained n steps on, they would be surprised by everything."""
-    model = make(demonstrations=demonstrations(), n_steps=3, alpha_ext=1.0, demonstration_fraction=0.5)
+    model = make(demonstrations=demonstrations(), n_steps=3, alpha_ext=1.0, alpha_ep=1.0, demonstration_fraction=0.5)
     model.learn(40)
     buffer, size = model.replay_buffer, model.replay_buffer.pos
     pairs = zip(
@@ -441,6 +441,9 @@ def test_with_n_step_returns_generator_and_prior_still_predict_one_step():
     one_step_on = [following[tuple(row)] for row in batch.features.tolist()]
     assert [tuple(row) for row in batch.next_features.tolist()] == one_step_on
     assert differ([batch.next_features], [batch.bootstrap_features])
+    model.alpha_ep = 0.0  # nobody predicts: the gathering is left out
+    batch = model._sample_batch(64)
+    assert not differ([batch.next_features], [batch.bootstrap_features])
 
 
 def test_a_circuit_with_a_smaller_batch_takes_the_newest_and_a_fair_mixture_of_the_rest():
