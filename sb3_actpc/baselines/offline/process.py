@@ -1,16 +1,17 @@
-"""A program of :mod:`sb3_actpc.baselines.offline.servers`, in its own virtual environment, asked through its pipes."""
+"""A program of :mod:`sb3_actpc.baselines.offline.servers`, in its own virtual environment, asked through a pipe."""
 
 from __future__ import annotations
 
 import os
-import select
 import subprocess
 import tempfile
-import time
 from collections.abc import Sequence
+from multiprocessing import Pipe
 from typing import Any
 
 from sb3_actpc.baselines.offline.servers.frames import Arrays, Values, pack, unpack
+
+MAX_ANSWER = 2**30  # bytes
 
 
 class ServerFailed(OSError):
@@ -19,7 +20,7 @@ class ServerFailed(OSError):
 
 class ServerProcess:
     """
-    A child process that answers questions; it ends with its parent, whose death closes its standard input.
+    A child process that answers questions; it ends with its parent, whose death closes the pipe.
 
     :param command: its program and arguments
     :param name: for messages
@@ -30,27 +31,24 @@ class ServerProcess:
 
     def __init__(self, command: Sequence[str], name: str, timeout: float, threads: int = 1) -> None:
         self.name, self.timeout = name, timeout
-        self._is_closed = False
         environment = {key: value for key, value in os.environ.items() if key not in ("PYTHONPATH", "PYTHONHOME")}
         environment |= {"OMP_NUM_THREADS": str(threads), "PYTHONDONTWRITEBYTECODE": "1"}
         self._log = tempfile.TemporaryFile()
+        self._channel, theirs = Pipe()
         try:
-            # a session of its own: what is typed at the terminal (Ctrl-C) is for the parent, who then closes the pipes
             self._process = subprocess.Popen(
-                command,
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
+                [*command, str(theirs.fileno())],
+                pass_fds=[theirs.fileno()],
+                stdin=subprocess.DEVNULL,
+                stdout=self._log,
                 stderr=self._log,
                 env=environment,
-                start_new_session=True,
-                bufsize=0,
+                start_new_session=True,  # Ctrl-C is for the parent, who then closes the pipe
             )
         except OSError as error:
-            self._log.close()
             raise ServerFailed(f"{name} cannot be started: {error}") from error
-        assert self._process.stdin is not None and self._process.stdout is not None
-        self._questions, self._answers = self._process.stdin.fileno(), self._process.stdout.fileno()
-        os.set_blocking(self._questions, False)
+        finally:
+            theirs.close()
 
     def ask(self, what: str, arrays: Arrays | None = None, **values: Any) -> tuple[Values, Arrays]:
         """
@@ -61,49 +59,27 @@ class ServerProcess:
         :raises ServerFailed: when there is none; the process is then ended
         :raises ValueError: when the answer is that the question was wrong; likewise
         """
-        if self._is_closed:
+        if self._channel.closed:
             raise ServerFailed(f"{self.name} has ended before: close() the agent, which starts it again as it was last saved")
-        deadline = time.monotonic() + self.timeout
+        is_answered = False
         try:
-            self._write(pack({"ask": what, **values}, arrays or {}), deadline)
-            answer, answered = unpack(lambda n: self._read(n, deadline))
-        except ServerFailed:
-            self.close()
-            raise
-        except ValueError as error:
-            self.close()
+            self._channel.send_bytes(pack({"ask": what, **values}, arrays or {}))
+            if not self._channel.poll(self.timeout):
+                raise TimeoutError
+            answer, answered = unpack(self._channel.recv_bytes(MAX_ANSWER))
+            is_answered = "error" not in answer
+        except TimeoutError:
+            raise ServerFailed(f"{self.name} gave no answer within {self.timeout:.0f} seconds") from None
+        except (EOFError, ConnectionError):
+            raise ServerFailed(self._ending()) from None
+        except (OSError, ValueError) as error:
             raise ServerFailed(f"{self.name} said what is no answer to {what!r}: {error}") from None
-        except BaseException:  # interrupted between question and answer: they would no longer fit together
-            self.close()
-            raise
+        finally:
+            if not is_answered:  # also when interrupted: the next answer would not fit its question
+                self.close()
         if "error" in answer:
-            self.close()
             raise ValueError(f"{self.name}: {answer['error']}")
         return answer, answered
-
-    def _write(self, data: bytes, deadline: float) -> None:
-        view = memoryview(data)
-        while view:
-            _, ready, _ = select.select([], [self._questions], [], max(0.0, deadline - time.monotonic()))
-            if not ready:
-                raise ServerFailed(f"{self.name} took nothing in for {self.timeout:.0f} seconds")
-            try:
-                view = view[os.write(self._questions, view) :]
-            except BrokenPipeError:
-                raise ServerFailed(self._ending()) from None
-
-    def _read(self, n: int, deadline: float) -> bytes:
-        parts, missing = [], n
-        while missing:
-            ready, _, _ = select.select([self._answers], [], [], max(0.0, deadline - time.monotonic()))
-            if not ready:
-                raise ServerFailed(f"{self.name} gave no answer within {self.timeout:.0f} seconds")
-            part = os.read(self._answers, missing)
-            if not part:
-                raise ServerFailed(self._ending())
-            parts.append(part)
-            missing -= len(part)
-        return b"".join(parts)
 
     def _ending(self) -> str:
         try:
@@ -116,13 +92,10 @@ class ServerProcess:
 
     def close(self) -> None:
         """End the process, at once."""
-        self._is_closed = True
-        if self._process.poll() is None:
-            self._process.kill()
+        self._process.kill()
         self._process.wait()
-        for stream in (self._process.stdin, self._process.stdout, self._log):
-            if stream is not None:
-                stream.close()
+        self._channel.close()
+        self._log.close()
 
     def __del__(self) -> None:
         if hasattr(self, "_process"):

@@ -1,7 +1,7 @@
 """Offline methods of other packages (BCQ and CQL by d3rlpy, HBC and IRIS by robomimic), evaluated like every other algorithm.
 
 Each trains and acts in a process of its own, in the virtual environment that ``sb3-actpc baselines install`` makes: the
-packages pin other versions than this one. Demonstrations go in and actions come out through pipes
+packages pin other versions than this one. Demonstrations go in and actions come out through a pipe
 (:mod:`sb3_actpc.baselines.offline.servers.frames`), so the episodes are played here, in our environments.
 """
 

@@ -18,12 +18,7 @@ class Server:
     transitions: Arrays
 
     def build(self, values: Values, arrays: Arrays) -> tuple[Values, Arrays]:
-        """
-        :param values: method, n_observations, n_actions, seed, and method_kwargs: of d3rlpy's config, and ``net_arch``, the
-            hidden sizes of all networks
-        :param arrays: none
-        :return: nothing
-        """
+        """``method_kwargs`` are those of d3rlpy's config, and ``net_arch``, the hidden sizes of all networks."""
         import d3rlpy
 
         random.seed(values["seed"])
@@ -39,20 +34,12 @@ class Server:
         return {}, {}
 
     def show(self, values: Values, arrays: Arrays) -> tuple[Values, Arrays]:
-        """
-        :param values: none
-        :param arrays: observations, actions, next_observations, rewards, terminations of N transitions
-        :return: nothing
-        """
+        """Transitions to learn from."""
         self.transitions = arrays
         return {}, {}
 
     def train(self, values: Values, arrays: Arrays) -> tuple[Values, Arrays]:
-        """
-        :param values: none
-        :param arrays: none
-        :return: the losses of one update
-        """
+        """One update."""
         from d3rlpy.dataset import TransitionMiniBatch
 
         rows = self.random.integers(len(self.transitions["actions"]), size=self.algorithm.batch_size)
@@ -70,29 +57,17 @@ class Server:
         return {name: float(loss) for name, loss in self.algorithm.update(batch).items()}, {}
 
     def predict(self, values: Values, arrays: Arrays) -> tuple[Values, Arrays]:
-        """
-        :param values: none
-        :param arrays: observations (n, obs_dim)
-        :return: actions (n, A)
-        """
+        """Without a state."""
         return {}, {"actions": self.algorithm.predict(arrays["observations"]).astype(np.float32)}
 
     def save(self, values: Values, arrays: Arrays) -> tuple[Values, Arrays]:
-        """
-        :param values: none
-        :param arrays: none
-        :return: all parameters, those of the optimisers too, as bytes
-        """
+        """Those of the optimisers too."""
         buffer = io.BytesIO()
         self.algorithm.impl.save_model(buffer)
         return {}, {"parameters": np.frombuffer(buffer.getvalue(), dtype=np.uint8)}
 
     def load(self, values: Values, arrays: Arrays) -> tuple[Values, Arrays]:
-        """
-        :param values: none
-        :param arrays: parameters, what :meth:`save` returned
-        :return: nothing
-        """
+        """What :meth:`save` returned."""
         self.algorithm.impl.load_model(io.BytesIO(arrays["parameters"].tobytes()))
         return {}, {}
 

@@ -1,24 +1,22 @@
-"""What two processes say to each other: plain values as JSON, and numpy arrays byte by byte. Nothing is unpickled.
+"""What two processes say to each other through a pipe: plain values as JSON and numpy arrays, as one ``.npz``.
 
-A frame is ``MARK``, the length of its header (4 bytes, big-endian), the header (JSON: the values, and name, type and shape of
-each array) and the bytes of the arrays. The standard library and numpy are enough to read one.
+Nothing is unpickled. The standard library and numpy are enough to read it.
 """
 
 from __future__ import annotations
 
+import io
 import json
-import os
-import struct
 import sys
 import traceback
 from collections.abc import Callable
+from contextlib import suppress
+from multiprocessing.connection import Connection
 from typing import Any
 
 import numpy as np
 
-MARK = b"ACTP"
-MAX_HEADER, MAX_ARRAYS = 2**20, 2**32  # bytes
-DTYPES = ("<f4", "<f8", "<i8", "|u1", "|b1")
+VALUES = "values"  # the entry that holds them
 
 Values = dict[str, Any]
 Arrays = dict[str, np.ndarray]
@@ -28,89 +26,49 @@ Handler = Callable[[Values, Arrays], tuple[Values, Arrays]]
 def pack(values: Values, arrays: Arrays) -> bytes:
     """
     :param values: what JSON can hold
-    :param arrays: of ``DTYPES``
-    :return: the frame
-    :raises ValueError: for arrays of other types
+    :param arrays: of numbers
+    :return: the message
+    :raises ValueError: for arrays of objects
     """
-    listed, parts = [], []
     for name, array in arrays.items():
-        array = np.ascontiguousarray(array).astype(array.dtype.newbyteorder("<"), copy=False)
-        if array.dtype.str not in DTYPES:
-            raise ValueError(f"array {name!r} has the type {array.dtype}, which no frame holds")
-        listed.append([name, array.dtype.str, list(array.shape)])
-        parts.append(array.tobytes())
-    header = json.dumps({"values": values, "arrays": listed}).encode()
-    return b"".join([MARK, struct.pack(">I", len(header)), header, *parts])
+        if array.dtype.hasobject:
+            raise ValueError(f"array {name!r} has the type {array.dtype}, which no message holds")
+    message = io.BytesIO()
+    np.savez(message, **{VALUES: np.frombuffer(json.dumps(values).encode(), np.uint8)}, **arrays)  # type: ignore[arg-type]
+    return message.getvalue()
 
 
-def unpack(read: Callable[[int], bytes]) -> tuple[Values, Arrays]:
+def unpack(message: bytes) -> tuple[Values, Arrays]:
     """
-    :param read: gives exactly so many bytes
-    :return: values and arrays of the next frame
-    :raises ValueError: when the bytes are no frame
+    :param message: what :func:`pack` returned
+    :return: its values and arrays
+    :raises ValueError: when it is no such message
     """
-    start = read(len(MARK) + 4)
-    if start[: len(MARK)] != MARK:
-        raise ValueError(f"expected an answer, found {start!r}")
-    n_header = struct.unpack(">I", start[len(MARK) :])[0]
-    if n_header > MAX_HEADER:
-        raise ValueError(f"expected a header of at most {MAX_HEADER} bytes, found {n_header}")
     try:
-        header = json.loads(read(n_header))
-        values = dict(header["values"])
-        listed = [(str(name), str(dtype), tuple(shape)) for name, dtype, shape in header["arrays"]]
-        sizes = [_n_bytes(dtype, shape) for _, dtype, shape in listed]
-    except (ValueError, TypeError, KeyError) as error:
-        raise ValueError(f"expected values and arrays, found a damaged header ({error})") from None
-    if sum(sizes) > MAX_ARRAYS:
-        raise ValueError(f"expected arrays of at most {MAX_ARRAYS} bytes, found {sum(sizes)}")
-    arrays = {}
-    for (name, dtype, shape), size in zip(listed, sizes, strict=True):
-        arrays[name] = np.frombuffer(read(size), dtype=dtype).reshape(shape).copy()
-    return values, arrays
-
-
-def _n_bytes(dtype: str, shape: tuple[int, ...]) -> int:
-    if dtype not in DTYPES or not all(isinstance(n, int) and n >= 0 for n in shape):
-        raise ValueError(f"an array of type {dtype} and shape {shape}")
-    n_values = 1
-    for n in shape:
-        n_values *= n
-    return n_values * np.dtype(dtype).itemsize
+        with np.load(io.BytesIO(message), allow_pickle=False) as stored:
+            arrays = dict(stored)
+        return dict(json.loads(arrays.pop(VALUES).tobytes())), arrays
+    except Exception as error:  # the readers of zip and npy have a dozen kinds
+        raise ValueError(f"expected values and arrays, found {message[:16]!r} ({error})") from None
 
 
 def serve(handlers: dict[str, Handler]) -> int:
-    """Answer the frames on the standard input until it ends.
+    """Answer the questions of the pipe whose number is the last argument of this program, until it is closed.
 
-    What libraries print goes to the standard error: the standard output is for the answers alone. An exception is the answer
-    ``{"error": ...}`` and ends the program.
+    An exception is the answer ``{"error": ...}`` and ends the program.
 
-    :param handlers: what to do, by the ``ask`` of a frame; given its values and arrays, returns those of the answer
+    :param handlers: what to do, by the ``ask`` of a question; given its values and arrays, returns those of the answer
     :return: exit code
     """
-    answers = os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)
-    while True:
-        try:
-            values, arrays = unpack(_read_stdin)
-        except EOFError:  # the other side has ended
-            return 0
-        try:
-            frame = pack(*handlers[values.pop("ask")](values, arrays))
-        except Exception as error:
-            traceback.print_exc()
-            frame = pack({"error": f"{type(error).__name__}: {error}"}, {})
-        try:
-            answers.write(frame)
-            answers.flush()
-        except BrokenPipeError:
-            return 0
-        if b'"error"' in frame[:32]:
-            return 1
-
-
-def _read_stdin(n: int) -> bytes:
-    data = sys.stdin.buffer.read(n)
-    if len(data) < n:
-        raise EOFError
-    return data
+    channel = Connection(int(sys.argv[-1]))
+    with suppress(EOFError, ConnectionError):  # the other side has ended
+        while True:
+            values, arrays = unpack(channel.recv_bytes())
+            try:
+                answer = pack(*handlers[values.pop("ask")](values, arrays))
+            except Exception as error:
+                traceback.print_exc()
+                channel.send_bytes(pack({"error": f"{type(error).__name__}: {error}"}, {}))
+                return 1
+            channel.send_bytes(answer)
+    return 0

@@ -25,12 +25,7 @@ class Server:
     transitions: Arrays
 
     def build(self, values: Values, arrays: Arrays) -> tuple[Values, Arrays]:
-        """
-        :param values: method, n_observations, n_actions, batch_size, seed, and method_kwargs: of the ``algo`` part of
-            robomimic's config, by its own names
-        :param arrays: none
-        :return: nothing
-        """
+        """``method_kwargs`` are of the ``algo`` part of robomimic's config."""
         stand_in_for_torchvision()
         import torch
         from robomimic.algo import algo_factory
@@ -65,21 +60,12 @@ class Server:
         return {}, {}
 
     def show(self, values: Values, arrays: Arrays) -> tuple[Values, Arrays]:
-        """
-        :param values: none
-        :param arrays: observations, actions, next_observations, rewards, terminations of N transitions, and last_rows, the
-            index of the last transition of each one's episode
-        :return: nothing
-        """
+        """Transitions to learn from."""
         self.transitions = arrays
         return {}, {}
 
     def train(self, values: Values, arrays: Arrays) -> tuple[Values, Arrays]:
-        """
-        :param values: none
-        :param arrays: none
-        :return: the losses of one update of every part
-        """
+        """One update of every part."""
         import torch
 
         shown = self.transitions
@@ -102,11 +88,8 @@ class Server:
     def predict(self, values: Values, arrays: Arrays) -> tuple[Values, Arrays]:
         """
         As robomimic's ``get_action``, for n episodes that need not begin together: a new subgoal every
-        ``subgoal_update_interval`` steps, the actor's memory emptied every ``horizon`` steps.
-
-        :param values: none
-        :param arrays: observations (n, obs_dim); episode_starts (n,), true where one begins; after the first step, the state
-        :return: actions (n, A); the state: state_subgoals (n, obs_dim), state_age (n,), state_memory (n, n_memory)
+        ``subgoal_update_interval`` steps, the actor's memory emptied every ``horizon`` steps. The state is state_subgoals
+        (n, obs_dim), state_age (n,) and state_memory (n, n_memory).
         """
         import torch
 
@@ -130,12 +113,7 @@ class Server:
         return {}, {"actions": actions.numpy(), **state}
 
     def subgoals(self, observations: Any, is_due: np.ndarray, before: np.ndarray | None) -> Any:
-        """
-        :param observations: (n, obs_dim)
-        :param is_due: (n,), where a new subgoal is due
-        :param before: (n, obs_dim), the subgoals so far
-        :return: the subgoals, (n, obs_dim)
-        """
+        """The subgoals ``before``, (n, obs_dim), or new ones where they are due, (n,)."""
         import torch
 
         subgoals = torch.zeros_like(observations) if before is None else torch.from_numpy(before.copy())
@@ -145,11 +123,7 @@ class Server:
         return subgoals
 
     def unflatten(self, memory: np.ndarray, like: Any) -> tuple[Any, ...]:
-        """
-        :param memory: (n, n_memory)
-        :param like: the actor's empty memory
-        :return: its parts, each (n_layers, n, hidden_size)
-        """
+        """The parts of a memory, each (n_layers, n, hidden_size), as those of ``like``, from (n, n_memory)."""
         import torch
 
         parts = parts_of(like)
@@ -158,11 +132,7 @@ class Server:
         return tuple(pieces[:, index].transpose(0, 1).contiguous() for index in range(len(parts)))
 
     def save(self, values: Values, arrays: Arrays) -> tuple[Values, Arrays]:
-        """
-        :param values: none
-        :param arrays: none
-        :return: all parameters, as bytes; robomimic keeps none of its optimisers
-        """
+        """robomimic keeps none of its optimisers."""
         import torch
 
         buffer = io.BytesIO()
@@ -170,11 +140,7 @@ class Server:
         return {}, {"parameters": np.frombuffer(buffer.getvalue(), dtype=np.uint8)}
 
     def load(self, values: Values, arrays: Arrays) -> tuple[Values, Arrays]:
-        """
-        :param values: none
-        :param arrays: parameters, what :meth:`save` returned
-        :return: nothing
-        """
+        """What :meth:`save` returned."""
         import torch
 
         self.algorithm.deserialize(torch.load(io.BytesIO(arrays["parameters"].tobytes()), weights_only=True))
@@ -187,10 +153,8 @@ def parts_of(memory: Any) -> tuple[Any, ...]:
 
 
 def update(config: Any, values: dict[str, Any], where: str) -> None:
-    """
-    :param config: robomimic's, or a part of it
-    :param values: what to change in it, mappings in mappings
-    :param where: how the user would name this part
+    """Change values, mappings in mappings, in a part of robomimic's config, which the user calls ``where``.
+
     :raises ValueError: for a key that it does not have
     """
     for key, value in values.items():
