@@ -78,6 +78,10 @@ class CloningPolicy(BasePolicy):
         """
         return ((observations - self.mean) / self.spread).clamp(-LARGEST_INPUT, LARGEST_INPUT)
 
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        names = ("observation_space", "action_space", "optimizer_class", "optimizer_kwargs")
+        return {**{name: getattr(self, name) for name in names}, "lr_schedule": self._dummy_schedule}
+
 
 class BCPolicy(CloningPolicy):
     """
@@ -107,7 +111,7 @@ class BCPolicy(CloningPolicy):
         return self(self.normalized(observation.float().flatten(1))).clamp(-1, 1)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
-        return {**_shared_parameters(self), "net_arch": self.net_arch}
+        return {**super()._get_constructor_parameters(), "net_arch": self.net_arch}
 
 
 class BCRNNPolicy(CloningPolicy):
@@ -221,15 +225,4 @@ class BCRNNPolicy(CloningPolicy):
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         names = ("cell", "hidden_size", "n_layers", "restart_every")
-        return {**_shared_parameters(self), **{name: getattr(self, name) for name in names}}
-
-
-def _shared_parameters(policy: CloningPolicy) -> dict[str, Any]:
-    """What :meth:`BasePolicy.save` keeps to build the policy again; the learning rate is of no use then."""
-    return {
-        "observation_space": policy.observation_space,
-        "action_space": policy.action_space,
-        "lr_schedule": policy._dummy_schedule,
-        "optimizer_class": policy.optimizer_class,
-        "optimizer_kwargs": policy.optimizer_kwargs,
-    }
+        return {**super()._get_constructor_parameters(), **{name: getattr(self, name) for name in names}}

@@ -18,24 +18,36 @@ from sb3_actpc.baselines.demonstration_buffers import (
     demonstration_buffer_class,
 )
 from sb3_actpc.demonstrations import Demonstrations, fit_demonstrations
+from sb3_actpc.utils.checks import check_range
 
 
 class LearnsFromDemonstrations(BaseAlgorithm):
-    """The demonstrations of an algorithm: what the user asked for, and what of it fits the environment."""
+    """
+    The demonstrations of an algorithm: what the user asked for, and what of it fits the environment.
 
-    demonstrations: Demonstrations | str | Path | None
-    n_demonstrations: int | None
-    n_demonstration_transitions: int | None
+    :param policy: as SB3's
+    :param env: as SB3's
+    :param demonstrations: a path, or a :class:`~sb3_actpc.demonstrations.dataset.Demonstrations`; None learns without
+    :param n_demonstrations: use only the first so many episodes of them
+    :param n_demonstration_transitions: use only the first so many transitions
+    :param options: keywords of the algorithm
+    :raises ValueError: for demonstrations that do not fit the environment
+    """
 
-    def _set_demonstrations(
+    def __init__(
         self,
-        demonstrations: Demonstrations | str | Path | None,
-        n_demonstrations: int | None,
-        n_demonstration_transitions: int | None,
+        policy: Any,
+        env: GymEnv | str | None,
+        *,
+        demonstrations: Demonstrations | str | Path | None = None,
+        n_demonstrations: int | None = None,
+        n_demonstration_transitions: int | None = None,
+        **options: Any,
     ) -> None:
         # a saved agent holds the path as it was given, and no object of one system's paths
         self.demonstrations = os.fspath(demonstrations) if isinstance(demonstrations, Path) else demonstrations
         self.n_demonstrations, self.n_demonstration_transitions = n_demonstrations, n_demonstration_transitions
+        super().__init__(policy, env, **options)
 
     def _fitted_demonstrations(self) -> Demonstrations:
         assert self.demonstrations is not None
@@ -52,9 +64,20 @@ class DemonstratedAlgorithm(LearnsFromDemonstrations, OffPolicyAlgorithm):
 
     An agent that is loaded without an environment, to be played, gets a buffer of one transition and does not look for its
     demonstrations; :meth:`set_env` makes the whole buffer.
+
+    :param policy: as SB3's
+    :param env: as SB3's
+    :param demonstration_fraction: share of each batch that comes from the demonstrations; without them it has no effect
+    :param options: keywords of :class:`LearnsFromDemonstrations` and of the algorithm
+    :raises ValueError: as there, and for a share out of range
     """
 
-    demonstration_fraction: float
+    def __init__(
+        self, policy: Any, env: GymEnv | str | None, *, demonstration_fraction: float = 0.5, **options: Any
+    ) -> None:
+        check_range(locals(), "demonstration_fraction", 0, 1)
+        self.demonstration_fraction = demonstration_fraction
+        super().__init__(policy, env, **options)
 
     def _setup_model(self) -> None:
         asked = self.replay_buffer_class

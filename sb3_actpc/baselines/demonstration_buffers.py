@@ -63,6 +63,7 @@ class WithDemonstrations(ReplayBuffer):
     :raises ValueError: for a share out of range
     """
 
+    _demonstrated_class: ClassVar[type[ReplayBuffer]]
     _own_keywords: ClassVar[tuple[str, ...]] = ()  # of a subclass, not for the demonstrations' buffer
 
     def __init__(
@@ -79,14 +80,9 @@ class WithDemonstrations(ReplayBuffer):
         if demonstrations is not None:
             skipped = {"n_envs", "optimize_memory_usage", *self._own_keywords}
             kwargs = {key: value for key, value in kwargs.items() if key not in skipped}
-            kind: Any = self._demonstrated_class
-            self.demonstrated = kind(len(demonstrations), *args[1:], n_envs=1, **kwargs)
+            self.demonstrated = self._demonstrated_class(len(demonstrations), *args[1:], n_envs=1, **kwargs)
             assert isinstance(self.action_space, spaces.Box)
             fill_with_demonstrations(self.demonstrated, demonstrations, self.observation_space, self.action_space)
-
-    @property
-    def _demonstrated_class(self) -> type[ReplayBuffer]:
-        raise NotImplementedError
 
     def n_demonstrated(self, batch_size: int) -> int:
         """

@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 from collections import deque
 from functools import partial
-from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -20,10 +19,10 @@ from stable_baselines3.common.type_aliases import GymEnv
 from torch import nn
 
 from sb3_actpc.baselines.demonstrated import LearnsFromDemonstrations
-from sb3_actpc.demonstrations.dataset import Demonstrations
 from sb3_actpc.utils.checks import check_kinds, check_range
 
 ZERO_DELTA = 6e-7  # at or below this the guidance step is left out (the authors' code)
+_NETS = ("discriminator", "guidance_value", "discriminator_optimizer", "guidance_value_optimizer")
 
 
 class Guidance(NamedTuple):
@@ -65,9 +64,6 @@ class LOGO(LearnsFromDemonstrations, TRPO):
 
     :param policy: "MlpPolicy"
     :param env: a task with Box observations and actions
-    :param demonstrations: a path, or a :class:`~sb3_actpc.demonstrations.dataset.Demonstrations`; None for TRPO
-    :param n_demonstrations: use only the first so many episodes of them
-    :param n_demonstration_transitions: use only the first so many transitions
     :param guidance_delta: δ at the start, mean Kullback-Leibler divergence of the guidance step
     :param guidance_iterations: iterations before δ can shrink
     :param guidance_decay: what δ is then multiplied by
@@ -78,7 +74,8 @@ class LOGO(LearnsFromDemonstrations, TRPO):
     :param target_kl: as TRPO's, the paper's ``high_kl``
     :param cg_max_steps: as TRPO's
     :param line_search_shrinking_factor: as TRPO's
-    :param options: further keywords of sb3-contrib's TRPO
+    :param options: keywords of :class:`~sb3_actpc.baselines.demonstrated.LearnsFromDemonstrations` (without demonstrations it
+        is TRPO) and of sb3-contrib's TRPO
     :raises ValueError: for a keyword with a value that is not allowed, for demonstrations that do not fit the environment,
         and for other spaces
     """
@@ -90,9 +87,6 @@ class LOGO(LearnsFromDemonstrations, TRPO):
         policy: str | type[ActorCriticPolicy],
         env: GymEnv | str | None,
         *,
-        demonstrations: Demonstrations | str | Path | None = None,
-        n_demonstrations: int | None = None,
-        n_demonstration_transitions: int | None = None,
         guidance_delta: float = 0.01,
         guidance_iterations: int = 50,
         guidance_decay: float = 0.95,
@@ -103,7 +97,6 @@ class LOGO(LearnsFromDemonstrations, TRPO):
         target_kl: float = 0.01,
         cg_max_steps: int = 10,
         line_search_shrinking_factor: float = 0.5,
-        _init_setup_model: bool = True,
         **options: Any,
     ) -> None:
         given = locals()
@@ -112,16 +105,6 @@ class LOGO(LearnsFromDemonstrations, TRPO):
         check_range(given, f"guidance_iterations {numbers}", 0)
         check_range(given, "guidance_decay", 0, 1)
         check_range(given, "discriminator_updates", 1)
-        super().__init__(
-            policy,
-            env,  # type: ignore[arg-type]
-            target_kl=target_kl,
-            cg_max_steps=cg_max_steps,
-            line_search_shrinking_factor=line_search_shrinking_factor,
-            _init_setup_model=False,
-            **options,
-        )
-        self._set_demonstrations(demonstrations, n_demonstrations, n_demonstration_transitions)
         self.guidance_delta, self.guidance_iterations = guidance_delta, guidance_iterations
         self.guidance_decay, self.guidance_delta_min = guidance_decay, guidance_delta_min
         self.discriminator_learning_rate, self.discriminator_updates = discriminator_learning_rate, discriminator_updates
@@ -129,8 +112,8 @@ class LOGO(LearnsFromDemonstrations, TRPO):
         self.delta = guidance_delta
         self._iteration_returns: list[float] = []
         self._past_returns: deque[float] = deque(maxlen=10)
-        if _init_setup_model:
-            self._setup_model()
+        options |= {"target_kl": target_kl, "cg_max_steps": cg_max_steps}
+        super().__init__(policy, env, line_search_shrinking_factor=line_search_shrinking_factor, **options)
 
     # ------------------------------------------------------------------ setting up
 
@@ -195,12 +178,11 @@ class LOGO(LearnsFromDemonstrations, TRPO):
             values = self.guidance_value(flat[0].reshape(shape)).reshape(buffer.n_envs, -1).T
             last = th.as_tensor(np.asarray(self._last_obs), dtype=th.float32, device=self.device)
             last_values = self.guidance_value(last.reshape(buffer.n_envs, -1))[:, 0]
-        ends = np.concatenate([buffer.episode_starts[1:], np.asarray(self._last_episode_starts)[None]]).astype(np.float32)
-        advantages = generalized_advantages(
-            rewards, values, th.as_tensor(ends, device=self.device), last_values, self.gamma, self.gae_lambda
-        )
-        returns = (advantages + values).T.flatten()
-        advantages = advantages.T.flatten()
+        judged = copy.copy(buffer)  # the same steps with the discriminator's rewards, for SB3's advantages
+        judged.rewards, judged.values = rewards.cpu().numpy(), values.cpu().numpy()
+        judged.advantages = np.zeros_like(judged.rewards)
+        judged.compute_returns_and_advantage(last_values, np.asarray(self._last_episode_starts))
+        advantages, returns = (buffer.to_torch(part.T.flatten()) for part in (judged.advantages, judged.returns))
         self.logger.record("train/guidance_reward", rewards.mean().item())
         return Guidance(
             observations=flat[0],
@@ -287,36 +269,8 @@ class LOGO(LearnsFromDemonstrations, TRPO):
     # ------------------------------------------------------------------ saving
 
     def _excluded_save_params(self) -> list[str]:
-        nets = ["discriminator", "guidance_value", "discriminator_optimizer", "guidance_value_optimizer"]
-        return [*super()._excluded_save_params(), "_shown", *nets]
+        return [*super()._excluded_save_params(), "_shown", *_NETS]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         names, variables = super()._get_torch_save_params()
-        if self.demonstrations is not None:
-            nets = ["discriminator", "guidance_value", "discriminator_optimizer", "guidance_value_optimizer"]
-            names = [*names, *nets]
-        return names, variables
-
-
-def generalized_advantages(
-    rewards: th.Tensor, values: th.Tensor, ends: th.Tensor, last_values: th.Tensor, gamma: float, gae_lambda: float
-) -> th.Tensor:
-    """
-    Generalised advantage estimation (Schulman et al., arXiv 1506.02438, eq. 16).
-
-    :param rewards: (T, n_envs)
-    :param values: (T, n_envs), of the observations acted on
-    :param ends: (T, n_envs), 1 where the episode ended with the step
-    :param last_values: (n_envs,), of the observations after the last step
-    :param gamma: discount
-    :param gae_lambda: λ
-    :return: (T, n_envs)
-    """
-    advantages = th.zeros_like(rewards)
-    following, next_values = th.zeros_like(last_values), last_values
-    for step in reversed(range(len(rewards))):
-        goes_on = 1.0 - ends[step]
-        error = rewards[step] + gamma * goes_on * next_values - values[step]
-        following = error + gamma * gae_lambda * goes_on * following
-        advantages[step], next_values = following, values[step]
-    return advantages
+        return names if self.demonstrations is None else [*names, *_NETS], variables

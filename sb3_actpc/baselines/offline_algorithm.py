@@ -70,7 +70,7 @@ class OfflineAlgorithm(LearnsFromDemonstrations):
         super().__init__(
             policy,
             env,
-            learning_rate,
+            learning_rate=learning_rate,
             policy_kwargs=policy_kwargs,
             stats_window_size=stats_window_size,
             tensorboard_log=tensorboard_log,
@@ -79,8 +79,10 @@ class OfflineAlgorithm(LearnsFromDemonstrations):
             seed=seed,
             support_multi_env=True,
             supported_action_spaces=(spaces.Box,),
+            demonstrations=demonstrations,
+            n_demonstrations=n_demonstrations,
+            n_demonstration_transitions=n_demonstration_transitions,
         )
-        self._set_demonstrations(demonstrations, n_demonstrations, n_demonstration_transitions)
         self.batch_size = batch_size
         if _init_setup_model:
             self._setup_model()

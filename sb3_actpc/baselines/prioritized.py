@@ -10,7 +10,7 @@ from stable_baselines3.common.type_aliases import DictReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
-from sb3_actpc.baselines.demonstration_buffers import WithDemonstrations, join_batches
+from sb3_actpc.baselines.demonstration_buffers import DemonstrationHerReplayBuffer, join_batches
 from sb3_actpc.utils.checks import check_range
 
 
@@ -153,14 +153,7 @@ class PrioritizedHerReplayBuffer(HerReplayBuffer):
         self._tree[np.arange(self.priorities.size)] = self.priorities.reshape(-1)
 
 
-class DemonstrationPrioritizedHerReplayBuffer(WithDemonstrations, PrioritizedHerReplayBuffer):
+class DemonstrationPrioritizedHerReplayBuffer(DemonstrationHerReplayBuffer, PrioritizedHerReplayBuffer):
     """The same with demonstrations, which are drawn uniformly and have weight 1."""
 
-    _demonstrated_class = HerReplayBuffer
     _own_keywords: ClassVar[tuple[str, ...]] = ("alpha", "beta", "beta_increment", "epsilon")
-
-    def set_env(self, env: Any) -> None:
-        """:param env: the environment whose ``compute_reward`` relabels"""
-        super().set_env(env)
-        if isinstance(self.demonstrated, HerReplayBuffer) and self.demonstrated.env is None:
-            self.demonstrated.set_env(env)

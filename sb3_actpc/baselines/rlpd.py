@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any, ClassVar
 
 import torch as th
@@ -14,8 +13,6 @@ from stable_baselines3.sac.policies import SACPolicy
 from torch import nn
 
 from sb3_actpc.baselines.demonstrated import DemonstratedAlgorithm
-from sb3_actpc.demonstrations.dataset import Demonstrations
-from sb3_actpc.utils.checks import check_range
 
 
 class LayerNormCritic(ContinuousCritic):
@@ -102,13 +99,9 @@ class RLPD(DemonstratedAlgorithm, SAC):
 
     :param policy: "MlpPolicy" or "MultiInputPolicy"; ``policy_kwargs`` takes ``n_critics`` and ``n_target_critics``
     :param env: as SB3's
-    :param demonstrations: a path, or a :class:`~sb3_actpc.demonstrations.dataset.Demonstrations`; None learns without
-    :param n_demonstrations: use only the first so many episodes of them
-    :param n_demonstration_transitions: use only the first so many transitions
-    :param demonstration_fraction: share of each batch that comes from them; without demonstrations it has no effect
     :param learning_starts: as SB3's
     :param gradient_steps: as SB3's
-    :param options: further keywords of SB3's SAC
+    :param options: keywords of :class:`~sb3_actpc.baselines.demonstrated.DemonstratedAlgorithm` and of SB3's SAC
     :raises ValueError: for a keyword with a value that is not allowed, for demonstrations that do not fit the environment
     """
 
@@ -122,25 +115,8 @@ class RLPD(DemonstratedAlgorithm, SAC):
         policy: str | type[SACPolicy],
         env: GymEnv | str | None,
         *,
-        demonstrations: Demonstrations | str | Path | None = None,
-        n_demonstrations: int | None = None,
-        n_demonstration_transitions: int | None = None,
-        demonstration_fraction: float = 0.5,
         learning_starts: int = 5000,
         gradient_steps: int = 20,
-        _init_setup_model: bool = True,
         **options: Any,
     ) -> None:
-        check_range(locals(), "demonstration_fraction", 0, 1)
-        super().__init__(
-            policy,
-            env,  # type: ignore[arg-type]
-            learning_starts=learning_starts,
-            gradient_steps=gradient_steps,
-            _init_setup_model=False,
-            **options,
-        )
-        self._set_demonstrations(demonstrations, n_demonstrations, n_demonstration_transitions)
-        self.demonstration_fraction = demonstration_fraction
-        if _init_setup_model:
-            self._setup_model()
+        super().__init__(policy, env, learning_starts=learning_starts, gradient_steps=gradient_steps, **options)

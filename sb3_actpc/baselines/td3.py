@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,6 @@ from stable_baselines3.td3.policies import TD3Policy
 
 from sb3_actpc.actpc.self_imitation import map_observations
 from sb3_actpc.baselines.demonstrated import DemonstratedAlgorithm
-from sb3_actpc.demonstrations.dataset import Demonstrations
 from sb3_actpc.utils.checks import check_kinds, check_range
 
 OPTIMIZERS: dict[str, type[th.optim.Optimizer]] = {"adam": th.optim.Adam, "adamw": th.optim.AdamW}
@@ -32,14 +30,10 @@ class TD3Demo(DemonstratedAlgorithm, TD3):
 
     :param policy: as SB3's
     :param env: as SB3's
-    :param demonstrations: a path, or a :class:`~sb3_actpc.demonstrations.dataset.Demonstrations`; None learns without
-    :param n_demonstrations: use only the first so many episodes of them
-    :param n_demonstration_transitions: use only the first so many transitions
-    :param demonstration_fraction: share of each batch that comes from them; without demonstrations it has no effect
     :param actor_kwargs: of the actor alone: ``learning_rate`` (a number; it follows the schedule of the algorithm's),
         ``optimizer`` ("adam" or "adamw"), ``optimizer_kwargs`` and ``tau``
     :param critic_kwargs: the same for the critic
-    :param options: further keywords of SB3's TD3
+    :param options: keywords of :class:`~sb3_actpc.baselines.demonstrated.DemonstratedAlgorithm` and of SB3's TD3
     :raises ValueError: for a keyword with a value that is not allowed, for demonstrations that do not fit the environment
     """
 
@@ -48,23 +42,13 @@ class TD3Demo(DemonstratedAlgorithm, TD3):
         policy: str | type[TD3Policy],
         env: GymEnv | str | None,
         *,
-        demonstrations: Demonstrations | str | Path | None = None,
-        n_demonstrations: int | None = None,
-        n_demonstration_transitions: int | None = None,
-        demonstration_fraction: float = 0.5,
         actor_kwargs: dict[str, Any] | None = None,
         critic_kwargs: dict[str, Any] | None = None,
-        _init_setup_model: bool = True,
         **options: Any,
     ) -> None:
         check_kinds(locals(), mappings="actor_kwargs critic_kwargs")
-        check_range(locals(), "demonstration_fraction", 0, 1)
-        super().__init__(policy, env, _init_setup_model=False, **options)  # type: ignore[arg-type]
-        self._set_demonstrations(demonstrations, n_demonstrations, n_demonstration_transitions)
-        self.demonstration_fraction = demonstration_fraction
         self.actor_kwargs, self.critic_kwargs = actor_kwargs, critic_kwargs
-        if _init_setup_model:
-            self._setup_model()
+        super().__init__(policy, env, **options)
 
     def _setup_model(self) -> None:
         super()._setup_model()

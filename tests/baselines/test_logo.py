@@ -5,13 +5,12 @@ import copy
 import numpy as np
 import pytest
 import torch as th
-from gymnasium import spaces
 from sb3_contrib import TRPO
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_actpc.baselines import LOGO
-from sb3_actpc.baselines.logo import Guidance, generalized_advantages
+from sb3_actpc.baselines.logo import Guidance
 from sb3_actpc.demonstrations.dataset import Demonstrations
 from tests.recordings import record
 
@@ -31,24 +30,6 @@ def test_without_demonstrations_it_is_trpo_number_by_number() -> None:
     trpo = TRPO("MlpPolicy", "Pendulum-v1", cg_max_steps=10, line_search_shrinking_factor=0.5, **SMALL).learn(128)
     logo = LOGO("MlpPolicy", "Pendulum-v1", **SMALL).learn(128)
     assert th.equal(weights(trpo), weights(logo))
-
-
-def test_advantages_are_those_of_sb3() -> None:
-    """Two environments, episodes ending in mid-batch and at its last step."""
-    rng = np.random.default_rng(0)
-    buffer = RolloutBuffer(7, spaces.Box(-1, 1, (1,)), spaces.Box(-1, 1, (1,)), gae_lambda=0.9, gamma=0.8, n_envs=2)
-    rewards, values = rng.normal(size=(2, 7, 2)).astype(np.float32)
-    ends = rng.random((8, 2)) < 0.4
-    for step in range(7):
-        start = ends[step - 1] if step else np.ones(2)
-        zeros = np.zeros((2, 1))
-        buffer.add(zeros, zeros, rewards[step], start, th.as_tensor(values[step]), th.zeros(2))
-    last_values = th.randn(2)
-    buffer.compute_returns_and_advantage(last_values, ends[6])
-    mine = generalized_advantages(
-        th.as_tensor(rewards), th.as_tensor(values), th.as_tensor(ends[:7], dtype=th.float32), last_values, 0.8, 0.9
-    )
-    assert mine.numpy() == pytest.approx(buffer.advantages, abs=1e-5)
 
 
 def test_the_discriminator_learns_who_acted() -> None:
@@ -172,7 +153,7 @@ def test_rows_of_two_environments_keep_together(monkeypatch: pytest.MonkeyPatch)
     model = LOGO("MlpPolicy", env, demonstrations=record("Pendulum-v1"), **{**SMALL, "n_steps": 24})
     prepared: list[Guidance] = []
     given: list[th.Tensor] = []
-    prepare, advantages = LOGO._prepare_guidance, generalized_advantages
+    prepare, advantages = LOGO._prepare_guidance, RolloutBuffer.compute_returns_and_advantage
 
     def watched(self: LOGO, shown: th.Tensor) -> Guidance:
         buffer = self.rollout_buffer
@@ -190,13 +171,14 @@ def test_rows_of_two_environments_keep_together(monkeypatch: pytest.MonkeyPatch)
         prepared.append(guidance)
         return guidance
 
-    def watched_advantages(rewards: th.Tensor, *others: object) -> th.Tensor:
-        given.append(rewards)
-        result = th.arange(48.0).reshape(24, 2)  # step * 2 + environment, to find them again
-        return result if advantages(rewards, *others).shape == result.shape else rewards
+    def watched_advantages(self: RolloutBuffer, last_values: th.Tensor, dones: np.ndarray) -> None:
+        advantages(self, last_values, dones)
+        if self is not model.rollout_buffer:  # the guidance's
+            given.append(th.as_tensor(self.rewards))
+            self.advantages = np.arange(48, dtype=np.float32).reshape(24, 2)  # step * 2 + environment, to find them again
 
     monkeypatch.setattr(LOGO, "_prepare_guidance", watched)
-    monkeypatch.setattr("sb3_actpc.baselines.logo.generalized_advantages", watched_advantages)
+    monkeypatch.setattr(RolloutBuffer, "compute_returns_and_advantage", watched_advantages)
     model.learn(48)
     expected = th.cat([th.arange(0.0, 48.0, 2.0), th.arange(1.0, 48.0, 2.0)])
     assert prepared[0].advantages == pytest.approx((expected - expected.mean()) / expected.std(), abs=1e-5)
