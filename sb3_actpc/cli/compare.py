@@ -31,10 +31,7 @@ _COMPARISON = (
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the sub-command.
-
-    :param subparsers: where to add it
-    """
+    """Add the sub-command."""
     parser = subparsers.add_parser(
         "compare",
         help="train several algorithms on several tasks with several seeds",
@@ -75,15 +72,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 
 def run(args: argparse.Namespace) -> int:
-    """Bring the runs to their end.
-
-    :param args: parsed arguments
-    :return: exit code: 0, 1 when runs have failed, 75 when a signal or a full disk stopped the command
-    :raises ValueError: when a name, a number or a setting is wrong, or another command works in the folder
-    :raises FileNotFoundError: when a file is missing
-    """
+    """Bring the runs to their end; 1 when runs have failed, 75 when a signal or a full disk stopped the command."""
     from sb3_actpc.experiments.comparison import plan_runs, read_comparison
-    from sb3_actpc.experiments.comparison.display import describe_runs, make_display
+    from sb3_actpc.experiments.comparison.display import Display, describe_runs
     from sb3_actpc.experiments.comparison.engines import make_engine
     from sb3_actpc.experiments.comparison.schedule import run_comparison
 
@@ -93,7 +84,7 @@ def run(args: argparse.Namespace) -> int:
         print(describe_runs(runs))
         return 0
     threads = max(run.threads for run in runs)
-    with make_display(not args.no_progress) as display:
+    with Display(not args.no_progress) as display:
         summary = run_comparison(
             runs,
             folder,

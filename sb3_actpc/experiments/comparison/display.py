@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from statistics import median
-from types import TracebackType
 
 import pandas as pd
 from rich.console import Console
@@ -14,139 +13,79 @@ from sb3_actpc.experiments.comparison.execution import DISK_FULL, FINISHED, LOST
 from sb3_actpc.experiments.runs import Run
 from sb3_actpc.experiments.runs.record import read_result
 
-_WORDS = {
-    LOST: "lost, will go on",
-    STOPPED: "stopped, will go on",
-    DISK_FULL: "stopped by a full disk",
-}
+_WORDS = {LOST: "lost, will go on", STOPPED: "stopped, will go on", DISK_FULL: "stopped by a full disk"}
 
 
-class LineDisplay:
-    """A line for every run that begins or ends.
+class Display:
+    """A line for every run that begins or ends; in a terminal, bars of the runs under way and of the steps of all.
 
-    :param write: given each line
-    """
-
-    def __init__(self, write: Callable[[str], None]) -> None:
-        self.write = write
-        self.n_runs, self.n_finished = 0, 0
-
-    def __enter__(self) -> LineDisplay:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        """Nothing is to be put away."""
-
-    def begin(self, runs: Sequence[Run], n_finished: int) -> None:
-        """:param runs: those still to do
-        :param n_finished: those done before"""
-        self.n_runs, self.n_finished = len(runs) + n_finished, n_finished
-        self.line(f"{n_finished} runs are done, {len(runs)} to do")
-
-    def started(self, run: Run) -> None:
-        """:param run: now under way"""
-        self.line(f"started   {run.label}")
-
-    def stepped(self, run: Run, steps: int) -> None:
-        """:param run: under way
-        :param steps: so far"""
-
-    def ended(self, run: Run, outcome: Outcome) -> None:
-        """:param run: no longer under way
-        :param outcome: what came of it"""
-        self.n_finished += outcome.status == FINISHED
-        message = f": {outcome.message}" if outcome.message else ""
-        word = _WORDS.get(outcome.status, outcome.status)
-        self.line(f"{word:9s} {run.label}{message}  ({self.n_finished} of {self.n_runs} runs done)")
-
-    def line(self, text: str) -> None:
-        """:param text: one line"""
-        self.write(text)
-
-
-class LiveDisplay(LineDisplay):
-    """Bars of the runs under way, and one for the steps of all.
-
+    :param bars: False for lines alone
     :param console: of rich
     """
 
-    def __init__(self, console: Console) -> None:
-        super().__init__(lambda text: console.print(text, markup=False, highlight=False))
-        columns = (
-            TextColumn("{task.description}"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TimeElapsedColumn(),
-            TimeRemainingColumn(),
-        )
-        self.progress = Progress(*columns, console=console)
+    def __init__(self, bars: bool = True, console: Console | None = None) -> None:
+        self.console = console or Console()
+        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
+        times, is_hidden = (TimeElapsedColumn(), TimeRemainingColumn()), not (bars and self.console.is_terminal)
+        self.progress = Progress(*columns, *times, console=self.console, disable=is_hidden)
+        self.n_runs, self.n_finished = 0, 0
         self._bars: dict[str, TaskID] = {}
         self._steps: dict[str, int] = {}  # done by this command or before
 
-    def __enter__(self) -> LiveDisplay:
+    def __enter__(self) -> Display:
         self.progress.start()
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        """Leave the terminal as it was."""
+    def __exit__(self, *error: object) -> None:
         self.progress.stop()
 
     def begin(self, runs: Sequence[Run], n_finished: int) -> None:
-        """:param runs: those still to do
-        :param n_finished: those done before"""
-        super().begin(runs, n_finished)
+        """Runs that are still to do, and how many were done before."""
+        self.n_runs, self.n_finished = len(runs) + n_finished, n_finished
+        self.line(f"{n_finished} runs are done, {len(runs)} to do")
         self._bars[""] = self.progress.add_task("all steps", total=sum(run.n_timesteps or 0 for run in runs))
 
     def started(self, run: Run) -> None:
-        """:param run: now under way"""
+        """It is now under way."""
+        if self.progress.disable:
+            self.line(f"started   {run.label}")
         self._bars[run.id] = self.progress.add_task(run.label, total=run.n_timesteps)
 
     def stepped(self, run: Run, steps: int) -> None:
-        """:param run: under way
-        :param steps: so far"""
+        """It has done so many steps."""
         self._steps[run.id] = steps
         self.progress.update(self._bars[run.id], completed=steps)
         self.progress.update(self._bars[""], completed=sum(self._steps.values()))
 
     def ended(self, run: Run, outcome: Outcome) -> None:
-        """:param run: no longer under way
-        :param outcome: what came of it"""
+        """It is no longer under way."""
         if outcome.status == FINISHED:
             self.stepped(run, run.n_timesteps or 0)
-        super().ended(run, outcome)
+        self.n_finished += outcome.status == FINISHED
+        message = f": {outcome.message}" if outcome.message else ""
+        word = _WORDS.get(outcome.status, outcome.status)
+        self.line(f"{word:9s} {run.label}{message}  ({self.n_finished} of {self.n_runs} runs done)")
         self.progress.remove_task(self._bars.pop(run.id))
 
-
-def make_display(live: bool) -> LineDisplay:
-    """
-    :param live: bars, where the output is a terminal
-    :return: context manager
-    """
-    console = Console()
-    if live and console.is_terminal:
-        return LiveDisplay(console)
-    return LineDisplay(lambda text: print(text, flush=True))
+    def line(self, text: str) -> None:
+        """Show a line, above the bars."""
+        self.console.print(text, markup=False, highlight=False, soft_wrap=True)
 
 
 def describe_runs(runs: Sequence[Run]) -> str:
     """The runs as a table, with the seconds that they took; those not finished with what finished runs of the same task,
-    variant and steps took (the median), where there are any.
-
-    :param runs: of a comparison
-    :return: lines
-    """
+    variant and steps took (the median), where there are any."""
     status = {run.id: run_status(run.folder) for run in runs}
     taken = {run.id: float(read_result(run.folder)["wall_seconds"]) for run in runs if status[run.id] == FINISHED}
 
+    def kind(run: Run) -> tuple[str | None, str | None, int | None]:
+        return run.task, run.name, run.n_timesteps
+
     def seconds(run: Run) -> str:
-        alike = [taken[other.id] for other in runs if other.id in taken and _kind(other) == _kind(run)]
+        alike = [taken[other.id] for other in runs if other.id in taken and kind(other) == kind(run)]
         known = taken.get(run.id, median(alike) if alike else None)
         return "" if known is None else f"{known:.0f}"
 
     rows = [[run.id, run.task, run.name, run.seed, run.n_timesteps, status[run.id], seconds(run)] for run in runs]
     table = pd.DataFrame(rows, columns=["id", "task", "variant", "seed", "steps", "state", "seconds"])
     return f"{table.to_string(index=False)}\n\n{len(runs) - len(taken)} of {len(runs)} runs to do"
-
-
-def _kind(run: Run) -> tuple[str | None, str | None, int | None]:
-    return run.task, run.name, run.n_timesteps

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from sb3_actpc.checkpoints import StopSignals
-from sb3_actpc.experiments.comparison.display import LineDisplay
+from sb3_actpc.experiments.comparison.display import Display
 from sb3_actpc.experiments.comparison.engines import Engine, Event
 from sb3_actpc.experiments.comparison.execution import (
     DISK_FULL,
@@ -54,7 +54,7 @@ def run_comparison(
     runs: Sequence[Run],
     folder: Path,
     make_engine: Callable[[], Engine],
-    display: LineDisplay,
+    display: Display,
     retry_failed: bool = False,
 ) -> Summary:
     """Bring every run of a table to its end that is not there yet.
@@ -91,18 +91,14 @@ def run_comparison(
 
 
 def is_to_do(status: str, retry_failed: bool) -> bool:
-    """
-    :param status: of a run
-    :param retry_failed: whether failed ones are tried again
-    :return: whether the command will execute it
-    """
+    """Whether the command will execute a run of this status."""
     return status != FINISHED and (retry_failed or status != FAILED)
 
 
 class _Scheduler:
     """Keeps an engine busy."""
 
-    def __init__(self, engine: Engine, display: LineDisplay, runs: Sequence[Run], summary: Summary) -> None:
+    def __init__(self, engine: Engine, display: Display, runs: Sequence[Run], summary: Summary) -> None:
         self.engine, self.display, self.summary = engine, display, summary
         self.waiting = deque(runs)
         self.under_way: dict[str, Run] = {}

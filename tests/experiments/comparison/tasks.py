@@ -13,7 +13,7 @@ import yaml
 
 from sb3_actpc.demonstrations.dataset import Demonstrations
 from sb3_actpc.experiments.comparison import plan_runs, read_comparison
-from sb3_actpc.experiments.comparison.display import LineDisplay
+from sb3_actpc.experiments.comparison.display import Display
 from sb3_actpc.experiments.comparison.engines import Event
 from sb3_actpc.experiments.comparison.execution import Outcome, execute_run
 from sb3_actpc.experiments.comparison.schedule import Summary, run_comparison
@@ -150,12 +150,17 @@ class InlineEngine:
     def close(self) -> None: ...
 
 
-class Lines(LineDisplay):
+class Lines(Display):
     """A display that keeps what it is told."""
 
     def __init__(self) -> None:
         self.lines: list[str] = []
-        super().__init__(self.lines.append)
+        super().__init__(bars=False)
+
+    def line(self, text: str) -> None:
+        self.lines.append(text)
+
+    def stepped(self, run: Run, steps: int) -> None: ...
 
     def begin(self, runs: Sequence[Run], n_finished: int) -> None:
         self.lines.append(f"{len(runs)} to do, {n_finished} finished")

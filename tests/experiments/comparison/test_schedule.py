@@ -6,14 +6,16 @@ import os
 import shutil
 import subprocess
 from collections.abc import Iterator
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
 import pytest
+from rich.console import Console
 
 from sb3_actpc.checkpoints import list_bundles
 from sb3_actpc.cli import main
-from sb3_actpc.experiments.comparison.display import LineDisplay, LiveDisplay, describe_runs, make_display
+from sb3_actpc.experiments.comparison.display import Display, describe_runs
 from sb3_actpc.experiments.comparison.engines.cluster import _execute, pack_folder, unpack_folder
 from sb3_actpc.experiments.comparison.execution import (
     FAILED,
@@ -287,25 +289,21 @@ def test_the_table_gives_the_seconds_of_finished_runs_to_those_of_their_kind_and
 
 
 def test_without_a_terminal_there_are_lines() -> None:
-    display = make_display(live=True)
-    assert type(display) is LineDisplay
-    lines: list[str] = []
-    display = LineDisplay(lines.append)
+    text = StringIO()
     [run] = small_runs(OUT)
-    display.begin([run], 0)
-    display.started(run)
-    display.ended(run, Outcome(FAILED, "a reason"))
-    assert "failed" in lines[-1] and "a reason" in lines[-1] and "0 of 1 runs done" in lines[-1]
+    with Display(console=Console(file=text, width=40)) as display:
+        display.begin([run], 0)
+        display.started(run)
+        display.ended(run, Outcome(FAILED, "a reason [red]"))
+    first, second, last = text.getvalue().splitlines()
+    assert "1 to do" in first and "started" in second
+    assert "failed" in last and "a reason [red]" in last and "0 of 1 runs done" in last
 
 
 def test_in_a_terminal_there_are_bars() -> None:
-    from io import StringIO
-
-    from rich.console import Console
-
     text = StringIO()
     [run] = small_runs(OUT)
-    with LiveDisplay(Console(file=text, force_terminal=True, width=160)) as display:
+    with Display(console=Console(file=text, force_terminal=True, width=160)) as display:
         display.begin([run], 1)
         display.started(run)
         display.stepped(run, 30)
