@@ -33,7 +33,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def build_parser() -> argparse.ArgumentParser:
     """The parser with all its sub-commands: the modules of this package.
 
-    Each has ``add_parser(subparsers)`` and ``run(args)``, which returns the exit code.
+    Each has ``add_parser(subparsers)`` and ``run(args)``, which returns the exit code or raises one of :func:`user_errors`.
 
     :return: the parser; the parsed ``command`` is the name of the sub-command's module
     """
@@ -47,11 +47,7 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 def steps(text: str) -> int:
-    """
-    :param text: a whole number, such as ``"100000"`` or ``"1e5"``
-    :return: the number
-    :raises argparse.ArgumentTypeError: when it is none
-    """
+    """A whole number, such as ``100000`` or ``1e5``, for argparse."""
     try:
         number = float(text)
         if number == int(number):
@@ -62,10 +58,7 @@ def steps(text: str) -> int:
 
 
 def user_errors() -> tuple[type[Exception], ...]:
-    """Errors whose message is for the user; imported only once one has been raised.
-
-    :return: exception classes
-    """
+    """Errors whose message is for the user; imported only once one has been raised."""
     import gymnasium as gym
 
     return ValueError, OSError, ImportError, gym.error.Error

@@ -7,10 +7,7 @@ from pathlib import Path
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the sub-command with its own ``install``.
-
-    :param subparsers: where to add it
-    """
+    """Add the sub-command."""
     parser = subparsers.add_parser("baselines", help="install what the baselines of other packages need")
     commands = parser.add_subparsers(dest="baselines_command", required=True, metavar="{install}")
     install = commands.add_parser(
@@ -25,13 +22,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 
 def run(args: argparse.Namespace) -> int:
-    """Install.
-
-    :param args: parsed arguments
-    :return: exit code
-    :raises ValueError: when there is no such package
-    :raises OSError: when a step of the installation fails
-    """
+    """Install."""
     from sb3_actpc.baselines.offline.installation import FOLDER_VARIABLE, environments_folder, install
 
     folder = None if args.dir is None else Path(args.dir).absolute()

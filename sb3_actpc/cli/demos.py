@@ -17,10 +17,7 @@ HDF5_SUFFIXES = (".hdf5", ".h5")
 
 
 def add_parser(subparsers: Subparsers) -> None:
-    """Add ``demos`` with its sub-commands ``collect``, ``convert``, ``download`` and ``info``.
-
-    :param subparsers: what ``ArgumentParser.add_subparsers()`` returned
-    """
+    """Add the sub-command."""
     parser = subparsers.add_parser("demos", help="make or look at demonstration files")
     commands = parser.add_subparsers(dest="demos_command", required=True, metavar="{collect,convert,download,info}")
     _add_collect(commands)
@@ -104,14 +101,7 @@ def _add_download(commands: Subparsers) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run the sub-command chosen by the arguments of :func:`add_parser`.
-
-    :return: the exit code, 0
-    :raises ValueError: for a wrong option, a demonstrator that does not succeed often enough, or a bad file
-    :raises FileNotFoundError: if the file to look at or convert does not exist
-    :raises OSError: if a file cannot be fetched
-    :raises ImportError: if robosuite or h5py is needed and not installed
-    """
+    """Run the sub-command."""
     commands = {"collect": _collect, "convert": _convert, "download": _download, "info": _info}
     return commands[args.demos_command](args)
 
@@ -195,11 +185,7 @@ def _collect_trained(args: argparse.Namespace) -> "Demonstrations":
 
 
 def command_line(args: argparse.Namespace, options: Sequence[str]) -> str:
-    """
-    :param args: of ``demos collect``
-    :param options: names of those that matter
-    :return: the command that repeats it, without the paths of the machine it ran on
-    """
+    """The command that repeats a ``demos collect``, of the options that matter: without the paths of the machine it ran on."""
     words = ["sb3-actpc", "demos", "collect"]
     for option in options:
         value = getattr(args, option)

@@ -7,10 +7,7 @@ from pathlib import Path
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the sub-command.
-
-    :param subparsers: where to add it
-    """
+    """Add the sub-command."""
     parser = subparsers.add_parser(
         "evaluate",
         help="replay the agent of a run",
@@ -31,13 +28,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 
 def run(args: argparse.Namespace) -> int:
-    """Play, print the table, record.
-
-    :param args: parsed arguments
-    :return: exit code; a machine that cannot render is no error
-    :raises ValueError: when an argument is wrong or a file of the run is damaged
-    :raises FileNotFoundError: when the folder is not that of a run
-    """
+    """Play, print the table, record; a machine that cannot render is no error."""
     from sb3_actpc.experiments.runs.video import check_video_path, choose_gl_backend
 
     folder = Path(args.folder)

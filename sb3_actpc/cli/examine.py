@@ -7,10 +7,7 @@ from pathlib import Path
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the sub-command.
-
-    :param subparsers: where to add it
-    """
+    """Add the sub-command."""
     parser = subparsers.add_parser(
         "examine",
         help="ask whether an agent's critic is worth following",
@@ -28,13 +25,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 
 def run(args: argparse.Namespace) -> int:
-    """Examine, print the table, write it.
-
-    :param args: parsed arguments
-    :return: exit code
-    :raises ValueError: when an argument is wrong, or the agent has no critic that can be examined
-    :raises FileNotFoundError: when the folder is not that of a run
-    """
+    """Examine, print the table, write it."""
     from sb3_actpc.experiments.examination import FILE, examine_run
 
     folder = Path(args.folder)

@@ -9,20 +9,13 @@ KINDS = ("tasks", "algos", "presets", "demos")
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the sub-command.
-
-    :param subparsers: where to add it
-    """
+    """Add the sub-command."""
     parser = subparsers.add_parser("list", help="what there is: tasks, algorithms, presets, demonstrations")
     parser.add_argument("kind", choices=KINDS, help="tasks (--env), algos (--algo, and variants of compare), presets, demos")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print a line for each.
-
-    :param args: parsed arguments
-    :return: exit code 0
-    """
+    """Print a line for each."""
     rows = list({"tasks": _tasks, "algos": _algos, "presets": _presets, "demos": _demos}[args.kind]())
     width = max(len(name) for name, _ in rows)
     for name, about in rows:

@@ -8,10 +8,7 @@ from pathlib import Path
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the sub-command.
-
-    :param subparsers: where to add it
-    """
+    """Add the sub-command."""
     parser = subparsers.add_parser(
         "report",
         help="tables and figures of a comparison",
@@ -33,14 +30,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 
 def run(args: argparse.Namespace) -> int:
-    """Write the report, the export or the tables.
-
-    :param args: parsed arguments
-    :return: exit code: 0, or 1 when an ablation has changed not one action, which is an error of the agent's
-    :raises ValueError: when there is nothing to do, or a marker is wrong
-    :raises FileNotFoundError: when the folder holds no runs
-    :raises OSError: when a file cannot be written
-    """
+    """Write the report, the export or the tables; 1 when an ablation has changed not one action, which is an error of the
+    agent's."""
     from sb3_actpc.experiments.report.build import write_report
     from sb3_actpc.experiments.report.export import export
     from sb3_actpc.experiments.report.published import write_tables

@@ -15,10 +15,7 @@ if TYPE_CHECKING:
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the sub-command.
-
-    :param subparsers: where to add it
-    """
+    """Add the sub-command."""
     parser = subparsers.add_parser(
         "train",
         help="train an agent on a sparse-reward task",
@@ -66,13 +63,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 
 def run(args: argparse.Namespace) -> int:
-    """Train, then print the table.
-
-    :param args: parsed arguments
-    :return: exit code: 0, or 75 when a signal stopped the run after everything was saved
-    :raises ValueError: when an argument or a setting is wrong
-    :raises FileNotFoundError: when the preset, the demonstrations or the run to resume do not exist
-    """
+    """Train, then print the table; 75 when a signal stopped the run after everything was saved."""
     from sb3_actpc.checkpoints import EXIT_STOPPED, TrainingStopped
     from sb3_actpc.experiments.runs import resume_run, train_run
     from sb3_actpc.experiments.runs.summary import result_table

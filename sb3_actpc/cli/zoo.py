@@ -44,10 +44,7 @@ NET_ARCHS = {"small": [64, 64], "medium": [256, 256], "big": [400, 300]}
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the sub-command.
-
-    :param subparsers: where to add it
-    """
+    """Add the sub-command."""
     parser = subparsers.add_parser(
         "zoo",
         help="train, enjoy, optimize and plot with rl-zoo3",
@@ -60,14 +57,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run one of rl_zoo3's scripts.
-
-    :param args: parsed arguments: a key of ``SCRIPTS``, then the script's own
-    :return: exit code 0
-    :raises ValueError: when a setting is unknown or has a wrong value
-    :raises ImportError: when rl_zoo3 is not installed
-    :raises FileNotFoundError: when the preset, the demonstrations or the runs do not exist
-    """
+    """Run one of rl_zoo3's scripts."""
     command, arguments = args.zoo_command, args.arguments
     if command.startswith(("plot", "all")):
         return _plot(SCRIPTS[command][0], arguments)
@@ -90,11 +80,7 @@ def _description() -> str:
 
 
 def register_algorithms() -> None:
-    """
-    Put our algorithms, and what samples their settings, into rl_zoo3's tables; ``td3`` and ``ddpg`` are then ours.
-
-    :raises ImportError: when rl_zoo3 is not installed
-    """
+    """Put our algorithms, and what samples their settings, into rl_zoo3's tables; ``td3`` and ``ddpg`` are then ours."""
     from sb3_actpc.experiments.runs.algorithms import ALGORITHMS, load_algorithm
 
     zoo, hyperparams = _import("rl_zoo3"), _import("rl_zoo3.hyperparams_opt")
@@ -130,15 +116,7 @@ def _evaluate_on_other_seeds(manager: Any) -> None:
 
 
 def sample_actpc_params(trial: Any, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> dict[str, Any]:
-    """
-    Settings of ActPC for one trial of a search: those that matter under either settling.
-
-    :param trial: Optuna's trial
-    :param n_actions: not used
-    :param n_envs: not used
-    :param additional_args: not used
-    :return: keywords of ActPC
-    """
+    """Settings of ActPC for one trial of a search: those that matter under either settling."""
     trial.suggest_float("learning_rate", 1e-5, 2e-3, log=True)
     trial.suggest_float("one_minus_gamma", 1e-4, 0.03, log=True)
     trial.suggest_float("tau", 1e-3, 0.15, log=True)
@@ -157,10 +135,7 @@ def sample_actpc_params(trial: Any, n_actions: int, n_envs: int, additional_args
 
 
 def convert_actpc_params(sampled: dict[str, Any]) -> dict[str, Any]:
-    """
-    :param sampled: the parameters of a trial, as :func:`sample_actpc_params` named them
-    :return: keywords of ActPC
-    """
+    """Keywords of ActPC from the parameters of a trial, as :func:`sample_actpc_params` named them."""
     params = {name: sampled[name] for name in ("learning_rate", "tau", "actor_pressure", "refresh_weight", "refresh_noise")}
     return {
         **params,

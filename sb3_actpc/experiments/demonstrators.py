@@ -89,50 +89,30 @@ def demonstrator_run(
 
 
 def train_demonstrator(run: Run, folder: Path, report: Report = silent) -> Demonstrator:
-    """Train a demonstrator, go on with a training that was stopped, or take the one that is there.
-
-    :param run: see :func:`demonstrator_run`
-    :param folder: run folder
-    :param report: takes lines of progress
-    :return: the agent of the best evaluation
-    :raises ValueError: if the folder holds another run, or a setting is wrong
-    """
+    """Train a demonstrator (see :func:`demonstrator_run`), go on with a training that was stopped, or take the one that is
+    there: the agent of the best evaluation."""
     result = finish_run(run.model_copy(update={"output": str(folder)}), report)
     return Demonstrator(load_run(folder)[1], result["timesteps"], result["dense_return"])
 
 
 def train_mixed(run: Run, folder: Path, report: Report = silent) -> list[Demonstrator]:
-    """A demonstrator, and one as it was earlier: trained alike, but stopped at half the return.
-
-    :param run: see :func:`demonstrator_run`
-    :param folder: run folder of the first; that of the second has ``_earlier`` at its end
-    :param report: takes lines of progress
-    :return: both
-    :raises ValueError: as :func:`train_demonstrator`
-    """
+    """A demonstrator, and one as it was earlier: trained alike, but stopped at half the return; the second's folder has
+    ``_earlier`` at its end."""
     final = train_demonstrator(run, folder, report)
     early_run = run.model_copy(update={"target_return": share_of(final.mean_return, EARLIER)})
     return [final, train_demonstrator(early_run, folder.with_name(f"{folder.name}_earlier"), report)]
 
 
 def share_of(reference: float, share: float) -> float:
-    """
-    :param reference: a mean return
-    :param share: between 0 and 1
-    :return: the return of a demonstrator of that quality: the share of a positive one, that many times a negative one's loss
-    :raises ValueError: for a share out of range
-    """
+    """The return of a demonstrator of that quality, between 0 and 1: the share of a positive reference, that many times a
+    negative one's loss."""
     if not 0.0 < share <= 1.0:
         raise ValueError(f"quality={share} must be above 0 and at most 1: a share of the reference return")
     return reference * share if reference >= 0.0 else reference / share
 
 
 def reference_return(env_id: str) -> float:
-    """Mean dense return of the demonstrations that come with the package.
-
-    :param env_id: a sparse MuJoCo task, for example ``"SparseHopper-v5"``
-    :raises FileNotFoundError: when there are none
-    """
+    """Mean dense return of the demonstrations of a sparse MuJoCo task that come with the package."""
     try:
         returns = Demonstrations.load(shipped_demonstrations(sparse_env_id(env_id))).dense_returns
     except FileNotFoundError:

@@ -271,12 +271,8 @@ def _demonstrated_states(model: Any, env: gym.Env[Any, Any], n_states: int, seed
 
 
 def rebuilt_states(demonstrations: Demonstrations, sparse_id: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """
-    :param demonstrations: N transitions of a gymnasium MuJoCo task
-    :param sparse_id: id of its sparse version
-    :return: generalised positions (N, nq), x counted from the episode's start, and velocities (N, nv) after each transition;
-        the rows after which the episode goes on and no velocity was clipped
-    """
+    """Generalised positions (N, nq), x counted from the episode's start, and velocities (N, nv) after each of N transitions
+    of a gymnasium MuJoCo task; the rows after which the episode goes on and no velocity was clipped."""
     env = gym.make(sparse_id, disable_env_checker=True)
     simulation: Any = env.unwrapped
     positions, n_velocities = simulation.demonstrated_positions(demonstrations), simulation.model.nv

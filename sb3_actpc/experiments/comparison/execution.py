@@ -46,14 +46,10 @@ class FolderBusy(ValueError):
 
 @contextmanager
 def folder_lock(folder: Path, wait: float, report: Callable[[str], None] = lambda line: None) -> Iterator[None]:
-    """Hold a folder. The lock is the operating system's: it is gone with the process that held it, however that ended.
+    """Hold a folder, made when it does not exist; another process that holds it is waited for some seconds. The lock is the
+    operating system's: it is gone with the process that held it, however that ended.
 
-    :param folder: made when it does not exist
-    :param wait: seconds to wait for another process that holds it
-    :param report: given a line when there is one to wait for
-    :return: context manager
     :raises FolderBusy: when the other still holds it then
-    :raises OSError: when the folder cannot be written
     """
     folder.mkdir(parents=True, exist_ok=True)
     lock = FileLock(folder / LOCK)
@@ -73,18 +69,12 @@ def folder_lock(folder: Path, wait: float, report: Callable[[str], None] = lambd
 
 
 def is_disk_full(error: Exception) -> bool:
-    """
-    :param error: any
-    :return: whether the disk, or the user's share of it, is full
-    """
+    """Whether the disk, or the user's share of it, is full."""
     return isinstance(error, OSError) and error.errno in _FULL
 
 
 def run_status(folder: Path) -> str:
-    """
-    :param folder: run folder
-    :return: ``"finished"``, ``"failed"``, ``"unfinished"`` or ``"new"``
-    """
+    """``"finished"``, ``"failed"``, ``"unfinished"`` or ``"new"``, from a run's folder."""
     try:
         read_result(folder)
     except (FileNotFoundError, ValueError):
@@ -97,10 +87,7 @@ def run_status(folder: Path) -> str:
 
 
 def read_error(folder: Path) -> str:
-    """
-    :param folder: run folder
-    :return: the error that ended the run, one line; empty without one
-    """
+    """The error that ended the run, one line; empty without one."""
     try:
         return str(json.loads((folder / ERROR).read_text(encoding="utf-8"))["message"])
     except FileNotFoundError:
@@ -110,24 +97,13 @@ def read_error(folder: Path) -> str:
 
 
 def write_error(folder: Path, message: str, details: str = "") -> None:
-    """Record that a run has failed.
-
-    :param folder: run folder
-    :param message: one line
-    :param details: where the error came from
-    :raises OSError: when it cannot be written
-    """
+    """Record in one line, with details on where it came from, that a run has failed."""
     with atomic_write(folder / ERROR, "w") as file:
         json.dump({"message": message, "details": details}, file, indent=2)
 
 
 def repair_result(folder: Path, report: Callable[[str], None]) -> None:
-    """Write a damaged ``result.json`` again from the run's other files, or remove it, so that the run goes on.
-
-    :param folder: run folder
-    :param report: given a line when there is something to repair
-    :raises OSError: when the folder cannot be written
-    """
+    """Write a damaged ``result.json`` again from the run's other files, or remove it, so that the run goes on."""
     try:
         read_result(folder)
         return
@@ -145,14 +121,8 @@ def repair_result(folder: Path, report: Callable[[str], None]) -> None:
 
 
 def execute_run(run: Run, report: Callable[[str], None], on_steps: Callable[[int], None]) -> Outcome:
-    """Bring a run to its end, from its newest whole checkpoint where there is one. Raises nothing: an error is recorded in
-    the run's ``error.json`` and returned.
-
-    :param run: of a comparison
-    :param report: given lines of text
-    :param on_steps: given the environment steps done so far, about once a second
-    :return: what came of it
-    """
+    """Bring a run to its end, from its newest whole checkpoint where there is one, telling the steps done about once a
+    second. Raises nothing: an error is recorded in the run's ``error.json`` and returned."""
     try:
         with folder_lock(run.folder, LOCK_WAIT, report):
             (run.folder / ERROR).unlink(missing_ok=True)
@@ -178,10 +148,7 @@ def _failure(folder: Path, error: Exception) -> Outcome:
 
 
 class StepWatch(BaseCallback):
-    """Tells how far a training is.
-
-    :param on_steps: given the environment steps done, at most once in ``REPORT_INTERVAL`` seconds, and at the end
-    """
+    """Tells the environment steps done, at most once in ``REPORT_INTERVAL`` seconds, and at the end."""
 
     def __init__(self, on_steps: Callable[[int], None]) -> None:
         super().__init__()
@@ -193,7 +160,7 @@ class StepWatch(BaseCallback):
         return {}
 
     def restore_checkpoint_state(self, state: dict[str, Any]) -> None:
-        """:param state: nothing"""
+        """Nothing to restore."""
 
     def _on_step(self) -> bool:
         now = time.monotonic()

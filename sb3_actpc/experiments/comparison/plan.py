@@ -59,12 +59,7 @@ def read_comparison(given: Mapping[str, Any]) -> Comparison:
 
 
 def read_comparison_file(path: Path) -> dict[str, Any]:
-    """
-    :param path: a YAML file with the keys of :func:`read_comparison`
-    :return: its content
-    :raises FileNotFoundError: when there is none
-    :raises ValueError: when it is not a YAML mapping
-    """
+    """The content of a YAML file with the keys of :func:`read_comparison`."""
     if not path.is_file():
         raise FileNotFoundError(f"no comparison file at {path}")
     content = read_yaml(path.read_bytes(), str(path))

@@ -18,11 +18,7 @@ VARIANTS_FILE = Path(__file__).with_name("variants.yml")
 
 
 def find_variant(name: str) -> Run:
-    """
-    :param name: of the shipped file, or an algorithm's
-    :return: the variant
-    :raises ValueError: when there is no such name
-    """
+    """The variant that goes by a name: of the shipped file, or an algorithm's."""
     known = _variants()
     if name in known:
         return known[name]
@@ -52,10 +48,8 @@ def parse_variant(entry: Any) -> Run:
 
 
 def part_of_run(entry: Mapping[str, Any], also: Sequence[str] = ()) -> Run:
-    """
-    :param entry: keys of a run
-    :param also: further keys that stand beside them where the entry is from
-    :return: the part
+    """A part of a run from its keys, with the nearest known one in the error; ``also`` are keys that stand beside them.
+
     :raises ValueError: for an unknown key, a wrong value, or a key that the comparison itself decides
     """
     known = sorted({*also, *Run.known_keys()} - set(PLANNED))

@@ -15,10 +15,7 @@ from typing import Any
 
 
 def main() -> int:
-    """Run it.
-
-    :return: exit code, 0: what came of the run has been said
-    """
+    """Run it; the exit code is 0: what came of the run has been said."""
     channel = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)  # whatever libraries print goes to the log
     text = sys.stdin.readline()

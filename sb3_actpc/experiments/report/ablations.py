@@ -19,34 +19,21 @@ NO_EFFECT = "NO: the part did nothing"
 
 
 def ablation_groups(results: Results, task: str) -> dict[str, pd.DataFrame]:
-    """
-    :param results: of a comparison
-    :param task: Gymnasium id
-    :return: label -> runs, the base first and then the ablations; empty without base or ablation
-    """
+    """Label -> runs on a task, the base first and then the ablations; empty without base or ablation."""
     groups, variants = results.groups(task), ablation_variants()
     found = {variant.name: groups[variant.name] for variant in variants if variant.name in groups}
     return found if variants[0].name in found and len(found) > 1 else {}
 
 
 def without_effect(results: Results, task: str) -> list[str]:
-    """Ablations whose removal of a part changed not one action in any seed.
-
-    :param results: of a comparison
-    :param task: Gymnasium id
-    :return: their names
-    """
+    """Names of the ablations on a task whose removal of a part changed not one action in any seed."""
     names, runs = list(found := ablation_groups(results, task)), list(found.values())
     return [name for name, own in zip(names[1:], runs[1:], strict=True) if changed_actions(results, runs[0], own) is False]
 
 
 def changed_actions(results: Results, base: pd.DataFrame, other: pd.DataFrame) -> bool | None:
-    """
-    :param results: of a comparison
-    :param base: runs with every part
-    :param other: runs without one
-    :return: whether the actions of training differ for some seed that both have; None without a common seed or episode
-    """
+    """Whether the actions of training differ between runs with every part and runs without one, for some seed that both
+    have; None without a common seed or episode."""
     actions = {run: rows["actions_crc32"].tolist() for run, rows in results.episodes.groupby("run")}
     ours, theirs = ({row.seed: actions.get(row.Index) for row in runs.itertuples()} for runs in (base, other))
     pairs = [(ours[seed], theirs[seed]) for seed in ours if ours[seed] and theirs.get(seed)]
@@ -54,12 +41,7 @@ def changed_actions(results: Results, base: pd.DataFrame, other: pd.DataFrame) -
 
 
 def ablation_sections(results: Results, task: str, folder: Path) -> list[Section]:
-    """
-    :param results: of a comparison
-    :param task: Gymnasium id
-    :param folder: where the figure goes
-    :return: of the report; none without ablations
-    """
+    """Of the report on a task, with its figure in ``folder``; none without ablations."""
     found = ablation_groups(results, task)
     if not found:
         return []
@@ -94,11 +76,7 @@ def ablation_sections(results: Results, task: str, folder: Path) -> list[Section
 
 
 def arriving_gradient(results: Results, run: str) -> list[tuple[float, float]]:
-    """
-    :param results: of a comparison
-    :param run: name of a run of ActPC
-    :return: of each layer of the actor, the last cosine and ratio of norms that it logged; empty where it logged none
-    """
+    """Of each layer of a run's actor, the last cosine and ratio of norms that it logged; empty where it logged none."""
     if results.diagnostics.empty:
         return []
     own = results.diagnostics[results.diagnostics["run"] == run].dropna(axis="columns", how="all")

@@ -110,12 +110,8 @@ def _task_section(results: Results, task: str, folder: Path) -> Section:
 
 
 def task_table(results: Results, task: str) -> pd.DataFrame:
-    """
-    :param results: with finished runs on the task
-    :param task: Gymnasium id
-    :return: of texts, with columns of two levels: a row for each group of runs, then the demonstrators, random actions and
-        those of the paper's algorithms that were not run; without the columns that no group has a value in
-    """
+    """A row of texts for each group of runs on a task, then the demonstrators, random actions and those of the paper's
+    algorithms that were not run; without the columns, of two levels, that no group has a value in."""
     paper = paper_results(task)
     score, stability = ("success in %", "S-Dist") if paper["is_success"].any() else ("average return", "R-stability")
     own = pd.concat(results.groups(task).values())

@@ -62,25 +62,15 @@ def time_curve(results: Results, runs: pd.Index, measure: str = "dense_return") 
 
 
 def axis_limits(heights: Sequence[float]) -> tuple[float, float]:
-    """Limits that hold every height with a margin of 5 %.
-
-    The intervals of two or three seeds reach much farther, and would flatten the curves: they may leave the picture.
-
-    :param heights: (n,) what must be seen; with none, 0 and 1
-    :return: lower and upper limit
-    """
+    """Limits that hold every height with a margin of 5 %; with none, of 0 and 1. The intervals of two or three seeds reach
+    much farther, and would flatten the curves: they may leave the picture."""
     low, high = min(heights, default=0.0), max(heights, default=1.0)
     margin = 0.05 * (high - low or 1.0)
     return low - margin, high + margin
 
 
 def draw_curves(results: Results, task: str, path: Path) -> None:
-    """Returns (or success, by the task's measure) over episodes where they are kept, over steps and over time.
-
-    :param results: with finished runs on the task
-    :param task: Gymnasium id
-    :param path: PNG file to write
-    """
+    """Returns (or success, by the task's measure) over episodes where they are kept, over steps and over time."""
     groups, measure = results.groups(task), measure_of(task)
     lines = reference_lines(results, task)
     order = sorted(results.finished["label"].unique())  # a variant looks the same on every task
@@ -109,12 +99,8 @@ def draw_curves(results: Results, task: str, path: Path) -> None:
 
 
 def reference_lines(results: Results, task: str) -> dict[str, float]:
-    """
-    :param results: with runs on the task
-    :param task: Gymnasium id
-    :return: the scores of demonstrators and random actions in the task's measure; of dense returns the demonstrators' are
-        those that the runs were given, which may not be the shipped ones; empty where none are known
-    """
+    """The scores of demonstrators and random actions in the task's measure; of dense returns the demonstrators' are those
+    that the runs were given, which may not be the shipped ones; empty where none are known."""
     reference = reference_score(task)
     if reference is None:
         return {}
@@ -124,22 +110,13 @@ def reference_lines(results: Results, task: str) -> dict[str, float]:
 
 
 def demonstrators_returns(results: Results, task: str) -> list[float]:
-    """
-    :param results: with runs on the task
-    :param task: Gymnasium id
-    :return: mean dense returns, rounded, of the demonstrations that the finished runs were given: one, unless they differ
-    """
+    """Mean dense returns, rounded, of the demonstrations that a task's finished runs were given: one, unless they differ."""
     finished = results.finished
     return sorted(finished.loc[finished["task"] == task, "demonstrators_return"].dropna().round(1).unique())
 
 
 def draw_aggregates(intervals: Mapping[str, tuple[float, Interval]], scores: Mapping[str, Scores], path: Path) -> None:
-    """Interquartile means with their intervals, and performance profiles.
-
-    :param intervals: variant -> interquartile mean and its interval
-    :param scores: variant -> normalised scores of each task
-    :param path: PNG file to write
-    """
+    """Interquartile means with their intervals, and performance profiles of the normalised scores of each task, by variant."""
     figure = _figure(12.0, max(4.0, 1.0 + 0.35 * len(scores)))
     bars, profiles = figure.subplots(1, 2)
     _bars(bars, {name: (value, *interval) for name, (value, interval) in intervals.items()})
@@ -157,13 +134,7 @@ def draw_aggregates(intervals: Mapping[str, tuple[float, Interval]], scores: Map
 
 
 def draw_ablation(values: Mapping[str, np.ndarray], measure: str, title: str, path: Path) -> None:
-    """A bar for every ablation.
-
-    :param values: label -> (n_seeds,) the last evaluation of each seed, the base first
-    :param measure: column of ``progress.csv``
-    :param title: of the figure
-    :param path: PNG file to write
-    """
+    """A bar for every ablation: label -> (n_seeds,) the last evaluation of each seed, the base first."""
     figure = _figure(9.0, 1.2 + 0.4 * len(values))
     axes = figure.subplots()
     bars = {label: tuple(map(float, mean_interval(seeds))) for label, seeds in values.items()}
@@ -176,14 +147,8 @@ def draw_ablation(values: Mapping[str, np.ndarray], measure: str, title: str, pa
 
 
 def draw_diagnostics(results: Results, groups: Mapping[str, pd.DataFrame], task: str, path: Path) -> bool:
-    """What ActPC logged about itself: a panel for each kind of quantity, a colour for each variant, a line for every run.
-
-    :param results: with diagnostics
-    :param groups: label -> runs, of one task
-    :param task: its name
-    :param path: PNG file to write
-    :return: whether there was anything to draw; without it no file is written
-    """
+    """What ActPC logged about itself: a panel for each kind of quantity, a colour for each variant (label -> runs of one
+    task), a line for every run. Without anything to draw no file is written, and the answer is False."""
     logged = {title: [one for one in columns if one in results.diagnostics] for title, columns in DIAGNOSTIC_PANELS.items()}
     everyone = pd.concat(groups.values()).index
     rows = results.diagnostics[results.diagnostics["run"].isin(everyone)]

@@ -36,13 +36,7 @@ class Section:
 
 
 def write_pages(sections: Sequence[Section], folder: Path) -> list[Path]:
-    """Write ``report.md`` and ``report.html``; the latter has the pictures inside.
-
-    :param sections: the report, its title first
-    :param folder: where to write, and where the pictures are
-    :return: the two files
-    :raises OSError: when a picture cannot be read or a file not be written
-    """
+    """Write ``report.md`` and ``report.html``; the latter has the pictures, which are in the same folder, inside."""
     environment = Environment(
         loader=FileSystemLoader(Path(__file__).parent),
         autoescape=select_autoescape(["html.j2"]),

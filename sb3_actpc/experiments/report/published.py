@@ -61,10 +61,8 @@ def write_tables(path: Path) -> bool:
 
 
 def fill_tables(text: str, folder: Path) -> str:
-    """
-    :param text: Markdown
-    :param folder: its own
-    :return: the same with its tables written anew
+    """A Markdown text with its tables written anew; ``folder`` is its own.
+
     :raises ValueError: when a marker is not closed, or says something unknown
     :raises FileNotFoundError: when the YAML file or an export is missing
     """

@@ -36,18 +36,11 @@ def r_stability(returns: np.ndarray) -> float:
 
 
 def smooth(values: np.ndarray, window: int = WINDOW) -> np.ndarray:
-    """The rolling mean of the paper's figures; the first values are means of as many as there are.
-
-    :param values: (N,), or (N, n_seeds) to be smoothed seed by seed
-    :param window: how many values each mean is taken over
-    :return: of the same shape
-    """
+    """The rolling mean of the paper's figures, of (N,) or (N, n_seeds) seed by seed; the first values are means of as many
+    as there are."""
     return pd.DataFrame(values).rolling(window, min_periods=1).mean().to_numpy().reshape(np.shape(values))
 
 
 def final_mean(values: np.ndarray) -> float:
-    """
-    :param values: (N,) of all training episodes in order
-    :return: the mean of the last 100; NaN where there are fewer
-    """
+    """The mean of the last 100 of (N,) training episodes; NaN where there are fewer."""
     return float(np.mean(values[-WINDOW:])) if len(values) >= WINDOW else math.nan

@@ -32,10 +32,7 @@ class ReferenceScore:
     measure: str = "dense_return"
 
     def normalize(self, values: Any) -> Any:
-        """
-        :param values: of the measure, any shape
-        :return: 0 for random actions, 1 for the demonstrators
-        """
+        """0 for random actions, 1 for the demonstrators; values of any shape."""
         return (values - self.random) / (self.demonstrators - self.random)
 
 
@@ -55,18 +52,12 @@ def paper_results(env_id: str | None = None) -> pd.DataFrame:
 
 @cache
 def reference_score(env_id: str) -> ReferenceScore | None:
-    """
-    :param env_id: Gymnasium id of a task
-    :return: its scores; None where none were measured
-    """
+    """The scores of a task; None where none were measured."""
     row = pd.read_csv(SCORES_FILE, index_col="env").dropna().T.get(env_id)
     return None if row is None else ReferenceScore(float(row.random_score), float(row.demonstrators_score), row.measure)
 
 
 def measure_of(env_id: str) -> str:
-    """
-    :param env_id: Gymnasium id of a task
-    :return: the column of ``progress.csv`` by which it is compared: ``"success_rate"`` or ``"dense_return"``
-    """
+    """The column of ``progress.csv`` by which a task is compared: ``"success_rate"`` or ``"dense_return"``."""
     reference = reference_score(env_id)
     return "dense_return" if reference is None else reference.measure

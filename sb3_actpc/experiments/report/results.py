@@ -54,32 +54,22 @@ class Results:
         return self.runs[self.runs["status"] == FINISHED]
 
     def groups(self, task: str) -> dict[str, pd.DataFrame]:
-        """
-        :param task: Gymnasium id
-        :return: label -> rows of its finished runs on the task, which differ in their seeds alone
-        """
+        """Label -> rows of its finished runs on a task, which differ in their seeds alone."""
         runs = self.finished[self.finished["task"] == task].sort_values("seed", kind="stable")
         return {str(label): rows for label, rows in runs.groupby("label")}
 
 
 def side_by_side(rows: pd.DataFrame, runs: pd.Index, index: str, column: str) -> pd.DataFrame:
-    """
-    :param rows: of :class:`Results`, with the column ``run``
-    :param runs: which ones
-    :param index: column of steps or episodes
-    :param column: what to lay side by side
-    :return: one column for each run, where all of them have a value
-    """
+    """A column of the rows laid side by side over steps or episodes: one for each of the runs, where all of them have a
+    value."""
     if column not in rows:
         return pd.DataFrame()
     return rows[rows["run"].isin(runs)].pivot(index=index, columns="run", values=column).dropna()
 
 
 def read_rows(path: Path) -> pd.DataFrame:
-    """
-    :param path: a CSV file of numbers; a last row that was not written to its end is left out
-    :return: its rows, NaN where empty; none where there is no row or no file
-    """
+    """The rows of a CSV file of numbers, NaN where empty; none without a file; a last row that was not written to its end
+    is left out."""
     text = path.read_text(encoding="utf-8") if path.is_file() else ""
     whole = text[: text.rfind("\n") + 1]
     if not whole:
@@ -192,12 +182,7 @@ def _labelled(runs: pd.DataFrame) -> pd.DataFrame:
 
 
 def write_runs(results: Results, folder: Path) -> Path:
-    """
-    :param results: of a comparison
-    :param folder: where to write ``results.csv``
-    :return: the file
-    :raises OSError: when it cannot be written
-    """
+    """Write ``results.csv`` into a folder."""
     with atomic_write(folder / RUNS, "w") as file:
         results.runs.drop(columns="label").to_csv(file, float_format="%.8g")
     return folder / RUNS

@@ -19,44 +19,26 @@ Interval = tuple[float, float]
 
 
 def interquartile_mean(scores: Scores) -> float:
-    """The mean of the middle half of all runs of all tasks.
-
-    :param scores: of each task
-    :return: the mean
-    """
+    """The mean of the middle half of all runs of all tasks."""
     from scipy.stats import trim_mean
 
     return float(trim_mean(np.concatenate(scores), 0.25))
 
 
 def interquartile_mean_interval(scores: Scores, seed: int = 0) -> Interval:
-    """
-    :param scores: of each task
-    :param seed: of the resampling
-    :return: bounds of the 95 % interval of :func:`interquartile_mean`; NaN where every task has a single run
-    """
+    """Bounds of the 95 % interval of :func:`interquartile_mean`; NaN where every task has a single run."""
     from scipy.stats import trim_mean
 
     return _bootstrap(scores, lambda joined: trim_mean(joined, 0.25, axis=-1), seed)
 
 
 def performance_profile(scores: Scores, thresholds: np.ndarray) -> np.ndarray:
-    """Which share of the runs scores above each threshold.
-
-    :param scores: of each task
-    :param thresholds: (n,)
-    :return: (n,) shares
-    """
+    """Which share of the runs scores above each of n thresholds, (n,)."""
     return (np.concatenate(scores)[None, :] > thresholds[:, None]).mean(axis=1)
 
 
 def performance_profile_interval(scores: Scores, thresholds: np.ndarray, seed: int = 0) -> np.ndarray:
-    """
-    :param scores: of each task
-    :param thresholds: (n,)
-    :param seed: of the resampling
-    :return: (2, n) bounds of the 95 % interval at each threshold
-    """
+    """(2, n) bounds of the 95 % interval at each of n thresholds."""
 
     def bounds(threshold: float) -> Interval:
         return _bootstrap(scores, lambda joined: (joined > threshold).mean(axis=-1), seed)
@@ -65,22 +47,13 @@ def performance_profile_interval(scores: Scores, thresholds: np.ndarray, seed: i
 
 
 def probability_of_improvement(scores: Scores, others: Scores) -> float:
-    """How probable it is that a run of one algorithm beats a run of another on a task drawn at random; ties count half.
-
-    :param scores: of each task
-    :param others: of the same tasks
-    :return: mean over the tasks of the Mann-Whitney statistic, over the number of pairs
-    """
+    """How probable it is that a run of one algorithm beats a run of another on a task drawn at random; ties count half: the
+    mean over the tasks of the Mann-Whitney statistic, over the number of pairs."""
     return float(np.mean([_wins(one[None], other[None])[0] for one, other in zip(scores, others, strict=True)]))
 
 
 def probability_of_improvement_interval(scores: Scores, others: Scores, seed: int = 0) -> Interval:
-    """
-    :param scores: of each task
-    :param others: of the same tasks
-    :param seed: of the resampling
-    :return: bounds of the 95 % interval of :func:`probability_of_improvement`
-    """
+    """Bounds of the 95 % interval of :func:`probability_of_improvement`."""
     sizes = [len(part) for part in (*scores, *others)]
     if all(size == 1 for size in sizes):
         return math.nan, math.nan
@@ -112,11 +85,8 @@ def _bootstrap(scores: Scores, statistic: Callable[[np.ndarray], np.ndarray], se
 
 
 def mean_interval(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Mean over seeds with a 95 % interval of Student's t distribution, which does not flatter a handful of seeds.
-
-    :param values: (n_seeds, ...)
-    :return: mean, lower and upper bound, each of shape (...); bounds are NaN for one seed
-    """
+    """Mean, lower and upper bound, (...) each, over (n_seeds, ...), of a 95 % interval of Student's t distribution, which
+    does not flatter a handful of seeds; bounds are NaN for one seed."""
     from scipy.stats import t
 
     mean = values.mean(axis=0)

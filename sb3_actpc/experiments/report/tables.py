@@ -13,21 +13,13 @@ UNDEFINED = "n/a"
 
 
 def number(value: float, form: str) -> str:
-    """
-    :param value: any, NaN for an undefined one
-    :param form: of a format, such as ``".1f"``
-    :return: a cell
-    """
+    """A cell in a format such as ``".1f"``; NaN is an undefined one."""
     text = UNDEFINED if math.isnan(value) else format(value, form)
     return text.removeprefix("-") if not text.strip("-0.") else text  # no negative zero
 
 
 def mean_and_deviation(values: np.ndarray, form: str) -> str:
-    """
-    :param values: (n_seeds,), NaN where undefined
-    :param form: of a format
-    :return: mean ± sample standard deviation of those that are defined, and of how many (n of N) where not of all
-    """
+    """Mean ± sample standard deviation of those of (n_seeds,) that are defined, and of how many (n of N) where not of all."""
     known = values[~np.isnan(values)]
     if not len(known):
         return UNDEFINED
@@ -37,19 +29,12 @@ def mean_and_deviation(values: np.ndarray, form: str) -> str:
 
 
 def interval(bounds: Interval, form: str) -> str:
-    """
-    :param bounds: lower and upper, NaN where there is none
-    :param form: of a format
-    :return: a cell
-    """
+    """A cell of lower and upper bound; empty where they are NaN."""
     return "" if math.isnan(bounds[0]) else f"{format(bounds[0], form)} to {format(bounds[1], form)}"
 
 
 def markdown(table: pd.DataFrame) -> str:
-    """
-    :param table: of texts; of columns with two levels, each is named ``first: second``
-    :return: GitHub's Markdown
-    """
+    """A table of texts in GitHub's Markdown; of columns with two levels, each is named ``first: second``."""
     names = [": ".join(filter(None, name)) if isinstance(name, tuple) else str(name) for name in table.columns]
     lines = [names, ["---"] * len(names), *table.astype(str).to_numpy().tolist()]
     return "\n".join("| " + " | ".join(text.replace("|", "\\|") for text in line) + " |" for line in lines)

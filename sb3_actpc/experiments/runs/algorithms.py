@@ -40,12 +40,7 @@ _OPTION_OF = {
 
 
 def load_algorithm(name: str) -> type[BaseAlgorithm]:
-    """Import an algorithm of the table.
-
-    :param name: key of ``ALGORITHMS``
-    :return: the class
-    :raises ValueError: when there is no such name
-    """
+    """Import an algorithm, a key of ``ALGORITHMS``; ValueError names the nearest one."""
     if name not in ALGORITHMS:
         raise ValueError(
             f"unknown algorithm {name!r}{nearest(name, ALGORITHMS)}: expected one of {', '.join(sorted(ALGORITHMS))}"
@@ -57,8 +52,6 @@ def load_algorithm(name: str) -> type[BaseAlgorithm]:
 def check_keywords(algorithm: type[BaseAlgorithm], settings: Mapping[str, Any]) -> None:
     """Check that a class takes these settings.
 
-    :param algorithm: the class
-    :param settings: constructor keywords
     :raises ValueError: naming the first one that it does not take, or that has an option of its own
     """
     known = constructor_keywords(algorithm)
@@ -70,10 +63,6 @@ def check_keywords(algorithm: type[BaseAlgorithm], settings: Mapping[str, Any]) 
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
-    """
-    :param name: that nothing goes by
-    :param known: names that there are
-    :return: ``" (did you mean 'gamma'?)"``, or nothing where none is near
-    """
+    """``" (did you mean 'gamma'?)"``, or nothing where no known name is near."""
     close = difflib.get_close_matches(name, list(known), n=1)
     return f" (did you mean {close[0]!r}?)" if close else ""

@@ -18,15 +18,7 @@ MAX_EVALUATION_ENVS = 10
 
 
 def make_env(env_id: str, env_kwargs: Mapping[str, Any], render_mode: str | None = None) -> gym.Env[Any, Any]:
-    """Make an environment, this package's tasks included.
-
-    :param env_id: Gymnasium id
-    :param env_kwargs: its keywords
-    :param render_mode: Gymnasium's render mode, or None
-    :return: the environment
-    :raises gymnasium.error.Error: when the id is unknown
-    :raises ValueError: when it does not take the keywords
-    """
+    """Make an environment, this package's tasks included; ValueError when it does not take the keywords."""
     register_tasks(env_id)
     options = dict(env_kwargs) if render_mode is None else {**env_kwargs, "render_mode": render_mode}
     try:
@@ -36,13 +28,7 @@ def make_env(env_id: str, env_kwargs: Mapping[str, Any], render_mode: str | None
 
 
 def make_eval_envs(env_id: str, env_kwargs: Mapping[str, Any], n_episodes: int) -> list[gym.Env[Any, Any]]:
-    """As many environments as episodes are played side by side.
-
-    :param env_id: Gymnasium id
-    :param env_kwargs: its keywords
-    :param n_episodes: how many episodes will be played
-    :return: at most ``MAX_EVALUATION_ENVS`` environments
-    """
+    """As many environments as episodes are played side by side, at most ``MAX_EVALUATION_ENVS``."""
     return [make_env(env_id, env_kwargs) for _ in range(min(n_episodes, MAX_EVALUATION_ENVS))]
 
 
@@ -73,10 +59,8 @@ def make_train_env(
 
 
 def register_tasks(env_id: str) -> None:
-    """Register this package's tasks with Gymnasium (again does no harm), and those of gymnasium-robotics where they are meant.
-
-    :param env_id: Gymnasium id
-    """
+    """Register this package's tasks with Gymnasium (again does no harm), and those of gymnasium-robotics where they are
+    meant."""
     from sb3_actpc.envs import register_envs
 
     register_envs()
@@ -88,12 +72,7 @@ def register_tasks(env_id: str) -> None:
 
 def check_env_id(env_id: str, gym_packages: Sequence[str] = ()) -> None:
     """Check that an environment is registered; ids with a module (``module:Name-v0``) are left to ``gymnasium.make``.
-
-    :param env_id: Gymnasium id
-    :param gym_packages: modules that register environments, imported first; the working folder is looked in, too
-    :raises ImportError: when there is no such module
-    :raises gymnasium.error.Error: when the id is unknown
-    """
+    Modules that register environments are imported first; the working folder is looked in, too."""
     if os.getcwd() not in sys.path:  # as with `python -m`
         sys.path.append(os.getcwd())
     for package in gym_packages:

@@ -65,10 +65,7 @@ class EpisodeLog(BaseCallback):
         }
 
     def restore_checkpoint_state(self, state: dict[str, Any]) -> None:
-        """Go on where the checkpoint was taken; rows written after it are dropped, they will be written again.
-
-        :param state: what :meth:`checkpoint_state` returned
-        """
+        """Go on where the checkpoint was taken; rows written after it are dropped, they will be written again."""
         self.n_episodes, self._actions = state["n_episodes"], state["actions"]
         self._dense_returns = list(state["dense_returns"])
         with atomic_write(self.path, "w") as file:

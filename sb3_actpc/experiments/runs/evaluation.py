@@ -80,10 +80,7 @@ class NormalizedPredictor:
 
     @classmethod
     def wrap_saved(cls, model: Predictor, folder: Path) -> Predictor:
-        """The agent itself, or with the statistics that :meth:`save` wrote into the run's folder.
-
-        :raises ValueError: when the file is damaged
-        """
+        """The agent itself, or with the statistics that :meth:`save` wrote into the run's folder."""
         if not (folder / cls.FILE).is_file():
             return model
         with np.load(folder / cls.FILE, allow_pickle=False) as stored:
@@ -227,13 +224,9 @@ class EvaluationCallback(BaseCallback):
         self._started = time.perf_counter()
 
     def begin(self, model: BaseAlgorithm) -> None:
-        """Evaluate before ``learn``, which may begin with demonstrations and not with steps.
-
-        An untrained agent fails for as long as an episode may last, which in robosuite's tasks takes minutes: it plays
-        ``UNTRAINED_EPISODES`` at most, and an offline method's, which has seen nothing, none.
-
-        :param model: the agent
-        """
+        """Evaluate before ``learn``, which may begin with demonstrations and not with steps. An untrained agent fails for
+        as long as an episode may last, which in robosuite's tasks takes minutes: it plays ``UNTRAINED_EPISODES`` at most,
+        and an offline method's, which has seen nothing, none."""
         self.model = model
         self._started = time.perf_counter()
         with atomic_write(self.folder / PROGRESS, "w") as file:
@@ -260,10 +253,7 @@ class EvaluationCallback(BaseCallback):
         }
 
     def restore_checkpoint_state(self, state: dict[str, Any]) -> None:
-        """Go on where the checkpoint was taken; rows written after it are dropped, they will be written again.
-
-        :param state: what :meth:`checkpoint_state` returned
-        """
+        """Go on where the checkpoint was taken; rows written after it are dropped, they will be written again."""
         self._started = time.perf_counter() - state["wall_seconds"]
         self.evaluation_seconds = state["evaluation_seconds"]
         self.best_return = state["best_return"]

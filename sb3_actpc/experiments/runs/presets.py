@@ -44,13 +44,7 @@ _PlainLoader.add_implicit_resolver(
 
 
 def read_yaml(text: str | bytes, source: str) -> Any:
-    """The one reader of YAML: plain values, nothing in it is run.
-
-    :param text: YAML, UTF-8 when it is bytes
-    :param source: where it is from, for the message
-    :return: the values
-    :raises ValueError: naming the source, when the text is not YAML or contains itself
-    """
+    """The one reader of YAML: plain values, nothing in it is run; a ValueError names the source."""
     try:
         return yaml.load(text, Loader=_PlainLoader)
     except (yaml.YAMLError, ValueError, RecursionError) as error:
@@ -141,13 +135,7 @@ def preset(env_id: str, name: str | None = None, algo: str = "actpc") -> dict[st
 
 
 def agent_keywords(run: Run, observation_space: gym.Space[Any], action_space: gym.Space[Any]) -> dict[str, Any]:
-    """
-    :param run: filled in
-    :param observation_space: of its environment
-    :param action_space: of its environment
-    :return: keywords of its algorithm's constructor, all but the environment, the seed and the device
-    :raises ValueError: when a text that stands for an object is unknown
-    """
+    """Keywords of a filled run's algorithm's constructor, all but the environment, the seed and the device."""
     keywords = copy.deepcopy(run.settings)  # SB3 adds keys of its own to the dictionaries it is given
     if "learning_rate" in keywords:
         keywords["learning_rate"] = parse_schedule(keywords["learning_rate"])
@@ -169,21 +157,12 @@ def agent_keywords(run: Run, observation_space: gym.Space[Any], action_space: gy
 
 
 def fitting_policy(policy: str, observation_space: gym.Space[Any]) -> str:
-    """
-    :param policy: name of SB3's policy
-    :param observation_space: of the environment
-    :return: the policy; for observations of several parts the one that takes them
-    """
+    """The policy; for observations of several parts the one that takes them."""
     return "MultiInputPolicy" if policy == "MlpPolicy" and isinstance(observation_space, gym.spaces.Dict) else policy
 
 
 def parse_schedule(value: float | str) -> float | LinearSchedule:
-    """A learning rate, or as in rl-zoo3 ``lin_3e-4``: falling linearly to zero at the end of training.
-
-    :param value: a number, or a text such as ``"lin_3e-4"``
-    :return: the number, or the schedule
-    :raises ValueError: when it is neither
-    """
+    """A learning rate, or as in rl-zoo3 ``"lin_3e-4"``: falling linearly to zero at the end of training."""
     if not isinstance(value, str):
         return value
     prefix, _, number = value.rpartition("_")
@@ -197,12 +176,7 @@ def parse_schedule(value: float | str) -> float | LinearSchedule:
 
 
 def parse_assignments(assignments: Iterable[str]) -> dict[str, Any]:
-    """Turn ``key=value`` texts into a dictionary; the values are read as YAML.
-
-    :param assignments: such as ``["gamma=0.98", "policy_kwargs.net_arch=[64, 64]"]``
-    :return: such as ``{"gamma": 0.98, "policy_kwargs.net_arch": [64, 64]}``
-    :raises ValueError: when a text has no ``=`` or no key, or the value is not YAML
-    """
+    """Turn texts such as ``"policy_kwargs.net_arch=[64, 64]"`` into a dictionary; the values are read as YAML."""
     values = {}
     for assignment in assignments:
         key, separator, text = assignment.partition("=")
@@ -213,12 +187,7 @@ def parse_assignments(assignments: Iterable[str]) -> dict[str, Any]:
 
 
 def with_changes(settings: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """
-    :param settings: such as ``{"policy_kwargs": {"n_critics": 2}}``
-    :param changes: what replaces them; with a dotted key, such as ``"policy_kwargs.net_arch"``, a value in a mapping
-    :return: the settings with the changes
-    :raises ValueError: when a dotted key leads into something that is no mapping
-    """
+    """The settings with changes; a dotted key, such as ``"policy_kwargs.net_arch"``, changes a value in a mapping."""
     changed = copy.deepcopy(dict(settings))
     for key, value in changes.items():
         *parents, last = key.split(".")
@@ -272,11 +241,7 @@ def preset_names() -> list[str]:
 
 
 def preset_path(name: str) -> Path:
-    """
-    :param name: of a file of the package, or a path ending in ``.yml`` or ``.yaml``
-    :return: where it is
-    :raises FileNotFoundError: when there is none
-    """
+    """Where the preset of a name, or a path ending in ``.yml`` or ``.yaml``, is."""
     if Path(name).suffix in (".yml", ".yaml"):
         if not Path(name).is_file():
             raise FileNotFoundError(f"no preset file at {name}")

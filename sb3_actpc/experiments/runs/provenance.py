@@ -24,12 +24,8 @@ def package_versions() -> dict[str, str]:
 
 
 def git_state(checkout: Path = CHECKOUT) -> tuple[str | None, bool | None]:
-    """What a source checkout stands on.
-
-    :param checkout: folder that holds ``.git``
-    :return: the commit, 40 hex digits, and whether files that git knows differ from it; None and None for an installed package
-        or where git cannot be asked
-    """
+    """The commit of a source checkout, 40 hex digits, and whether files that git knows differ from it; None and None for an
+    installed package or where git cannot be asked."""
     if not (checkout / ".git").exists():
         return None, None
     try:
@@ -41,11 +37,7 @@ def git_state(checkout: Path = CHECKOUT) -> tuple[str | None, bool | None]:
 
 
 def file_hash(*paths: Path) -> str:
-    """
-    :param paths: files
-    :return: SHA-256 of their content, one after the other, in hex digits
-    :raises OSError: when one cannot be read
-    """
+    """SHA-256 of the content of files, one after the other, in hex digits."""
     content = hashlib.sha256()
     for path in paths:
         content.update(path.read_bytes())

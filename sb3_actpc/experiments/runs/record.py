@@ -17,19 +17,14 @@ _NOT_KEPT = {"output", "progress"}  # where it stands and how it is watched is n
 
 
 def write_config(run: Run) -> None:
-    """Write ``config.json``: the run with everything filled in.
-
-    :param run: with its folder
-    :raises OSError: when it cannot be written
-    """
+    """Write ``config.json``: the run with everything filled in."""
     with atomic_write(run.folder / CONFIG, "w") as file:
         json.dump({"schema": VERSION, **run.model_dump(mode="json", exclude=_NOT_KEPT)}, file, indent=2)
 
 
 def read_config(folder: Path) -> dict[str, Any]:
-    """
-    :param folder: run folder
-    :return: the content of ``config.json``, of whatever version
+    """The content of ``config.json``, of whatever version.
+
     :raises FileNotFoundError: when there is none
     :raises ValueError: when it is not JSON or lacks what identifies a run
     """
@@ -42,9 +37,8 @@ def read_config(folder: Path) -> dict[str, Any]:
 
 
 def read_run(folder: Path) -> Run:
-    """
-    :param folder: run folder
-    :return: the run in it
+    """The run in a folder.
+
     :raises FileNotFoundError: when there is no ``config.json``
     :raises ValueError: when it is damaged, or of another version
     """
@@ -62,11 +56,7 @@ def read_run(folder: Path) -> Run:
 
 
 def check_demonstrations(run: Run) -> None:
-    """
-    :param run: one that goes on
-    :raises FileNotFoundError: when its demonstrations are gone
-    :raises ValueError: when they are not those that it began with
-    """
+    """Check that the demonstrations of a run that goes on are those that it began with."""
     if demonstrations_hash(run) != run.demonstrations_sha256:
         raise ValueError(
             f"{run.folder}: the demonstrations ({run.demonstrations}) are not those that the run began with: put them back, "
@@ -109,9 +99,8 @@ def write_result(folder: Path) -> dict[str, Any]:
 
 
 def read_result(folder: Path) -> dict[str, Any]:
-    """
-    :param folder: run folder
-    :return: the content of ``result.json``
+    """The content of ``result.json``.
+
     :raises FileNotFoundError: when there is none: the run is not finished
     :raises ValueError: when it is damaged
     """

@@ -282,11 +282,9 @@ def load_run(folder: Path) -> tuple[Run, Predictor]:
 
 
 def run_folder(run: Run) -> Path:
-    """The folder of a run: new, or left by a run that stopped before its first checkpoint.
+    """``run.output``, or ``runs/<env>/<algo>_<preset>_seed<seed>`` with ``_2``, ``_3``, … when it holds a result or
+    checkpoints.
 
-    :param run: the user's choices
-    :return: ``run.output``, or ``runs/<env>/<algo>_<preset>_seed<seed>`` with ``_2``, ``_3``, … when it holds a result or
-        checkpoints
     :raises ValueError: when ``run.output`` holds a finished run, or one that can be resumed
     """
     if run.output is not None:
@@ -304,24 +302,14 @@ def run_folder(run: Run) -> Path:
 
 
 def demonstrators_return(source: Path | str | None) -> float | None:
-    """Mean dense return of the demonstrated episodes.
-
-    :param source: demonstrations file, id of a Minari dataset, or None
-    :return: the mean, or None when there is none or it does not hold dense rewards
-    :raises ValueError: when the file is not valid
-    """
+    """Mean dense return of demonstrated episodes, of a file or a Minari dataset; None when there are none, or without dense
+    rewards."""
     returns = None if source is None else resolve_demonstrations(source).dense_returns
     return None if returns is None else float(returns.mean())
 
 
 def build_model(run: Run, env: VecEnv) -> BaseAlgorithm:
-    """Make the agent.
-
-    :param run: filled in
-    :param env: training environment
-    :return: the agent, not trained
-    :raises ValueError: when a setting has a wrong value
-    """
+    """The agent of a filled run, not trained."""
     algorithm, keywords = load_algorithm(run.algo), agent_keywords(run, env.observation_space, env.action_space)
     try:
         return algorithm(env=env, seed=run.seed, device=run.device, **keywords)
@@ -331,9 +319,7 @@ def build_model(run: Run, env: VecEnv) -> BaseAlgorithm:
 
 
 def close_model(model: Any) -> None:
-    """
-    :param model: ends its other process, where it has one
-    """
+    """End the agent's other process, where it has one."""
     getattr(model, "close", lambda: None)()
 
 

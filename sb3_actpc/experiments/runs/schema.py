@@ -215,10 +215,8 @@ class Run(Schema):
 
 
 def merged(*parts: Run) -> dict[str, Any]:
-    """
-    :param parts: of one run; what is said later counts more, ``settings`` and ``env_kwargs`` are put together
-    :return: keywords of a :class:`Run`: everything that was said
-    """
+    """Keywords of a :class:`Run`: everything that was said in the parts; what is said later counts more, ``settings`` and
+    ``env_kwargs`` are put together."""
     said: dict[str, Any] = {}
     for part in parts:
         for name in part.model_fields_set:
@@ -228,11 +226,8 @@ def merged(*parts: Run) -> dict[str, Any]:
 
 
 def content_id(record: Mapping[str, Any], seed: int | None = None) -> str:
-    """
-    :param record: a run's ``config.json``, or as much of it as decides the outcome
-    :param seed: the run's; None for an id that all seeds share
-    :return: ten hex digits
-    """
+    """Ten hex digits from as much of a run's ``config.json`` as decides the outcome; without a seed, an id that all seeds
+    share."""
     content = {name: record[name] for name in CONTENT if record.get(name) is not None}
     text = json.dumps({**content, "seed": seed}, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:10]

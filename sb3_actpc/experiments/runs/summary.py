@@ -11,11 +11,7 @@ from sb3_actpc.utils.files import atomic_write
 
 
 def result_table(result: Mapping[str, Any]) -> str:
-    """The result of a run, or of its replay, as aligned text.
-
-    :param result: what ``train_run`` or ``evaluate_run`` returned
-    :return: a line per quantity
-    """
+    """The result of ``train_run`` or ``evaluate_run`` as aligned text, a line per quantity."""
     rows = [
         ("dense return", f"{result['dense_return']:.1f} ± {result['dense_return_std']:.1f}"),
         ("demonstrators' dense return", _number(result.get("demonstrators_return"), ".1f")),
@@ -33,14 +29,8 @@ def result_table(result: Mapping[str, Any]) -> str:
 
 
 def plot_learning_curve(progress: Path, output: Path, title: str, demonstrators_return: float | None) -> None:
-    """Draw the dense and the sparse return against the environment steps.
-
-    :param progress: a ``progress.csv``
-    :param output: PNG file to write
-    :param title: title of the figure
-    :param demonstrators_return: mean dense return of the demonstrations, drawn as a dashed line; None for none
-    :raises FileNotFoundError: when there is no such CSV file
-    """
+    """Draw the dense and the sparse return of a ``progress.csv`` against the environment steps, and the demonstrators' as a
+    dashed line."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

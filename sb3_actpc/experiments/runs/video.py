@@ -29,13 +29,9 @@ class RenderingUnavailable(RuntimeError):
 
 
 def choose_gl_backend() -> str | None:
-    """Find a way for MuJoCo to render without a window and select it for this process (environment variables).
-
-    Call it before MuJoCo is imported. What ``MUJOCO_GL`` names is tried first; it is unset when nothing works, since
-    MuJoCo cannot be imported with a name that does not work.
-
-    :return: the name, or None when nothing works
-    """
+    """Find a way for MuJoCo to render without a window and select it for this process (environment variables); None when
+    nothing works. Call it before MuJoCo is imported: what ``MUJOCO_GL`` names is tried first, and unset when nothing works,
+    since MuJoCo cannot be imported with a name that does not work."""
     chosen = os.environ.get("MUJOCO_GL", "")
     for backend in dict.fromkeys(filter(None, (chosen, *GL_BACKENDS))):
         variables = {"MUJOCO_GL": backend}
@@ -49,11 +45,7 @@ def choose_gl_backend() -> str | None:
 
 
 def check_video_path(path: Path) -> None:
-    """Check that a video can have this name.
-
-    :param path: file to write
-    :raises ValueError: when the suffix is none of ``VIDEO_SUFFIXES``
-    """
+    """ValueError when a video cannot have this name: the suffix must be one of ``VIDEO_SUFFIXES``."""
     if path.suffix.lower() not in VIDEO_SUFFIXES:
         raise ValueError(f"the video must end in .mp4, .gif or .png, found {str(path)!r}")
 
@@ -106,10 +98,8 @@ def record_video(
 
 
 def picture_strip(frames: list[np.ndarray]) -> np.ndarray:
-    """
-    :param frames: (height, width, 3) uint8 each
-    :return: ``STRIP_LENGTH`` of them from the first to the last, side by side, (height / 2, STRIP_LENGTH * width / 2, 3)
-    """
+    """``STRIP_LENGTH`` of frames (height, width, 3) from the first to the last, side by side, (height / 2, STRIP_LENGTH *
+    width / 2, 3)."""
     chosen = np.linspace(0, len(frames) - 1, STRIP_LENGTH).round().astype(int)
     return np.concatenate([frames[index][::2, ::2] for index in chosen], axis=1)
 

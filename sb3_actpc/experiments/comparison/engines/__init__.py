@@ -10,12 +10,10 @@ __all__ = ["ENGINES", "Engine", "Event", "make_engine"]
 
 
 def make_engine(name: str, n_workers: int | None, threads: int, address: str | None = None) -> Engine:
-    """
-    :param name: one of ``ENGINES``
+    """:param name: one of ``ENGINES``
     :param n_workers: runs at a time; by default one for each core (of the cluster) and ``threads``
     :param threads: of each run
     :param address: of a Ray cluster; by default one is started on this machine
-    :return: the engine
     :raises ValueError: for another name, a number below 1, or an address that the engine has no use for
     :raises ImportError: when Ray is not installed
     """

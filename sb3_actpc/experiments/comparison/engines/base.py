@@ -30,16 +30,11 @@ class Engine(Protocol):
         """How many runs can be executed at a time, now."""
 
     def start(self, run: Run) -> None:
-        """Begin, or go on with, a run.
-
-        :param run: one that is not under way
-        """
+        """Begin, or go on with, a run that is not under way."""
 
     def poll(self, timeout: float) -> list[Event]:
-        """
-        :param timeout: seconds to wait for news
-        :return: what has happened since the last call; each run that was started ends in exactly one event with an outcome
-        """
+        """What has happened since the last call, waiting for it some seconds; each run that was started ends in exactly one
+        event with an outcome."""
 
     def stop(self) -> None:
         """Ask every run under way to save a checkpoint and end; their ends still come as events."""

@@ -56,8 +56,7 @@ class RayEngine:
         return max(1, fitting if self.n_workers is None else min(fitting, self.n_workers))
 
     def start(self, run: Run) -> None:
-        """:param run: one that is not under way
-        :raises OSError: when its folder cannot be written"""
+        """Begin, or go on with, a run."""
         run.folder.mkdir(parents=True, exist_ok=True)
         folder = run.folder.absolute()
         run = run.model_copy(update={"output": str(folder)})
@@ -67,8 +66,7 @@ class RayEngine:
         self._tasks[self._task.remote(run.to_json(), str(probe), packed, self._board)] = run
 
     def poll(self, timeout: float) -> list[Event]:
-        """:param timeout: seconds
-        :return: news"""
+        """News, after some seconds at most."""
         if not self._tasks:
             threading.Event().wait(timeout)
             return []
@@ -125,24 +123,17 @@ class StepBoard:
         self.steps: dict[str, int] = {}
 
     def write(self, run_id: str, steps: int) -> None:
-        """:param run_id: which
-        :param steps: so far"""
+        """Note the steps of a run."""
         self.steps[run_id] = steps
 
     def read(self) -> dict[str, int]:
-        """:return: by the run's id"""
+        """Steps by the run's id."""
         return self.steps
 
 
 def _execute(job: str, probe: str, packed: bytes, board: Any) -> tuple[str, str, bytes | None]:
-    """On a node: bring a run to its end, in its folder or in a copy of it.
-
-    :param job: the run as JSON
-    :param probe: a file that is there where the node shares the folders
-    :param packed: the run's folder as it is now
-    :param board: is told the steps; None for nobody
-    :return: status and message of the outcome, and the folder where it has to be sent back
-    """
+    """On a node: bring a run, given as JSON, to its end. Where it sees the probe file it works in the run's folder, else in
+    a copy of it, which is sent back with status and message of the outcome."""
     run = Run.from_json(job)
 
     def on_steps(steps: int) -> None:
@@ -167,11 +158,7 @@ def _execute_with_log(run: Run, on_steps: Callable[[int], None]) -> Outcome:
 
 
 def pack_folder(folder: Path) -> bytes:
-    """
-    :param folder: any
-    :return: its files as a ZIP archive, locks and probes left out
-    :raises OSError: when a file cannot be read
-    """
+    """The files of a folder as a ZIP archive, locks and probes left out."""
     archive = io.BytesIO()
     with zipfile.ZipFile(archive, "w", zipfile.ZIP_STORED) as target:
         for path in sorted(folder.rglob("*")):
@@ -181,12 +168,8 @@ def pack_folder(folder: Path) -> bytes:
 
 
 def unpack_folder(archive: bytes, folder: Path) -> None:
-    """Make a folder what another was; files that the archive does not hold are removed, ``result.json`` comes last.
-
-    :param archive: what :func:`pack_folder` returned
-    :param folder: made when it does not exist
-    :raises OSError: when it cannot be written
-    """
+    """Make a folder what another was, packed by :func:`pack_folder`; files that the archive does not hold are removed,
+    ``result.json`` comes last."""
     folder.mkdir(parents=True, exist_ok=True)
     with zipfile.ZipFile(io.BytesIO(archive)) as source:
         names = source.namelist()
@@ -199,10 +182,7 @@ def unpack_folder(archive: bytes, folder: Path) -> None:
 
 
 def _check_address(address: str | None) -> None:
-    """Ray itself would try for minutes.
-
-    :raises ConnectionError: when nobody answers at ``host:port``
-    """
+    """Ray itself would try for minutes, where nobody answers at ``host:port``."""
     host, separator, port = (address or "").rpartition(":")
     if not separator or "/" in host or not port.isdigit():  # "auto", or a URL of Ray's
         return

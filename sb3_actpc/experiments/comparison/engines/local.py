@@ -39,8 +39,7 @@ class LocalEngine:
         return self.n_workers
 
     def start(self, run: Run) -> None:
-        """:param run: one that is not under way
-        :raises OSError: when its log cannot be written or no process can be started"""
+        """Begin, or go on with, a run."""
         run.folder.mkdir(parents=True, exist_ok=True)
         environment = {**os.environ, **dict.fromkeys(_THREAD_VARIABLES, str(self.threads))}
         with open(run.folder / LOG, "a", encoding="utf-8") as log:
@@ -59,8 +58,7 @@ class LocalEngine:
         threading.Thread(target=self._listen, args=(run.id, worker), daemon=True).start()
 
     def poll(self, timeout: float) -> list[Event]:
-        """:param timeout: seconds
-        :return: news"""
+        """News, after some seconds at most."""
         events = []
         try:
             events.append(self._events.get(timeout=timeout))
