@@ -89,17 +89,11 @@ class BC(OfflineAlgorithm):
             self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
 
     def _loss(self, rows: th.Tensor) -> th.Tensor:
-        """
-        :param rows: (B,) of the demonstrations
-        :return: mean squared error of the actions
-        """
+        """Mean squared error of the actions of (B,) demonstrated rows."""
         return nn.functional.mse_loss(self.policy(self._inputs(rows)), self._actions[rows])
 
     def _inputs(self, rows: th.Tensor) -> th.Tensor:
-        """
-        :param rows: of the demonstrations, any shape
-        :return: (*shape, obs_dim), normalised observations with noise
-        """
+        """Normalised observations with noise, (*shape, obs_dim), of rows of any shape."""
         assert self._observations is not None
         inputs = self._observations[rows]
         return inputs + self.input_noise * th.randn_like(inputs) if self.input_noise else inputs
@@ -154,10 +148,7 @@ class BCRNN(BC):
         return {"restart_every": None if self.carry_state else self.sequence_length}
 
     def _loss(self, rows: th.Tensor) -> th.Tensor:
-        """
-        :param rows: (B,) where the sequences begin
-        :return: mean squared error of the actions, over the steps that lie within an episode
-        """
+        """Mean squared error of the actions over the steps, from (B,) rows on, that lie within an episode."""
         steps = rows[:, None] + th.arange(self.sequence_length, device=self.device)
         within = (steps < self._episode_ends[rows][:, None]).float()
         steps = steps.clamp(max=len(self._actions) - 1)

@@ -65,17 +65,12 @@ class CloningPolicy(BasePolicy):
         """Make the network."""
 
     def fit_normalization(self, rows: th.Tensor) -> None:
-        """
-        :param rows: demonstrated observations, (N, obs_dim), whose entries get mean 0 and standard deviation 1
-        """
+        """Entries of these observations, (N, obs_dim), shall get mean 0 and standard deviation 1."""
         self.mean.copy_(rows.mean(dim=0))
         self.spread.copy_(rows.std(dim=0, correction=0).clamp(min=SMALLEST_SPREAD))
 
     def normalized(self, observations: th.Tensor) -> th.Tensor:
-        """
-        :param observations: (..., obs_dim)
-        :return: the same, normalised
-        """
+        """Observations (..., obs_dim), normalised."""
         return ((observations - self.mean) / self.spread).clamp(-LARGEST_INPUT, LARGEST_INPUT)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
@@ -84,13 +79,8 @@ class CloningPolicy(BasePolicy):
 
 
 class BCPolicy(CloningPolicy):
-    """
-    A multilayer perceptron.
-
-    :param args: as :class:`CloningPolicy`'s
-    :param net_arch: hidden sizes; by default two of 512
-    :param kwargs: as :class:`CloningPolicy`'s
-    """
+    """A multilayer perceptron; ``net_arch`` are its hidden sizes, by default two of 512, the other keywords
+    :class:`CloningPolicy`'s."""
 
     def __init__(self, *args: Any, net_arch: list[int] | None = None, **kwargs: Any) -> None:
         self.net_arch = [512, 512] if net_arch is None else list(net_arch)
@@ -100,10 +90,7 @@ class BCPolicy(CloningPolicy):
         self.network = nn.Sequential(*create_mlp(self.n_inputs, self.n_outputs, self.net_arch, nn.ReLU))
 
     def forward(self, inputs: th.Tensor) -> th.Tensor:
-        """
-        :param inputs: normalised observations, (B, obs_dim)
-        :return: actions, (B, A), not cut to [-1, 1]
-        """
+        """Actions (B, A), not cut to [-1, 1], from normalised observations (B, obs_dim)."""
         return self.network(inputs)
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
@@ -166,10 +153,7 @@ class BCRNNPolicy(CloningPolicy):
         return self.head(outputs), after if self.cell == "lstm" else (after,)
 
     def initial_state(self, n: int) -> tuple[np.ndarray, ...]:
-        """
-        :param n: episodes side by side
-        :return: the state before their first step
-        """
+        """The state before the first step of n episodes side by side."""
         n_parts = 2 if self.cell == "lstm" else 1
         hidden = [np.zeros((self.n_layers, n, self.hidden_size), dtype=np.float32) for _ in range(n_parts)]
         return *hidden, np.zeros(n, dtype=np.int64)

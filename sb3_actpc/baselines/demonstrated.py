@@ -115,10 +115,7 @@ class DemonstratedAlgorithm(LearnsFromDemonstrations, OffPolicyAlgorithm):
         )
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
-        """
-        :param env: as SB3's; an agent that was loaded without one gets its replay buffer and its demonstrations now
-        :param force_reset: as SB3's
-        """
+        """As SB3's; an agent that was loaded without an environment gets its replay buffer and its demonstrations now."""
         was_without = self.env is None
         super().set_env(env, force_reset)
         if was_without:
@@ -129,10 +126,7 @@ class DemonstratedAlgorithm(LearnsFromDemonstrations, OffPolicyAlgorithm):
         return {"n_demonstrated": self._n_demonstrated()}
 
     def restore_checkpoint_state(self, state: dict[str, Any]) -> None:
-        """
-        :param state: what :meth:`checkpoint_state` returned
-        :raises ValueError: when it was taken with other demonstrations
-        """
+        """ValueError when it was taken with other demonstrations."""
         if state["n_demonstrated"] != self._n_demonstrated():
             raise ValueError(
                 f"the checkpoint's agent has {state['n_demonstrated']} demonstrated transitions, this one "

@@ -21,15 +21,8 @@ from sb3_actpc.utils.checks import check_range
 def fill_with_demonstrations(
     buffer: ReplayBuffer, demonstrations: Demonstrations, observation_space: spaces.Space, action_space: spaces.Box
 ) -> None:
-    """
-    Add every demonstrated transition; an episode that did not terminate ends as by a time limit.
-
-    :param buffer: a buffer for one environment, with room for all
-    :param demonstrations: N transitions that fit the spaces
-    :param observation_space: a Box, or a Dict of Boxes
-    :param action_space: whose actions are scaled to [-1, 1]
-    :raises ValueError: for other observation spaces
-    """
+    """Add every demonstrated transition to a buffer for one environment with room for all; an episode that did not
+    terminate ends as by a time limit. Actions are scaled to [-1, 1]; observations are a Box, or a Dict of Boxes."""
     observations = split_observations(observation_space, demonstrations.observations)
     actions = scaled_actions(demonstrations, action_space)
     next_observations = split_observations(observation_space, demonstrations.next_observations)
@@ -85,18 +78,11 @@ class WithDemonstrations(ReplayBuffer):
             fill_with_demonstrations(self.demonstrated, demonstrations, self.observation_space, self.action_space)
 
     def n_demonstrated(self, batch_size: int) -> int:
-        """
-        :param batch_size: B
-        :return: how many of the B transitions are demonstrated ones; they are the last rows
-        """
+        """How many of B transitions are demonstrated ones; they are the last rows."""
         return 0 if self.demonstrated is None else round(self.demonstration_fraction * batch_size)
 
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> Any:
-        """
-        :param batch_size: B
-        :param env: VecNormalize whose statistics normalise observations and rewards
-        :return: B transitions: those of the agent, then those of the demonstrations
-        """
+        """B transitions: those of the agent, then those of the demonstrations; ``env`` as SB3's."""
         n_demonstrated = self.n_demonstrated(batch_size)
         if self.demonstrated is None or not n_demonstrated:
             return super().sample(batch_size, env)
@@ -169,11 +155,8 @@ def demonstration_buffer_class(
 
 
 def join_batches(own: Any, shown: Any) -> Any:
-    """
-    :param own: a batch of SB3's, a named tuple of tensors (B, ...)
-    :param shown: another of the same kind, (C, ...)
-    :return: both as one, (B + C, ...), field by field; fields that SB3 leaves at None stay None
-    """
+    """Two batches of SB3's, named tuples of tensors (B, ...) and (C, ...), as one, (B + C, ...); fields that SB3 leaves at
+    None stay None."""
     columns: dict[str, Any] = {}
     for name, mine in own._asdict().items():
         theirs = getattr(shown, name)

@@ -104,12 +104,7 @@ class HER(DDPGDemo):
         return actions, scaled
 
     def train(self, gradient_steps: int, batch_size: int = 100) -> None:
-        """
-        DDPG's updates; none before the first episode has ended, since hindsight needs one.
-
-        :param gradient_steps: how many
-        :param batch_size: B
-        """
+        """DDPG's updates; none before the first episode has ended, since hindsight needs one."""
         buffer = self.replay_buffer
         if isinstance(buffer, HerReplayBuffer) and not self._has_episode and buffer.n_demonstrated(batch_size) < batch_size:  # type: ignore[attr-defined]
             self._has_episode = bool((buffer.ep_length > 0).any())

@@ -138,10 +138,7 @@ class LOGO(LearnsFromDemonstrations, TRPO):
         self._shown = th.as_tensor(np.concatenate([shown.observations, shown.actions], axis=1), device=self.device)
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
-        """
-        :param env: as SB3's; an agent that was loaded without one gets its demonstrations now
-        :param force_reset: as SB3's
-        """
+        """As SB3's; an agent that was loaded without an environment gets its demonstrations now."""
         super().set_env(env, force_reset)
         if self.demonstrations is not None:
             self._load_demonstrations()
@@ -219,13 +216,8 @@ class LOGO(LearnsFromDemonstrations, TRPO):
         self.logger.record("train/guidance_value_loss", loss.item())
 
     def _trust_region_step(self, guidance: Guidance, max_kl: float) -> bool:
-        """
-        Move the policy along the natural gradient of the guidance's surrogate objective.
-
-        :param guidance: the iteration's transitions
-        :param max_kl: largest mean divergence from the policy as it is now
-        :return: whether the line search found a better policy; if not, the policy is as it was
-        """
+        """Move the policy along the natural gradient of the guidance's surrogate objective, at most a mean divergence of
+        ``max_kl`` far; whether the line search found a better policy. If not, the policy is as it was."""
         with th.no_grad():
             old = copy.copy(self.policy.get_distribution(guidance.observations))
         objective, divergence = self._surrogate(guidance, old)

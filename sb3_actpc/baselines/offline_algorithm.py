@@ -100,9 +100,7 @@ class OfflineAlgorithm(LearnsFromDemonstrations):
 
     @abstractmethod
     def _take(self, shown: Demonstrations) -> None:
-        """
-        :param shown: demonstrations that fit the environment, to learn from
-        """
+        """Learn from these demonstrations, which fit the environment."""
 
     def _load_demonstrations(self) -> None:
         if self.demonstrations is None:
@@ -113,10 +111,7 @@ class OfflineAlgorithm(LearnsFromDemonstrations):
         self._is_shown = True
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
-        """
-        :param env: as SB3's; an agent that was loaded without one gets its demonstrations now
-        :param force_reset: as SB3's
-        """
+        """As SB3's; an agent that was loaded without an environment gets its demonstrations now."""
         super().set_env(env, force_reset)
         self._load_demonstrations()
 
@@ -129,15 +124,8 @@ class OfflineAlgorithm(LearnsFromDemonstrations):
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
     ) -> SelfOffline:
-        """
-        :param total_timesteps: gradient steps
-        :param callback: called after each of them
-        :param log_interval: gradient steps between two lines of the log
-        :param tb_log_name: as SB3's, by default the name of the class
-        :param reset_num_timesteps: as SB3's
-        :param progress_bar: as SB3's
-        :return: the agent
-        """
+        """As SB3's: ``total_timesteps`` are gradient steps, callbacks are called after each, and ``log_interval`` of them
+        lie between two lines of the log."""
         if not getattr(self, "_is_shown", False):
             raise ValueError(f"{type(self).__name__} was loaded without an environment: set_env() first")
         name = tb_log_name or type(self).__name__

@@ -15,11 +15,7 @@ from sb3_actpc.utils.checks import check_range
 
 
 class SumTree:
-    """
-    Numbers of which any can be changed, and drawn in proportion, in logarithmic time.
-
-    :param size: how many; all start at 0
-    """
+    """Numbers, at first 0, of which any can be changed, and drawn in proportion, in logarithmic time."""
 
     def __init__(self, size: int) -> None:
         self.n_leaves = 1 << max(size - 1, 1).bit_length()
@@ -41,10 +37,7 @@ class SumTree:
             self.nodes[nodes] = self.nodes[2 * nodes] + self.nodes[2 * nodes + 1]
 
     def draw(self, n: int) -> np.ndarray:
-        """
-        :param n: how many
-        :return: (n,) indices, each drawn in proportion to its number: one from each n-th part of the total
-        """
+        """(n,) indices, each drawn in proportion to its number: one from each n-th part of the total."""
         masses = (np.arange(n) + np.random.random(n)) / n * self.total
         nodes = np.ones(n, dtype=np.int64)
         while nodes[0] < self.n_leaves:

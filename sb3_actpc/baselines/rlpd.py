@@ -16,12 +16,7 @@ from sb3_actpc.baselines.demonstrated import DemonstratedAlgorithm
 
 
 class LayerNormCritic(ContinuousCritic):
-    """
-    SB3's critics with layer normalisation before every activation.
-
-    :param args: as SB3's
-    :param kwargs: as SB3's
-    """
+    """SB3's critics with layer normalisation before every activation."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
@@ -34,11 +29,7 @@ class LayerNormCritic(ContinuousCritic):
             self.add_module(f"qf{index}", self.q_networks[index])
 
     def forward(self, obs: th.Tensor, actions: th.Tensor) -> tuple[th.Tensor, ...]:
-        """
-        :param obs: (B, *obs_shape)
-        :param actions: (B, A)
-        :return: action-values (B, 1) of every critic, or of ``n_drawn`` drawn ones
-        """
+        """Action-values (B, 1) of every critic, or of ``n_drawn`` drawn ones."""
         values = super().forward(obs, actions)
         if self.n_drawn is None:
             return values
@@ -67,10 +58,7 @@ class LayerNormSACPolicy(SACPolicy):
         self.critic_target.n_drawn = self.n_target_critics  # type: ignore[assignment]
 
     def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> LayerNormCritic:
-        """
-        :param features_extractor: as SB3's
-        :return: the critics
-        """
+        """As SB3's."""
         kwargs = self._update_features_extractor(self.critic_kwargs, features_extractor)
         return LayerNormCritic(**kwargs).to(self.device)
 

@@ -90,12 +90,7 @@ class TD3Demo(DemonstratedAlgorithm, TD3):
     # ------------------------------------------------------------------ learning
 
     def train(self, gradient_steps: int, batch_size: int = 100) -> None:
-        """
-        TD3's updates.
-
-        :param gradient_steps: how many of the critic; the actor and the targets follow every ``policy_delay``
-        :param batch_size: B
-        """
+        """TD3's updates: so many of the critic; the actor and the targets follow every ``policy_delay``."""
         assert self.replay_buffer is not None
         self.policy.set_training_mode(True)
         self._update_learning_rate([self.actor.optimizer, self.critic.optimizer])
@@ -128,11 +123,7 @@ class TD3Demo(DemonstratedAlgorithm, TD3):
             return batch.rewards + (1 - batch.dones) * discounts * next_values
 
     def _critic_loss(self, values: th.Tensor, targets: th.Tensor) -> th.Tensor:
-        """
-        :param values: (n_critics, B, 1)
-        :param targets: (B, 1)
-        :return: mean squared error, summed over the critics
-        """
+        """Mean squared error of values (n_critics, B, 1) and targets (B, 1), summed over the critics."""
         return sum((th.nn.functional.mse_loss(one, targets) for one in values), start=values.new_zeros(()))
 
     def _update_actor(self, batch: Any) -> None:
@@ -143,11 +134,7 @@ class TD3Demo(DemonstratedAlgorithm, TD3):
         self.actor.optimizer.step()
 
     def _actor_loss(self, batch: Any, actions: th.Tensor) -> th.Tensor:
-        """
-        :param batch: B transitions
-        :param actions: (B, A), what the actor does in them
-        :return: minus the mean action-value
-        """
+        """Minus the mean action-value of what the actor does, (B, A), in a batch."""
         return -self.critic.q1_forward(batch.observations, actions).mean()
 
     def _update_targets(self) -> None:

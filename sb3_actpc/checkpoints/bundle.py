@@ -36,42 +36,27 @@ def warn(line: str) -> None:
 
 
 class BundleWriter:
-    """
-    Files of one checkpoint; made by :func:`write_bundle`. Workers flush and hash a file while the next one is written.
-
-    :param folder: where they go
-    :param workers: flush and hash
-    """
+    """Files of one checkpoint; made by :func:`write_bundle`. Workers flush and hash a file while the next one is written."""
 
     def __init__(self, folder: Path, workers: ThreadPoolExecutor) -> None:
         self.folder, self.workers = folder, workers
         self._sealed: dict[str, Future[str]] = {}
 
     def files(self) -> dict[str, str]:
-        """Wait until everything is on the disk.
-
-        :return: name -> SHA-256
-        :raises OSError: when a file could not be flushed
-        """
+        """Wait until everything is on the disk: name -> SHA-256."""
         return {name: sealed.result() for name, sealed in self._sealed.items()}
 
     def add_bytes(self, name: str, data: bytes) -> None:
-        """:param name: file name
-        :param data: its content"""
+        """Write a file."""
         (self.folder / name).write_bytes(data)
         self._sealed[name] = self.workers.submit(_seal, self.folder / name)
 
     def add_json(self, name: str, value: Any) -> None:
-        """:param name: file name
-        :param value: plain values"""
+        """Write plain values."""
         self.add_bytes(name, json.dumps(value).encode())
 
     def add_array(self, name: str, array: np.ndarray) -> None:
-        """
-        :param name: file name, ending in ``.npy``
-        :param array: of numbers; written straight from its memory where it is C-contiguous
-        :raises ValueError: for an array of Python objects
-        """
+        """Write numbers, as ``.npy``, straight from their memory where that is C-contiguous; ValueError for Python objects."""
         np.save(self.folder / name, array, allow_pickle=False)
         self._sealed[name] = self.workers.submit(_seal, self.folder / name)
 
@@ -117,18 +102,15 @@ class Bundle:
                 raise DamagedCheckpoint(f"{self.path}: {name} does not have the recorded SHA-256")
 
     def read_bytes(self, name: str) -> bytes:
-        """:param name: file name
-        :return: its content"""
+        """A file's content."""
         return (self.path / name).read_bytes()
 
     def read_json(self, name: str) -> Any:
-        """:param name: file name
-        :return: plain values"""
+        """Plain values."""
         return json.loads(self.read_bytes(name))
 
     def read_array(self, name: str) -> np.ndarray:
-        """:param name: file name
-        :return: the array in it, memory-mapped: nothing is read before it is used"""
+        """An array, memory-mapped: nothing is read before it is used."""
         return np.load(self.path / name, mmap_mode="r", allow_pickle=False)
 
 
@@ -169,10 +151,7 @@ def write_bundle(folder: Path, num_timesteps: int, keep: int, manifest: Mapping[
 
 
 def list_bundles(folder: str | os.PathLike[str]) -> list[Path]:
-    """
-    :param folder: of all checkpoints of a run
-    :return: their folders, oldest first; empty when there are none
-    """
+    """Folders of all checkpoints of a run, oldest first; empty when there are none."""
     return [path for _, path in _list(Path(folder))]
 
 

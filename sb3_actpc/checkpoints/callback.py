@@ -154,10 +154,8 @@ class CheckpointCallback(BaseCallback):
 
 
 def why_no_checkpoints(algorithm: type[BaseAlgorithm]) -> str:
-    """
-    :param algorithm: a class; ``is_resumable = False`` in it says that SB3's state is not all of its own
-    :return: why its training cannot be stopped and gone on with; empty where it can
-    """
+    """Why the training of a class of algorithms cannot be stopped and gone on with; empty where it can. ``is_resumable =
+    False`` in the class says that SB3's state is not all of its own."""
     learns_by_rollouts = issubclass(algorithm, (OffPolicyAlgorithm, OnPolicyAlgorithm))
     return "" if learns_by_rollouts and getattr(algorithm, "is_resumable", True) else "keeps no checkpoints"
 
@@ -235,10 +233,7 @@ def callback_tree(callback: Any) -> list[BaseCallback]:
 
 
 def check_writable(folder: Path) -> None:
-    """
-    :param folder: where checkpoints shall go; made when it does not exist
-    :raises ValueError: when nothing can be written there
-    """
+    """Make the folder of checkpoints; ValueError when nothing can be written there."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):

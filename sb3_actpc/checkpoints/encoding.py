@@ -132,11 +132,7 @@ class Encoder:
 
 
 class Decoder:
-    """The inverse of :class:`Encoder`.
-
-    :param arrays: by the names that the encoder gave
-    :param tensors: likewise
-    """
+    """The inverse of :class:`Encoder`, given the arrays and tensors by the names that it gave them."""
 
     def __init__(self, arrays: Mapping[str, np.ndarray], tensors: Mapping[str, th.Tensor]) -> None:
         self.arrays, self.tensors = arrays, tensors
@@ -251,18 +247,12 @@ def _subspaces(space: spaces.Space) -> list[spaces.Space]:
 
 
 def space_generators(space: spaces.Space) -> list[dict[str, Any] | None]:
-    """
-    :param space: a space, with spaces in it or without
-    :return: the state of each one's generator, None where it has not been used
-    """
+    """The state of the generator of a space and of each space in it, None where it has not been used."""
     return [None if part._np_random is None else dict(part._np_random.bit_generator.state) for part in _subspaces(space)]
 
 
 def restore_space_generators(space: spaces.Space, states: list[dict[str, Any] | None]) -> None:
-    """
-    :param space: a space of the same form
-    :param states: what :func:`space_generators` returned
-    """
+    """Put back what :func:`space_generators` returned, into a space of the same form."""
     for part, state in zip(_subspaces(space), states, strict=True):
         if state is not None:
             part.np_random.bit_generator.state = state

@@ -12,13 +12,8 @@ STOP_SIGNALS = (signal.SIGTERM, signal.SIGINT)
 
 
 class TrainingStopped(SystemExit):
-    """
-    A signal stopped the training and everything is saved. Where nobody catches it, the process ends with ``EXIT_STOPPED``.
-
-    :param signal_name: such as ``"SIGTERM"``
-    :param num_timesteps: environment steps so far
-    :param checkpoint: folder of the checkpoint
-    """
+    """A signal stopped the training and everything is saved. Where nobody catches it, the process ends with
+    ``EXIT_STOPPED``."""
 
     def __init__(self, signal_name: str, num_timesteps: int, checkpoint: str) -> None:
         super().__init__(EXIT_STOPPED)

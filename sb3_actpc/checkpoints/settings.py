@@ -58,10 +58,9 @@ def constructor_settings(model: BaseAlgorithm) -> dict[str, Any]:
 
 
 def read_settings(record: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
-    """
-    :param record: what :func:`constructor_settings` returned
-    :param overrides: keywords that replace the stored ones
-    :return: keywords of the constructor, ``policy`` among them
+    """Keywords of the constructor, ``policy`` among them, from what :func:`constructor_settings` returned; ``overrides``
+    replace them.
+
     :raises ValueError: when a value has no name in this version, or a keyword that could not be stored is not given
     """
     missing = [name for name in record["unnamed"] if name not in overrides]
@@ -121,9 +120,8 @@ def _name_object(value: Any) -> dict[str, Any]:
 
 
 def read_value(node: Any) -> Any:
-    """
-    :param node: what :func:`constructor_settings` stored for one keyword
-    :return: the value
+    """The value of one keyword as :func:`constructor_settings` stored it.
+
     :raises ValueError: for a class, a schedule or a noise that is not allowed
     """
     if isinstance(node, list):
@@ -141,10 +139,8 @@ def read_value(node: Any) -> Any:
 
 
 def find_class(name: str) -> type | None:
-    """
-    :param name: module and name of a class
-    :return: the class, if it is among the allowed ones and its module has been imported before; otherwise None
-    """
+    """The class of a module and name, if it is among the allowed ones and its module has been imported before; otherwise
+    None."""
     module, _, attribute = name.rpartition(".")
     found = getattr(sys.modules.get(module), attribute, None) if module.partition(".")[0] in _PACKAGES else None
     return found if isinstance(found, type) and issubclass(found, _KINDS) else None

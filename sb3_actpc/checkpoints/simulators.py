@@ -47,12 +47,8 @@ def env_name(env: VecEnv) -> str:
 
 
 def capture_vec_env(env: VecEnv, encoder: Encoder, where: str) -> dict[str, Any]:
-    """
-    :param env: the training environment, with its wrappers
-    :param encoder: takes the values
-    :param where: path of the environment in the checkpoint
-    :return: JSON; environments whose state cannot be stored are named in it with the reason
-    """
+    """The training environment with its wrappers as JSON; environments whose state cannot be stored are named in it with
+    the reason."""
     *wrappers, innermost = vec_env_layers(env)
     record: dict[str, Any] = {"wrappers": [], "envs": []}
     # what the next reset will be given
@@ -70,10 +66,8 @@ def capture_vec_env(env: VecEnv, encoder: Encoder, where: str) -> dict[str, Any]
 
 
 def restore_vec_env(env: VecEnv, record: dict[str, Any], decoder: Decoder) -> list[tuple[int, str]]:
-    """
-    :param env: an environment made as the captured one was
-    :param record: what :func:`capture_vec_env` returned
-    :param decoder: gives the values back
+    """Put back what :func:`capture_vec_env` returned into an environment made as the captured one was.
+
     :return: (index, reason) of each environment whose episode must start again
     :raises ValueError: when the environment is wrapped in another way
     """
@@ -103,12 +97,8 @@ def restore_vec_env(env: VecEnv, record: dict[str, Any], decoder: Decoder) -> li
 
 
 def capture_env(env: gym.Env[Any, Any], encoder: Encoder, where: str) -> dict[str, Any]:
-    """
-    :param env: one environment, with its wrappers
-    :param encoder: takes the values
-    :param where: its path in the checkpoint
-    :return: JSON; with a "reason" where the state cannot be stored
-    """
+    """The state of one environment and its wrappers as JSON, ``where`` being its path in the checkpoint; with a "reason"
+    where it cannot be stored."""
     layers = env_layers(env)
     record: dict[str, Any] = {"classes": [type(layer).__qualname__ for layer in layers], "layers": []}
     for depth, layer in enumerate(layers):
@@ -144,12 +134,8 @@ def _layers_mismatch(env: gym.Env[Any, Any] | None, entry: dict[str, Any]) -> st
 
 
 def restore_env(env: gym.Env[Any, Any], entry: dict[str, Any], decoder: Decoder, generators_only: bool = False) -> None:
-    """
-    :param env: an environment made as the captured one was
-    :param entry: what :func:`capture_env` returned
-    :param decoder: gives the values back
-    :param generators_only: restore the random generators alone
-    """
+    """Put back what :func:`capture_env` returned into an environment made as the captured one was, or the random generators
+    alone."""
     for layer, attributes in zip(env_layers(env), entry.get("layers", []), strict=False):
         for name, node in attributes.items():
             if generators_only and not _is_generator(node):
@@ -196,12 +182,8 @@ def _is_physics(value: Any) -> bool:
 
 
 def capture_physics(model: Any, data: Any) -> dict[str, np.ndarray]:
-    """
-    :param model: ``mujoco.MjModel``
-    :param data: ``mujoco.MjData``
-    :return: the full integration state, (n,) float64 under "", and every other array of ``data`` by its name, since some of
-        them lag behind the state
-    """
+    """The full integration state of an ``MjData``, (n,) float64 under "", and every other array of it by its name, since
+    some of them lag behind the state."""
     mujoco = importlib.import_module("mujoco")
     kind = mujoco.mjtState.mjSTATE_INTEGRATION
     state = np.empty(mujoco.mj_stateSize(model, kind))
@@ -210,12 +192,7 @@ def capture_physics(model: Any, data: Any) -> dict[str, np.ndarray]:
 
 
 def restore_physics(model: Any, data: Any, arrays: dict[str, np.ndarray]) -> None:
-    """
-    :param model: ``mujoco.MjModel`` of the same simulation
-    :param data: ``mujoco.MjData``, changed
-    :param arrays: what :func:`capture_physics` returned
-    :raises ValueError: when they are of another simulation
-    """
+    """Put back what :func:`capture_physics` returned; ValueError when it is of another simulation."""
     mujoco = importlib.import_module("mujoco")
     kind = mujoco.mjtState.mjSTATE_INTEGRATION
     if len(arrays[""]) != mujoco.mj_stateSize(model, kind):

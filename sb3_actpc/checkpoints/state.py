@@ -52,13 +52,8 @@ _RECORDED_PACKAGES = ("sb3-actpc", "stable-baselines3", "torch", "gymnasium", "m
 
 @dataclass
 class Restored:
-    """
-    An agent that a checkpoint was put back into, and what can only be put back once ``learn`` has begun.
-
-    :param model: the agent
-    :param state: the checkpoint's plain values
-    :param decoder: gives them back
-    """
+    """An agent that a checkpoint was put back into, and what can only be put back once ``learn`` has begun: the
+    checkpoint's plain values, and what decodes them."""
 
     model: BaseAlgorithm
     state: dict[str, Any]
@@ -69,14 +64,10 @@ class Restored:
 
 
 def capture_model(model: BaseAlgorithm, callbacks: Sequence[BaseCallback], writer: BundleWriter) -> None:
-    """
-    Write everything that the rest of the training depends on.
+    """Write everything that the rest of the training depends on, between two rollouts, or between two updates before the
+    first.
 
-    :param model: the agent, between two rollouts, or between two updates before the first
-    :param callbacks: whose state is kept
-    :param writer: takes the files
     :raises ValueError: when a weight is not finite
-    :raises OSError: when the files cannot be written
     """
     check_weights(model)
     encoder = Encoder()
@@ -102,11 +93,7 @@ def capture_model(model: BaseAlgorithm, callbacks: Sequence[BaseCallback], write
 
 
 def describe_model(model: BaseAlgorithm, env_id: str) -> dict[str, Any]:
-    """
-    :param model: the agent
-    :param env_id: name of its task
-    :return: plain values by which a checkpoint of another agent or task is recognised, and the versions
-    """
+    """Plain values by which a checkpoint of another agent or task is recognised, and the versions."""
     buffer = replay_buffer(model)
     return {
         "agent": {
@@ -200,10 +187,7 @@ def stored_rows(buffer: ReplayBuffer) -> int:
 
 
 def buffer_arrays(buffer: ReplayBuffer) -> dict[str, np.ndarray]:
-    """
-    :param buffer: a replay buffer of SB3's or of this package
-    :return: its arrays with a row per step, (buffer_size, n_envs, ...), by name; dictionaries' as ``name.key``
-    """
+    """A replay buffer's arrays with a row per step, (buffer_size, n_envs, ...), by name; dictionaries' as ``name.key``."""
     arrays: dict[str, np.ndarray] = {}
     for name, value in vars(buffer).items():
         parts = {f"{name}.{key}": part for key, part in value.items()} if isinstance(value, dict) else {name: value}
@@ -345,12 +329,8 @@ def _restore_logger(model: BaseAlgorithm, record: dict[str, Any], decoder: Decod
 
 
 def restore_model(model: BaseAlgorithm, bundle: Bundle, report: Report) -> Restored:
-    """
-    Put everything back into an agent that was made with the same settings. Nothing is changed when the two do not fit.
+    """Put everything back into an agent that was made with the same settings. Nothing is changed when the two do not fit.
 
-    :param model: the agent, with its environment
-    :param bundle: a checkpoint that was verified
-    :param report: given a line for each environment whose episode starts again
     :return: the agent, and what :func:`restore_learning` puts back once ``learn(..., reset_num_timesteps=False)`` has begun
     :raises ValueError: when the checkpoint is of another algorithm, task, network or buffer
     """
@@ -380,13 +360,8 @@ def restore_model(model: BaseAlgorithm, bundle: Bundle, report: Report) -> Resto
 
 
 def restore_learning(restored: Restored, callbacks: Sequence[BaseCallback], report: Report) -> None:
-    """
-    Put back what the beginning of ``learn`` has changed or made: callbacks, logger, action noise, generators.
-
-    :param restored: an agent at the start of its first rollout
-    :param callbacks: of this ``learn``
-    :param report: given a line for each callback without a match
-    """
+    """Put back what the beginning of ``learn`` has changed or made: callbacks, logger, action noise, generators. A line is
+    reported for each callback without a match."""
     model, state, decoder = restored.model, restored.state, restored.decoder
     present = dict(named(callbacks))
     for name, record in state["callbacks"]:

@@ -42,10 +42,7 @@ def resolve(
 
 
 def is_minari_id(source: Any) -> bool:
-    """
-    :param source: as :func:`resolve`'s
-    :return: whether it is a text that names a Minari dataset, and no file
-    """
+    """Whether the source of demonstrations is a text that names a Minari dataset, and no file."""
     return isinstance(source, str) and MINARI_ID.fullmatch(source) is not None and not os.path.exists(source)
 
 
@@ -99,10 +96,6 @@ def _with_dense_rewards(demonstrations: Demonstrations, env_id: str | None) -> D
 
 
 def scaled_actions(demonstrations: Demonstrations, action_space: spaces.Box) -> np.ndarray:
-    """
-    :param demonstrations: N transitions that fit the space
-    :param action_space: the environment's
-    :return: (N, action_dim) float32, the actions scaled to [-1, 1]
-    """
+    """(N, action_dim) float32, the actions scaled to [-1, 1]."""
     low, high = action_space.low.ravel(), action_space.high.ravel()
     return np.clip(2.0 * (demonstrations.actions - low) / (high - low) - 1.0, -1.0, 1.0).astype(np.float32)

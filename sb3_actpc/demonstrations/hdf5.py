@@ -18,10 +18,8 @@ _READ_ERRORS = (OSError, RuntimeError, KeyError, ValueError, TypeError)
 
 @contextmanager
 def open_hdf5(path: str | os.PathLike[str]) -> Iterator[Any]:
-    """Open a file for reading.
+    """Open a file for reading; gives its ``data`` group, an ``h5py.Group``.
 
-    :param path: the file
-    :return: its ``data`` group, an ``h5py.Group``
     :raises FileNotFoundError: when there is no such file
     :raises ValueError: when it is not a whole HDF5 file, or has no demonstrations
     :raises ImportError: when h5py is not installed
@@ -59,13 +57,9 @@ def demo_names(data: Any) -> list[str]:
 
 
 def read_array(group: Any, key: str, source: str, size: int | None = None, length: int | None = None) -> np.ndarray:
-    """
-    :param group: an ``h5py.Group``
-    :param key: name of a dataset in it
-    :param source: file and demonstration, for messages
-    :param size: numbers in a row; None for a column
-    :param length: rows that are expected, None for any number of at least 1
-    :return: (length, size) float64, or (length,)
+    """A dataset of an ``h5py.Group``, (length, size) float64, or (length,) for a column; a length of None is any of at least
+    1.
+
     :raises ValueError: when it is missing, cannot be read, has another shape or type, or holds NaN or infinity
     """
     if key not in group:
@@ -89,13 +83,7 @@ def read_array(group: Any, key: str, source: str, size: int | None = None, lengt
 
 
 def read_json_attribute(data: Any, name: str, source: str) -> dict[str, Any]:
-    """
-    :param data: an ``h5py.Group``
-    :param name: attribute with a JSON dictionary
-    :param source: the file, for messages
-    :return: the dictionary
-    :raises ValueError: when it is missing or not JSON
-    """
+    """An attribute of an ``h5py.Group`` with a JSON dictionary; ValueError when it is missing or not JSON."""
     try:
         value = json.loads(data.attrs[name])
     except KeyError:
@@ -108,13 +96,8 @@ def read_json_attribute(data: Any, name: str, source: str) -> dict[str, Any]:
 
 
 def check_recorded_task(recorded: dict[str, Any], name: str, source: str) -> None:
-    """Check robosuite's task, robot and controller.
-
-    :param recorded: robosuite's keywords, with ``env_name``
-    :param name: robosuite's name of the task wanted
-    :param source: the file, for messages
-    :raises ValueError: naming the first one that differs
-    """
+    """Check the task (robosuite's ``name``), robot and controller among robosuite's recorded keywords; ValueError names the
+    first one that differs."""
     robots = recorded.get("robots", "Panda")
     controller = recorded.get("controller_configs") or {}
     parts = controller.get("body_parts", {})

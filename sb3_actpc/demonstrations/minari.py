@@ -63,11 +63,8 @@ def write_minari(
     metadata: dict[str, Any],
     options: dict[str, Any],
 ) -> Any:
-    """
-    :param episodes: the columns of each episode
-    :param metadata: further entries, JSON values
-    :return: the ``minari.MinariDataset``; for the other parameters and the errors see ``Demonstrations.to_minari``
-    """
+    """The ``minari.MinariDataset`` of the columns of each episode, with further metadata; for the rest see
+    ``Demonstrations.to_minari``."""
     dataset = import_minari().create_dataset_from_buffers(
         dataset_id,
         [episode_buffer(episode, observation_space, action_space) for episode in episodes],
@@ -81,12 +78,7 @@ def write_minari(
 
 
 def episode_buffer(episode: dict[str, Any], observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> Any:
-    """
-    :param episode: columns of one episode of n steps
-    :param observation_space: of the environment
-    :param action_space: of the environment
-    :return: a ``minari.data_collector.EpisodeBuffer`` with n + 1 observations
-    """
+    """The columns of one episode of n steps as a ``minari.data_collector.EpisodeBuffer`` with n + 1 observations."""
     from minari.data_collector import EpisodeBuffer
 
     observations = np.concatenate([episode["observations"], episode["next_observations"][-1:]])

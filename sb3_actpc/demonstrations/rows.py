@@ -9,23 +9,13 @@ from gymnasium import spaces
 
 
 def field_error(source: str, name: str, expected: str, found: str) -> ValueError:
-    """
-    :param source: file or data set the field comes from, or an empty text
-    :param name: the field
-    :param expected: what it must hold
-    :param found: what it holds
-    :return: the error to raise
-    """
+    """The error to raise for a field of demonstrations from a file or data set (or an empty text)."""
     prefix = f"{source}: " if source else ""
     return ValueError(f"{prefix}demonstrations field '{name}': expected {expected}, found {found}")
 
 
 def flat_size(space: spaces.Space[Any]) -> int:
-    """
-    :param space: of observations or actions
-    :return: how many numbers one of them has when flattened
-    :raises ValueError: for a space that cannot be flattened
-    """
+    """How many numbers an element of a space has when flattened; ValueError for a space that cannot be."""
     try:
         return int(spaces.utils.flatdim(space))
     except (NotImplementedError, ValueError):
@@ -33,10 +23,9 @@ def flat_size(space: spaces.Space[Any]) -> int:
 
 
 def box_paths(space: spaces.Space[Any]) -> list[list[str]]:
-    """
-    :param space: a Box, or a Dict of these or of further Dicts
-    :return: the way to every Box, in the order of ``gymnasium.spaces.utils.flatten``: ``[[]]`` for a Box, ``[["goal"], ...]``
-        for a Dict
+    """The way to every Box, in the order of ``gymnasium.spaces.utils.flatten``: ``[[]]`` for a Box, ``[["goal"], ...]`` for a
+    Dict.
+
     :raises ValueError: for other spaces
     """
     if isinstance(space, spaces.Dict):
@@ -47,14 +36,8 @@ def box_paths(space: spaces.Space[Any]) -> list[list[str]]:
 
 
 def split_observations(space: spaces.Space[Any], rows: np.ndarray) -> Any:
-    """
-    Undo ``gymnasium.spaces.utils.flatten`` for many rows at once.
-
-    :param space: a Box, or a Dict of these or of further Dicts
-    :param rows: (N, flat size)
-    :return: (N, *shape), or a dict of such
-    :raises ValueError: for other spaces
-    """
+    """Undo ``gymnasium.spaces.utils.flatten`` for many rows at once: (N, flat size) to (N, *shape), or a dict of such, for
+    a Box or a Dict of these or of further Dicts."""
     box_paths(space)
     if isinstance(space, spaces.Dict):
         ends = np.cumsum([flat_size(part) for part in space.values()])[:-1]
@@ -64,13 +47,8 @@ def split_observations(space: spaces.Space[Any], rows: np.ndarray) -> Any:
 
 
 def join_observations(observations: Any, paths: list[list[str]], source: str = "") -> np.ndarray:
-    """
-    The inverse of :func:`split_observations`.
+    """The inverse of :func:`split_observations`, given the way to every part (see :func:`box_paths`): (N, flat size).
 
-    :param observations: (N, *shape), or nested mappings of such
-    :param paths: the way to every part, see :func:`box_paths`
-    :param source: where they come from, for the message
-    :return: (N, flat size)
     :raises ValueError: when a part is missing
     """
     parts = []
@@ -86,12 +64,8 @@ def join_observations(observations: Any, paths: list[list[str]], source: str = "
 
 
 def unchained_indices(observations: np.ndarray, next_observations: np.ndarray, episode_starts: np.ndarray) -> np.ndarray:
-    """
-    :param observations: (N, obs_dim) float32
-    :param next_observations: (N, obs_dim) float32
-    :param episode_starts: (n_episodes,)
-    :return: (M,) int64, the transitions whose next observation is not, bit for bit, the next row of the same episode
-    """
+    """(M,) int64, the transitions whose next observation is not, bit for bit, the next row of the same episode;
+    observations are (N, obs_dim) float32."""
     unchained = np.ones(len(observations), dtype=bool)
     unchained[:-1] = np.any(next_observations[:-1].view(np.int32) != observations[1:].view(np.int32), axis=1)
     unchained[episode_starts[1:] - 1] = True

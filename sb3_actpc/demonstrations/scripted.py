@@ -92,10 +92,7 @@ class Skill:
 
     @classmethod
     def of(cls, proficiency: float) -> Skill:
-        """
-        :param proficiency: p
-        :raises ValueError: when it does not lie in [0, 1]
-        """
+        """Of a proficiency in [0, 1]."""
         if isinstance(proficiency, bool) or not isinstance(proficiency, int | float) or not 0.0 <= proficiency <= 1.0:
             raise ValueError(f"proficiency={proficiency!r} must be a number from 0 (clumsy) to 1 (sure), or 'mixed'")
         clumsiness = 1.0 - float(proficiency)
@@ -140,11 +137,7 @@ class ScriptedDemonstrator:
         self.start(0)
 
     def start(self, seed: int) -> None:
-        """
-        A new episode begins.
-
-        :param seed: the same one gives the same noise
-        """
+        """A new episode begins; the same seed gives the same noise."""
         self._rng = np.random.default_rng([self.seed, 1, seed])
         self._noise = np.zeros(ACTION_DIM - 1)
         self._pause = 0
@@ -153,10 +146,7 @@ class ScriptedDemonstrator:
         self._enter("reach")
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
-        """
-        :param observation: (obs_dim,)
-        :return: action (7,) float32, in [-1, 1]
-        """
+        """Action (7,) float32, in [-1, 1], for an observation (obs_dim,)."""
         view = self._view(observation)
         if self.stage not in ("reach", "descend", "release") and self._has_lost(view):
             self._enter("reach")

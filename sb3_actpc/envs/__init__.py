@@ -45,21 +45,12 @@ def register_envs() -> None:
 
 
 def sparse_env_id(env_id: str) -> str:
-    """Id of the sparse task behind a goal task.
-
-    :param env_id: any id, for example ``"GoalHopper-v5"``
-    :return: for example ``"SparseHopper-v5"``; an id that is not one of ``GOAL_MUJOCO_IDS`` is returned as it is
-    """
+    """Id of the sparse task behind a goal task: ``SparseHopper-v5`` of ``GoalHopper-v5``; another id is returned as it is."""
     return env_id.replace("Goal", "Sparse", 1) if env_id in GOAL_MUJOCO_IDS else env_id
 
 
 def dense_env_id(env_id: str) -> str:
-    """Id of the dense base task of a sparse MuJoCo task.
-
-    :param env_id: for example ``"SparseHopper-v5"``
-    :return: for example ``"Hopper-v5"``
-    :raises ValueError: if ``env_id`` is not one of ``SPARSE_MUJOCO_IDS``
-    """
+    """Id of the dense base task of a sparse MuJoCo task: ``Hopper-v5`` of ``SparseHopper-v5``; ValueError for another id."""
     if env_id not in SPARSE_MUJOCO_IDS:
         raise ValueError(f"env_id={env_id!r} is not a sparse MuJoCo task: choose one of {', '.join(SPARSE_MUJOCO_IDS)}")
     return env_id.removeprefix("Sparse")

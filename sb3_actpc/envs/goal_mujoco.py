@@ -44,31 +44,19 @@ class GoalTask(gym.Wrapper[Any, np.ndarray, Any, np.ndarray]):
         self.observation_space = spaces.Dict(boxes)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, dict[str, Any]]:
-        """
-        :param seed: as the sparse task's
-        :param options: likewise
-        :return: the dictionary, and the sparse task's info
-        """
+        """As the sparse task's, with the dictionary."""
         observation, info = self.env.reset(seed=seed, options=options)
         return self._goal_observation(observation), info
 
     def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """
-        :param action: (action_dim,) within the action space
-        :return: as the sparse task's, with the dictionary and the reward of :meth:`compute_reward`
-        """
+        """As the sparse task's, with the dictionary and the reward of :meth:`compute_reward`."""
         observation, _, terminated, truncated, info = self.env.step(action)
         row = self._goal_observation(observation)
         reward = self.compute_reward(row["achieved_goal"], row["desired_goal"], info)
         return row, float(reward), terminated, truncated, info
 
     def compute_reward(self, achieved_goal: np.ndarray, desired_goal: np.ndarray, info: Any) -> np.ndarray:
-        """
-        :param achieved_goal: (n_goal,), or (N, n_goal) for N transitions
-        :param desired_goal: likewise
-        :param info: not used
-        :return: rewards, () or (N,)
-        """
+        """Rewards () or (N,), of goals (n_goal,) or (N, n_goal); ``info`` is not used."""
         raise NotImplementedError
 
     def demonstrated_rewards(self, demonstrations: Demonstrations) -> np.ndarray:
@@ -172,13 +160,7 @@ class GoalLocomotion(GoalTask):
 
 
 def make_goal_env(task: str, **kwargs: Any) -> GoalTask:
-    """
-    Entry point of the ids ``Goal...``.
-
-    :param task: class in :mod:`sb3_actpc.envs.sparse_mujoco`, such as ``"SparseHopperV5Env"``
-    :param kwargs: its keywords
-    :return: the goal task
-    :raises ValueError: for a keyword that the task does not take
-    """
+    """Entry point of the ids ``Goal...``: the goal task of a class in :mod:`sb3_actpc.envs.sparse_mujoco`, with its
+    keywords."""
     env = getattr(sparse_mujoco, task)(**kwargs)
     return GoalReacher(env) if isinstance(env, sparse_mujoco.SparseReacherEnv) else GoalLocomotion(env)

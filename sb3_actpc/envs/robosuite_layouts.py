@@ -45,11 +45,7 @@ class RobosuiteTask:
         return sum(self.object_parts.values())
 
     def layout(self, obs: str) -> dict[str, slice]:
-        """
-        :param obs: key of ``OBSERVATIONS``
-        :return: part -> its columns in an observation, in order
-        :raises ValueError: for an unknown ``obs``
-        """
+        """Part -> its columns in an observation, in order; ValueError for an ``obs`` that is no key of ``OBSERVATIONS``."""
         if obs not in OBSERVATIONS:
             raise ValueError(f"obs={obs!r} is not one of {', '.join(OBSERVATIONS)}: choose one of these")
         sizes = {**PROPRIOCEPTION, "object": self.object_dim}
@@ -61,11 +57,7 @@ class RobosuiteTask:
         return self.layout(obs)["object"].stop
 
     def obs_of_size(self, obs_dim: int) -> str:
-        """
-        :param obs_dim: size of an observation
-        :return: the key of ``OBSERVATIONS``
-        :raises ValueError: when no observation of the task has this size
-        """
+        """The key of ``OBSERVATIONS`` that gives observations of this size; ValueError where none does."""
         sizes = {obs: self.obs_dim(obs) for obs in OBSERVATIONS}
         for obs, size in sizes.items():
             if size == obs_dim:
@@ -135,22 +127,14 @@ ROBOSUITE_TASKS: dict[str, RobosuiteTask] = {
 
 
 def quaternion_product(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Products of quaternions (x, y, z, w): the rotation ``second``, then ``first``.
-
-    :param first: (N, 4)
-    :param second: (N, 4)
-    :return: (N, 4)
-    """
+    """Products of quaternions (x, y, z, w), (N, 4): the rotation ``second``, then ``first``."""
     (v, a), (w, b) = (first[:, :3], first[:, 3:]), (second[:, :3], second[:, 3:])
     return np.concatenate([a * w + b * v + np.cross(v, w), a * b - (v * w).sum(axis=1, keepdims=True)], axis=1)
 
 
 def robosuite_task(env_id: str) -> RobosuiteTask:
-    """
-    :param env_id: Gymnasium id, with or without the module before a colon
-    :return: the task
-    :raises ValueError: when it is none of ``ROBOSUITE_TASKS``
-    """
+    """The task of a Gymnasium id, with or without the module before a colon; ValueError when it is none of
+    ``ROBOSUITE_TASKS``."""
     task = ROBOSUITE_TASKS.get(env_id.rpartition(":")[2])
     if task is None:
         raise ValueError(f"{env_id!r} is not a robosuite task: choose one of {', '.join(ROBOSUITE_TASKS)}")

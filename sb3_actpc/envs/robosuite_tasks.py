@@ -302,11 +302,7 @@ def make_simulation(name: str, **kwargs: Any) -> Any:
 
 
 def share_generator(simulation: Any, generator: np.random.Generator) -> None:
-    """Let a robosuite environment draw its random numbers from ``generator``.
-
-    :param simulation: the robosuite environment
-    :param generator: any generator
-    """
+    """Let a robosuite environment draw its random numbers from a generator."""
     simulation.rng = generator
     samplers = [simulation.placement_initializer]
     while samplers:
@@ -316,11 +312,8 @@ def share_generator(simulation: Any, generator: np.random.Generator) -> None:
 
 
 def resize_cube(simulation: Any, half_edges: np.ndarray) -> None:
-    """Give Lift's cube other edges, as if the model had been compiled with them (robosuite compiles it for each episode).
-
-    :param simulation: the robosuite environment; its state is lost, reset it or restore one
-    :param half_edges: (3,) in metres
-    """
+    """Give Lift's cube other half edges, (3,) in metres, as if the model had been compiled with them (robosuite compiles it
+    for each episode). The state of the simulation is lost: reset it or restore one."""
     model, data = simulation.sim.model._model, simulation.sim.data._data
     simulation.cube.size = [float(edge) for edge in half_edges]
     body = model.body(simulation.cube.root_body).id

@@ -40,10 +40,7 @@ LOCOMOTION_CONDITIONS: tuple[str, ...] = ("displacement", "forward")
 
 
 def _check_threshold(threshold: float | None, default: float, meaning: str, *, allow_zero: bool = False) -> float:
-    """Return the threshold in use.
-
-    :raises ValueError: if it is not a positive finite number, or with ``allow_zero`` 0
-    """
+    """The threshold in use; ValueError if it is not a positive finite number, or with ``allow_zero`` 0."""
     if threshold is None:
         return default
     is_number = isinstance(threshold, int | float) and not isinstance(threshold, bool)
@@ -71,19 +68,12 @@ class _SparseMujocoEnv(MujocoEnv, utils.EzPickle):
         return observation, reward, bool(terminated), truncated, info
 
     def demonstrated_rewards(self, demonstrations: Demonstrations) -> np.ndarray:
-        """The rewards that this environment, with its own condition and threshold, gives for recorded transitions.
-
-        :param demonstrations: N transitions of the same task, recorded under any condition
-        :return: (N,) float32; the recorded ones where the recording does not tell
-        """
+        """The rewards that this environment, with its own condition and threshold, gives for N recorded transitions of the
+        same task, under any condition: (N,) float32; the recorded ones where the recording does not tell."""
         raise NotImplementedError
 
     def demonstrated_positions(self, demonstrations: Demonstrations) -> np.ndarray:
-        """Generalised positions after every recorded transition, to draw the demonstrator with.
-
-        :param demonstrations: N transitions of the same task
-        :return: (N, nq) float64
-        """
+        """Generalised positions after every recorded transition, (N, nq) float64, to draw the demonstrator with."""
         raise NotImplementedError
 
     def _sparse_reward(self, info: dict[str, Any]) -> tuple[float, bool]:
@@ -119,20 +109,12 @@ class SparseReacherEnv(_SparseMujocoEnv):
         utils.EzPickle.__init__(self, threshold=threshold, miss_reward=miss_reward, **kwargs)
 
     def demonstrated_rewards(self, demonstrations: Demonstrations) -> np.ndarray:
-        """The rewards under this threshold, from the distance to the target, which is observed.
-
-        :param demonstrations: N transitions of the Reacher
-        :return: (N,) float32
-        """
+        """From the distance to the target, which is observed."""
         distances = np.linalg.norm(demonstrations.next_observations[:, 8:], axis=1)  # fingertip minus target
         return np.where(distances <= self.threshold, 1.0, self.miss_reward).astype(np.float32)
 
     def demonstrated_positions(self, demonstrations: Demonstrations) -> np.ndarray:
-        """Both joint angles and the target's position.
-
-        :param demonstrations: N transitions of the Reacher
-        :return: (N, 4) float64
-        """
+        """Both joint angles and the target's position, (N, 4)."""
         cosines, sines, targets = np.split(demonstrations.next_observations[:, :6].astype(np.float64), 3, axis=1)
         return np.concatenate([np.arctan2(sines, cosines), targets], axis=1)
 
@@ -185,23 +167,15 @@ class SparseLocomotionEnv(_SparseMujocoEnv):
         utils.EzPickle.__init__(self, condition=condition, threshold=threshold, **kwargs)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
-        """Start an episode and remember its x.
-
-        :param seed: seed of the base task's noise, None to go on with its generator
-        :param options: passed to the base task
-        :return: observation (obs_dim,) and the base task's info
-        """
+        """Start an episode and remember its x; as the base task's."""
         observation, info = super().reset(seed=seed, options=options)
         self._start_x = float(self.data.qpos[0])
         self._has_passed = False
         return observation, info
 
     def demonstrated_rewards(self, demonstrations: Demonstrations) -> np.ndarray:
-        """The rewards under this condition, from the forward velocity within the base task's reward.
-
-        :param demonstrations: N transitions of the base task with its default weights
-        :return: (N,) float32; the recorded rewards where ``dense_rewards`` is None
-        """
+        """From the forward velocity within the base task's reward, with its default weights; the recorded ones where
+        ``dense_rewards`` is None."""
         if demonstrations.dense_rewards is None:
             return demonstrations.rewards
         velocities = self._demonstrated_velocities(demonstrations)
@@ -210,11 +184,8 @@ class SparseLocomotionEnv(_SparseMujocoEnv):
         return (self._travelled(velocities, demonstrations) > self.distance).astype(np.float32)
 
     def demonstrated_positions(self, demonstrations: Demonstrations) -> np.ndarray:
-        """The observed positions, and the distance travelled along x (the Swimmer's y, not observed either, stays 0).
-
-        :param demonstrations: N transitions of the base task with its default weights and ``dense_rewards``
-        :return: (N, nq) float64
-        """
+        """The observed positions, and the distance travelled along x (the Swimmer's y, not observed either, stays 0); needs
+        ``dense_rewards`` under the base task's default weights."""
         assert self.model is not None
         positions = np.zeros((len(demonstrations), self.model.nq))
         positions[:, 0] = self._travelled(self._demonstrated_velocities(demonstrations), demonstrations)

@@ -19,24 +19,15 @@ LARGEST_SIZE = 2**31 - 1
 
 
 def check_choices(given: Mapping[str, Any], **allowed: Sequence[str]) -> None:
-    """
-    :param given: keyword -> value
-    :param allowed: keyword -> its allowed values
-    :raises ValueError: naming the first value that is not allowed
-    """
+    """ValueError naming the first value that is not one of those allowed for its keyword."""
     for name, choices in allowed.items():
         if not isinstance(given[name], str) or given[name] not in choices:
             raise ValueError(f"{name}={given[name]!r} is unknown; choose one of {list(choices)}")
 
 
 def check_range(given: Mapping[str, Any], names: str, low: float, high: float = np.inf) -> None:
-    """
-    :param given: keyword -> number, or None, which is left alone
-    :param names: keywords, separated by spaces
-    :param low: smallest allowed value
-    :param high: largest allowed value
-    :raises ValueError: naming the first value out of range
-    """
+    """ValueError naming the first of the keywords (separated by spaces) whose number is below ``low`` or above ``high``;
+    None is left alone."""
     for name in names.split():
         if given[name] is not None and not low <= given[name] <= high:
             bounds = f"at least {low}" if np.isinf(high) else f"between {low} and {high}"
@@ -122,13 +113,7 @@ def check_device(device: Any) -> None:
 
 
 def check_finite(where: str, what: str, values: np.ndarray, step: int) -> None:
-    """
-    :param where: the circuit's name, or "environment"
-    :param what: what ``values`` are
-    :param values: any shape
-    :param step: environment step to name
-    :raises ValueError: when a value is NaN or infinite
-    """
+    """ValueError when one of the values, of a circuit or of the environment, is NaN or infinite at an environment step."""
     if not np.isfinite(values).all():
         raise ValueError(
             f"{where}: {what} are not finite at step {step}; "

@@ -20,10 +20,7 @@ COMPLETE = "sb3_actpc_complete.json"  # written last, into an environment that i
 
 @dataclass(frozen=True)
 class Recipe:
-    """
-    :param steps: arguments of ``pip install``, one call after the other
-    :param check: statement that must run in the finished environment
-    """
+    """Arguments of ``pip install``, one call after the other, and a statement that must run in the finished environment."""
 
     steps: tuple[tuple[str, ...], ...]
     check: str
@@ -48,10 +45,8 @@ def environments_folder() -> Path:
 
 
 def environment_python(name: str, folder: Path | None = None) -> Path:
-    """
-    :param name: key of ``RECIPES``
-    :param folder: of the environments
-    :return: the interpreter of the whole environment of ``name``
+    """The interpreter of the whole environment of a package.
+
     :raises ImportError: when there is none; the message says how to make it
     """
     place = (environments_folder() if folder is None else folder) / name

@@ -32,16 +32,8 @@ ROBOMIMIC_RATES = "actor.optim_params.policy.learning_rate.initial, ..."
 
 
 class ServedPolicy(BasePolicy):
-    """
-    A policy whose actions another process chooses.
-
-    ``predict`` takes and returns that process's state as SB3's recurrent ``state``, arrays with a row for each environment;
-    None where the method has none.
-
-    :param observation_space: a Box
-    :param action_space: a Box with bounds
-    :param lr_schedule: no matter
-    """
+    """A policy whose actions another process chooses. ``predict`` takes and returns that process's state as SB3's recurrent
+    ``state``, arrays with a row for each environment; None where the method has none."""
 
     owner: ServedAlgorithm
 
@@ -58,13 +50,7 @@ class ServedPolicy(BasePolicy):
         episode_start: np.ndarray | None = None,
         deterministic: bool = False,
     ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
-        """
-        :param observation: of one environment, or of n
-        :param state: what the call before returned; None at the beginning
-        :param episode_start: (n,), true where an episode begins
-        :param deterministic: has no effect: the packages' own evaluation is meant
-        :return: actions in the environment's units, and the next state
-        """
+        """As SB3's; ``deterministic`` has no effect: the packages' own evaluation is meant."""
         rows, is_batch = self.obs_to_tensor(observation)
         assert isinstance(rows, th.Tensor)
         starts = np.full(len(rows), state is None) if episode_start is None else np.asarray(episode_start, dtype=bool)
@@ -221,11 +207,9 @@ class ServedAlgorithm(OfflineAlgorithm):
     def act(
         self, observations: np.ndarray, starts: np.ndarray, state: tuple[np.ndarray, ...] | None
     ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
-        """
-        :param observations: (n, obs_dim)
-        :param starts: (n,), true where an episode begins
-        :param state: what the call before returned; None at the beginning
-        :return: actions (n, A), about in [-1, 1], and the next state
+        """Actions (n, A), about in [-1, 1], and the next state, for observations (n, obs_dim); ``starts`` (n,) is true where
+        an episode begins.
+
         :raises OSError: when the other process has failed
         """
         arrays = {"observations": self._normalized(observations), "episode_starts": starts}
@@ -241,11 +225,7 @@ class ServedAlgorithm(OfflineAlgorithm):
     # ------------------------------------------------------------------ saving
 
     def save(self, path: Any, exclude: Any = None, include: Any = None) -> None:
-        """
-        :param path: as SB3's
-        :param exclude: as SB3's
-        :param include: as SB3's
-        """
+        """As SB3's; the networks are fetched first."""
         if self._process is not None or not len(self.trained):
             self.trained = th.from_numpy(self._server().ask("save")[1]["parameters"])
         super().save(path, exclude, include)
@@ -263,62 +243,32 @@ def _plain(settings: Mapping[str, Any]) -> dict[str, Any]:
 
 
 class BCQ(ServedAlgorithm):
-    """
-    Batch-constrained Q-learning (Fujimoto et al., arXiv 1812.02900) by d3rlpy, as it is there.
-
-    :param policy: "MlpPolicy"
-    :param env: as :class:`ServedAlgorithm`'s
-    :param options: keywords of :class:`ServedAlgorithm`; ``method_kwargs`` are those of d3rlpy's ``BCQConfig``, and
-        ``net_arch``, the hidden sizes of all networks
-    :raises ValueError: as there
-    :raises ImportError: as there
-    """
+    """Batch-constrained Q-learning (Fujimoto et al., arXiv 1812.02900) by d3rlpy, as it is there; ``method_kwargs`` are
+    those of d3rlpy's ``BCQConfig``, and ``net_arch``, the hidden sizes of all networks."""
 
     package, method, rates = "d3rlpy", "bcq", D3RLPY_RATES
 
 
 class CQL(ServedAlgorithm):
-    """
-    Conservative Q-learning (Kumar et al., arXiv 2006.04779) by d3rlpy, as it is there.
-
-    :param policy: "MlpPolicy"
-    :param env: as :class:`ServedAlgorithm`'s
-    :param options: keywords of :class:`ServedAlgorithm`; ``method_kwargs`` are those of d3rlpy's ``CQLConfig``, and
-        ``net_arch``, the hidden sizes of all networks
-    :raises ValueError: as there
-    :raises ImportError: as there
-    """
+    """Conservative Q-learning (Kumar et al., arXiv 2006.04779) by d3rlpy, as it is there; ``method_kwargs`` are those of
+    d3rlpy's ``CQLConfig``, and ``net_arch``, the hidden sizes of all networks."""
 
     package, method, rates = "d3rlpy", "cql", D3RLPY_RATES
 
 
 class HBC(ServedAlgorithm):
-    """
-    Hierarchical behaviour cloning (Mandlekar et al., arXiv 2003.06085) by robomimic: a planner of subgoals, a recurrent actor.
+    """Hierarchical behaviour cloning (Mandlekar et al., arXiv 2003.06085) by robomimic: a planner of subgoals, a recurrent
+    actor.
 
-    Difference from robomimic's runs: the observation is one key, not one for each of robosuite's parts.
-
-    :param policy: "MlpPolicy"
-    :param env: as :class:`ServedAlgorithm`'s
-    :param options: keywords of :class:`ServedAlgorithm`; ``method_kwargs`` are what is to change in the ``algo`` part of
-        robomimic's config
-    :raises ValueError: as there
-    :raises ImportError: as there
+    Difference from robomimic's runs: the observation is one key, not one for each of robosuite's parts. ``method_kwargs``
+    are what is to change in the ``algo`` part of robomimic's config.
     """
 
     package, method, rates = "robomimic", "hbc", ROBOMIMIC_RATES
 
 
 class IRIS(ServedAlgorithm):
-    """
-    Implicit reinforcement without interaction at scale (Mandlekar et al., arXiv 1911.05321) by robomimic: :class:`HBC` with
-    a value function (BCQ) that chooses among sampled subgoals.
-
-    :param policy: "MlpPolicy"
-    :param env: as :class:`ServedAlgorithm`'s
-    :param options: as :class:`HBC`'s
-    :raises ValueError: as there
-    :raises ImportError: as there
-    """
+    """Implicit reinforcement without interaction at scale (Mandlekar et al., arXiv 1911.05321) by robomimic: :class:`HBC`
+    with a value function (BCQ) that chooses among sampled subgoals."""
 
     package, method, rates = "robomimic", "iris", ROBOMIMIC_RATES
