@@ -528,7 +528,7 @@ MUTANTS = [
         f"{TASKS} -k displacement",
     ),
     Mutant(
-        "the HalfCheetah's threshold", SPARSE, "default_distance = 20.0", "default_distance = 19.0", f"{TASKS} -k displacement"
+        "the HalfCheetah's threshold", SPARSE, '"HalfCheetah": 20.0', '"HalfCheetah": 19.0', f"{TASKS} -k displacement"
     ),
     Mutant(
         "the Reacher's threshold",

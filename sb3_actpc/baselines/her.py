@@ -40,11 +40,9 @@ class HER(DDPGDemo):
     :param random_action_start: ε at the start
     :param random_action_decay: factor of ε per environment step
     :param random_action_end: smallest ε
-    :param cloning_weight: as :class:`DDPGDemo`'s; the paper names no cloning for HER
-    :param policy_gradient_weight: as :class:`DDPGDemo`'s, where something is cloned
-    :param demonstration_fraction: share of each batch that comes from the demonstrations
     :param replay_buffer_kwargs: further keywords of the buffer
-    :param options: further keywords of :class:`DDPGDemo`
+    :param options: keywords of :class:`DDPGDemo`; ``cloning_weight`` is 0 (the paper names no cloning for HER) and
+        ``demonstration_fraction`` 0.5 unless given
     :raises ValueError: for an environment without goals, or a value that is not allowed
     """
 
@@ -57,9 +55,6 @@ class HER(DDPGDemo):
         random_action_start: float = 1.0,
         random_action_decay: float = 0.9999,
         random_action_end: float = 0.32,
-        cloning_weight: float = 0.0,
-        policy_gradient_weight: float = 0.001,
-        demonstration_fraction: float = 0.5,
         replay_buffer_kwargs: dict[str, Any] | None = None,
         **options: Any,
     ) -> None:
@@ -68,15 +63,9 @@ class HER(DDPGDemo):
         self.random_action_start, self.random_action_decay = random_action_start, random_action_decay
         self.random_action_end = random_action_end
         self._has_episode = False
-        super().__init__(
-            policy,
-            env,
-            cloning_weight=cloning_weight,
-            policy_gradient_weight=policy_gradient_weight,
-            demonstration_fraction=demonstration_fraction,
-            replay_buffer_kwargs={"n_sampled_goal": 1, "goal_selection_strategy": "final", **(replay_buffer_kwargs or {})},
-            **options,
-        )
+        buffer = {"n_sampled_goal": 1, "goal_selection_strategy": "final", **(replay_buffer_kwargs or {})}
+        options = {"cloning_weight": 0.0, "demonstration_fraction": 0.5, **options, "replay_buffer_kwargs": buffer}
+        super().__init__(policy, env, **options)
 
     def _replay_class(self) -> type[WithDemonstrations]:
         keys = set(getattr(self.observation_space, "spaces", {}))

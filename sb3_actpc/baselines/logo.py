@@ -71,11 +71,9 @@ class LOGO(LearnsFromDemonstrations, TRPO):
     :param discriminator_learning_rate: Adam's
     :param discriminator_updates: updates each iteration, each on all transitions of the iteration and all demonstrations
     :param discriminator_net_arch: hidden sizes of the discriminator and of the guidance value net
-    :param target_kl: as TRPO's, the paper's ``high_kl``
-    :param cg_max_steps: as TRPO's
-    :param line_search_shrinking_factor: as TRPO's
     :param options: keywords of :class:`~sb3_actpc.baselines.demonstrated.LearnsFromDemonstrations` (without demonstrations it
-        is TRPO) and of sb3-contrib's TRPO
+        is TRPO) and of sb3-contrib's TRPO; ``target_kl`` is the paper's ``high_kl``, and unless given ``cg_max_steps`` is 10,
+        ``line_search_shrinking_factor`` 0.5
     :raises ValueError: for a keyword with a value that is not allowed, for demonstrations that do not fit the environment,
         and for other spaces
     """
@@ -94,9 +92,6 @@ class LOGO(LearnsFromDemonstrations, TRPO):
         discriminator_learning_rate: float = 3e-4,
         discriminator_updates: int = 1,
         discriminator_net_arch: list[int] | None = None,
-        target_kl: float = 0.01,
-        cg_max_steps: int = 10,
-        line_search_shrinking_factor: float = 0.5,
         **options: Any,
     ) -> None:
         given = locals()
@@ -112,8 +107,7 @@ class LOGO(LearnsFromDemonstrations, TRPO):
         self.delta = guidance_delta
         self._iteration_returns: list[float] = []
         self._past_returns: deque[float] = deque(maxlen=10)
-        options |= {"target_kl": target_kl, "cg_max_steps": cg_max_steps}
-        super().__init__(policy, env, line_search_shrinking_factor=line_search_shrinking_factor, **options)
+        super().__init__(policy, env, **{"cg_max_steps": 10, "line_search_shrinking_factor": 0.5, **options})
 
     # ------------------------------------------------------------------ setting up
 

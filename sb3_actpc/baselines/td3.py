@@ -190,25 +190,16 @@ class DDPGDemo(TD3Demo):
         cloning_weight: float = 1.0,
         q_filter: bool = True,
         demonstration_fraction: float = 1 / 9,
-        policy_delay: int = 1,
-        target_policy_noise: float = 0.1,
-        target_noise_clip: float = 0.0,
         policy_kwargs: dict[str, Any] | None = None,
         **options: Any,
     ) -> None:
         check_kinds(locals(), numbers="policy_gradient_weight cloning_weight", mappings="policy_kwargs")
         check_range(locals(), "policy_gradient_weight cloning_weight", 0)
         self.policy_gradient_weight, self.cloning_weight, self.q_filter = policy_gradient_weight, cloning_weight, q_filter
-        super().__init__(
-            policy,
-            env,
-            demonstration_fraction=demonstration_fraction,
-            policy_delay=policy_delay,
-            target_policy_noise=target_policy_noise,
-            target_noise_clip=target_noise_clip,
-            policy_kwargs={"n_critics": 1, **(policy_kwargs or {})},
-            **options,
-        )
+        # SB3's DDPG
+        options = {"policy_delay": 1, "target_policy_noise": 0.1, "target_noise_clip": 0.0, **options}
+        policy_kwargs = {"n_critics": 1, **(policy_kwargs or {})}
+        super().__init__(policy, env, demonstration_fraction=demonstration_fraction, policy_kwargs=policy_kwargs, **options)
 
     def _actor_loss(self, batch: Any, actions: th.Tensor) -> th.Tensor:
         loss = super()._actor_loss(batch, actions)

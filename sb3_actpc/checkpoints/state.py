@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 import inspect
 import random
 import warnings
@@ -27,6 +26,7 @@ from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 from sb3_actpc.checkpoints.bundle import Bundle, BundleWriter, Report
 from sb3_actpc.checkpoints.encoding import Decoder, Encoder, OpaqueValue
 from sb3_actpc.checkpoints.simulators import capture_vec_env, env_name, restore_vec_env, vec_env_layers
+from sb3_actpc.utils.versions import installed_version
 
 _COUNTERS = (
     "num_timesteps",
@@ -106,7 +106,7 @@ def describe_model(model: BaseAlgorithm, env_id: str) -> dict[str, Any]:
             "buffer_size": None if buffer is None else buffer.buffer_size,
             "weights": {name: list(tensor.shape) for name, tensor in model.policy.state_dict().items()},
         },
-        "versions": {name: _version(name) for name in _RECORDED_PACKAGES},
+        "versions": {name: installed_version(name) for name in _RECORDED_PACKAGES},
     }
 
 
@@ -129,13 +129,6 @@ def named(callbacks: Sequence[BaseCallback]) -> list[tuple[str, BaseCallback]]:
         seen[kind] = seen.get(kind, 0) + 1
         result.append((f"{kind}{seen[kind]}", callback))
     return result
-
-
-def _version(package: str) -> str:
-    try:
-        return importlib.metadata.version(package)
-    except importlib.metadata.PackageNotFoundError:  # a source checkout, or an extra that is not installed
-        return "unknown"
 
 
 def _generators(model: BaseAlgorithm) -> dict[str, Any]:

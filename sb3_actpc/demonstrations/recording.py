@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
 import gymnasium as gym
@@ -12,6 +11,7 @@ import numpy as np
 from gymnasium import spaces
 
 from sb3_actpc.demonstrations.rows import box_paths, join_observations
+from sb3_actpc.utils.versions import installed_version
 
 Columns = dict[str, np.ndarray]
 Report = Callable[[str], None]
@@ -69,7 +69,8 @@ def record_episodes(
             f"only {len(episodes)} of {n_tries} episodes succeeded in {env_name(env)}, {n_episodes} are needed: take a better "
             "demonstrator (train it longer: --steps), allow more tries (--max-tries), or ask for fewer episodes (--episodes)"
         )
-    return episodes, {"seed": seed, "n_tries": n_tries, "deterministic": deterministic, **_versions()}
+    simulators = {name: installed_version(name) for name in ("gymnasium", "mujoco", "robosuite") if name in sys.modules}
+    return episodes, {"seed": seed, "n_tries": n_tries, "deterministic": deterministic, **simulators}
 
 
 def env_name(env: gym.Env[Any, Any]) -> str:
@@ -158,15 +159,3 @@ def _is_kept(info: Mapping[str, Any], only_successes: bool | None) -> bool:
             "only_successes=True needs an environment whose info has is_success: give False to keep every episode"
         )
     return only_successes is False or success is None or bool(success)
-
-
-def _versions() -> dict[str, str]:
-    """Of the simulators in use."""
-    versions: dict[str, str] = {}
-    for name in ("gymnasium", "mujoco", "robosuite"):
-        if name in sys.modules:
-            try:
-                versions[name] = version(name)
-            except PackageNotFoundError:
-                versions[name] = "unknown"
-    return versions

@@ -9,7 +9,6 @@ from __future__ import annotations
 import io
 import json
 import os
-from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
 import numpy as np
@@ -28,6 +27,7 @@ from sb3_actpc.envs.robosuite_layouts import ACTION_DIM, OBSERVATIONS, PROPRIOCE
 from sb3_actpc.utils.files import atomic_write
 
 ROBOSUITE_TYPE = 1  # robomimic's EnvType
+ROBOSUITE_VERSION = "1.5.2"  # whose observations and controller these are
 # metres: the median over an episode of how much an object's two recorded distances from the gripper differ
 OBJECT_TOLERANCE = 0.005
 
@@ -175,16 +175,12 @@ def _object_states(
 
 
 def _env_args(task: RobosuiteTask) -> dict[str, Any]:
-    try:
-        robosuite_version = version("robosuite")
-    except PackageNotFoundError:
-        robosuite_version = "1.5.2"
     arm = {"type": "OSC_POSE", "input_max": 1, "input_min": -1, "input_type": "delta", "input_ref_frame": "base"}
     arm |= {"output_max": [0.05] * 3 + [0.5] * 3, "output_min": [-0.05] * 3 + [-0.5] * 3, "kp": 150, "damping_ratio": 1}
     arm |= {"impedance_mode": "fixed", "kp_limits": [0, 300], "damping_ratio_limits": [0, 10], "gripper": {"type": "GRIP"}}
     controller = {"type": "BASIC", "body_parts": {"right": {**arm, "uncouple_pos_ori": True, "ramp_ratio": 0.2}}}
     kwargs = {"robots": ["Panda"], "controller_configs": controller, "control_freq": 20, "reward_shaping": False}
-    return {"env_name": task.name, "env_version": robosuite_version, "type": ROBOSUITE_TYPE, "env_kwargs": kwargs}
+    return {"env_name": task.name, "env_version": ROBOSUITE_VERSION, "type": ROBOSUITE_TYPE, "env_kwargs": kwargs}
 
 
 def _write_episode(group: Any, demonstrations: Demonstrations, rows: slice, layout: dict[str, slice]) -> None:

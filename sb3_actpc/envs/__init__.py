@@ -20,28 +20,18 @@ def register_envs() -> None:
     The time limits of the MuJoCo tasks are those of the base tasks: 50 steps for the Reacher, 1000 for the others. The
     robosuite tasks have their own keyword ``horizon``.
     """
-    for env_id in SPARSE_MUJOCO_IDS:
-        if env_id in registry:
-            continue
-        task, env_version = env_id.split("-")
-        register(
-            id=env_id,
-            entry_point=f"sb3_actpc.envs.sparse_mujoco:{task}{env_version.upper()}Env",
-            max_episode_steps=50 if task == "SparseReacher" else 1000,
-        )
-    for env_id in GOAL_MUJOCO_IDS:
+    for env_id in (*SPARSE_MUJOCO_IDS, *GOAL_MUJOCO_IDS):
         if env_id in registry:
             continue
         task, env_version = sparse_env_id(env_id).split("-")
-        register(
-            id=env_id,
-            entry_point="sb3_actpc.envs.goal_mujoco:make_goal_env",
-            max_episode_steps=50 if task == "SparseReacher" else 1000,
-            kwargs={"task": f"{task}{env_version.upper()}Env"},
-        )
+        limit, kind = 50 if task == "SparseReacher" else 1000, f"{task}{env_version.upper()}Env"
+        if env_id in SPARSE_MUJOCO_IDS:
+            register(env_id, f"sb3_actpc.envs.sparse_mujoco:{kind}", max_episode_steps=limit)
+        else:
+            register(env_id, "sb3_actpc.envs.goal_mujoco:make_goal_env", max_episode_steps=limit, kwargs={"task": kind})
     for env_id in ROBOSUITE_IDS:
         if env_id not in registry:
-            register(id=env_id, entry_point=f"sb3_actpc.envs.robosuite_tasks:{env_id.split('-')[0]}Env")
+            register(env_id, f"sb3_actpc.envs.robosuite_tasks:{env_id.split('-')[0]}Env")
 
 
 def sparse_env_id(env_id: str) -> str:

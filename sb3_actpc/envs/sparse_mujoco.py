@@ -17,21 +17,13 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Any, ClassVar
 
+import gymnasium as gym
 import numpy as np
 from gymnasium import utils
-from gymnasium.envs.mujoco import (
-    MujocoEnv,
-    half_cheetah_v4,
-    half_cheetah_v5,
-    hopper_v4,
-    hopper_v5,
-    reacher_v4,
-    reacher_v5,
-    swimmer_v4,
-    swimmer_v5,
-    walker2d_v4,
-    walker2d_v5,
-)
+from gymnasium.envs.mujoco import MujocoEnv
+from gymnasium.envs.registration import load_env_creator
+
+from sb3_actpc.envs import SPARSE_MUJOCO_IDS
 
 if TYPE_CHECKING:
     from sb3_actpc.demonstrations.dataset import Demonstrations
@@ -139,10 +131,7 @@ class SparseLocomotionEnv(_SparseMujocoEnv):
     """
 
     default_distance: ClassVar[float]
-    """Metres, of LOGO's benchmark."""
     default_velocity: ClassVar[float]
-    """Metres per second, our choice: the paper gives none. Of the steps of uniformly random actions (10 episodes of -v5) it
-    pays 0 % (HalfCheetah, Walker2d), 4 % (Hopper) and 18 % (Swimmer, whose first segment swings along x)."""
 
     _ctrl_cost_weight: float  # of the base task, as the next
     _forward_reward_weight: float
@@ -214,61 +203,22 @@ class SparseLocomotionEnv(_SparseMujocoEnv):
         return float(is_paid), self._has_passed
 
 
-class _SparseHalfCheetahEnv(SparseLocomotionEnv):
-    default_distance = 20.0
-    default_velocity = 3.5
+# metres, of LOGO's benchmark, and metres per second, our choice: the paper gives none. Of the steps of uniformly random
+# actions (10 episodes of -v5) the latter pays 0 % (HalfCheetah, Walker2d), 4 % (Hopper) and 18 % (Swimmer, which swings)
+_DISTANCES = {"HalfCheetah": 20.0, "Walker2d": 2.0, "Hopper": 2.0, "Swimmer": 1.0}
+_VELOCITIES = {"HalfCheetah": 3.5, "Walker2d": 1.0, "Hopper": 1.0, "Swimmer": 0.3}
 
 
-class _SparseWalker2dEnv(SparseLocomotionEnv):
-    default_distance = 2.0
-    default_velocity = 1.0
+def _sparse_class(env_id: str) -> type:
+    """The class of a sparse task, such as ``SparseHopperV5Env``: Gymnasium's own with another reward."""
+    task, version = env_id.removeprefix("Sparse").split("-")
+    base: Any = load_env_creator(str(gym.spec(f"{task}-{version}").entry_point))
+    described = {"__module__": __name__, "__doc__": f"``{task}-{version}`` with a sparse reward."}
+    name = f"Sparse{task}{version.upper()}Env"
+    if task == "Reacher":
+        return type(name, (SparseReacherEnv, base), described)
+    thresholds = {"default_distance": _DISTANCES[task], "default_velocity": _VELOCITIES[task]}
+    return type(name, (SparseLocomotionEnv, base), described | thresholds)
 
 
-class _SparseHopperEnv(SparseLocomotionEnv):
-    default_distance = 2.0
-    default_velocity = 1.0
-
-
-class _SparseSwimmerEnv(SparseLocomotionEnv):
-    default_distance = 1.0
-    default_velocity = 0.3
-
-
-class SparseReacherV5Env(SparseReacherEnv, reacher_v5.ReacherEnv):
-    """``Reacher-v5`` (10 observations) paid near its target."""
-
-
-class SparseReacherV4Env(SparseReacherEnv, reacher_v4.ReacherEnv):
-    """``Reacher-v4`` (11 observations, as in the paper) paid near its target."""
-
-
-class SparseHalfCheetahV5Env(_SparseHalfCheetahEnv, half_cheetah_v5.HalfCheetahEnv):
-    """``HalfCheetah-v5`` (17 observations) paid beyond 20 m, or above 3.5 m/s."""
-
-
-class SparseHalfCheetahV4Env(_SparseHalfCheetahEnv, half_cheetah_v4.HalfCheetahEnv):
-    """``HalfCheetah-v4`` (17 observations) paid beyond 20 m, or above 3.5 m/s."""
-
-
-class SparseWalker2dV5Env(_SparseWalker2dEnv, walker2d_v5.Walker2dEnv):
-    """``Walker2d-v5`` (17 observations) paid beyond 2 m, or above 1 m/s."""
-
-
-class SparseWalker2dV4Env(_SparseWalker2dEnv, walker2d_v4.Walker2dEnv):
-    """``Walker2d-v4`` (17 observations) paid beyond 2 m, or above 1 m/s."""
-
-
-class SparseHopperV5Env(_SparseHopperEnv, hopper_v5.HopperEnv):
-    """``Hopper-v5`` (11 observations) paid beyond 2 m, or above 1 m/s."""
-
-
-class SparseHopperV4Env(_SparseHopperEnv, hopper_v4.HopperEnv):
-    """``Hopper-v4`` (11 observations) paid beyond 2 m, or above 1 m/s."""
-
-
-class SparseSwimmerV5Env(_SparseSwimmerEnv, swimmer_v5.SwimmerEnv):
-    """``Swimmer-v5`` (8 observations) paid beyond 1 m, or above 0.3 m/s."""
-
-
-class SparseSwimmerV4Env(_SparseSwimmerEnv, swimmer_v4.SwimmerEnv):
-    """``Swimmer-v4`` (8 observations) paid beyond 1 m, or above 0.3 m/s."""
+globals().update({made.__name__: made for made in map(_sparse_class, SPARSE_MUJOCO_IDS)})

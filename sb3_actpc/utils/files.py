@@ -6,24 +6,13 @@ import os
 import shutil
 import uuid
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, Any, Literal, overload
+from typing import IO, Any, Literal
 
 
-@overload
-def atomic_write(path: str | os.PathLike[str]) -> AbstractContextManager[IO[bytes]]: ...
-
-
-@overload
-def atomic_write(path: str | os.PathLike[str], mode: Literal["wb"]) -> AbstractContextManager[IO[bytes]]: ...
-
-
-@overload
-def atomic_write(path: str | os.PathLike[str], mode: Literal["w"]) -> AbstractContextManager[IO[str]]: ...
-
-
-def atomic_write(path: str | os.PathLike[str], mode: Literal["wb", "w"] = "wb") -> AbstractContextManager[IO[Any]]:
+@contextmanager
+def atomic_write(path: str | os.PathLike[str], mode: Literal["wb", "w"] = "wb") -> Iterator[IO[Any]]:
     """Open ``path`` for writing; the file appears, or replaces the old one, only when the block ends without an error.
 
     The data goes to a temporary name in the same folder, is flushed to the disk and then renamed. When the block
@@ -37,11 +26,7 @@ def atomic_write(path: str | os.PathLike[str], mode: Literal["wb", "w"] = "wb") 
     """
     if mode not in ("wb", "w"):
         raise ValueError(f"mode must be 'wb' or 'w', found {mode!r}")
-    return _atomic_write(Path(os.path.realpath(path)), mode)
-
-
-@contextmanager
-def _atomic_write(target: Path, mode: str) -> Iterator[IO[Any]]:
+    target = Path(os.path.realpath(path))
     if target.is_dir():
         raise IsADirectoryError(f"cannot write a file over the folder {target}")
     target.parent.mkdir(parents=True, exist_ok=True)

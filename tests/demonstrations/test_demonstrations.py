@@ -518,7 +518,7 @@ class TestAtomicWrite:
 
     def test_another_mode_is_refused(self, tmp_path: Path) -> None:
         with pytest.raises(ValueError, match="found 'a'"):
-            atomic_write(tmp_path / "file", "a")  # type: ignore[call-overload]
+            atomic_write(tmp_path / "file", "a").__enter__()  # type: ignore[arg-type]
 
 
 class TinyReach(gym.Env[Any, Any]):

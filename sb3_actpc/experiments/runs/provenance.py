@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import hashlib
-import importlib.metadata
 import platform
 import subprocess
 from pathlib import Path
+
+from sb3_actpc.utils.versions import installed_version
 
 _PACKAGES = ("sb3-actpc", "stable-baselines3", "torch", "gymnasium", "mujoco", "robosuite", "numpy")
 CHECKOUT = Path(__file__).resolve().parents[3]
@@ -14,13 +15,7 @@ CHECKOUT = Path(__file__).resolve().parents[3]
 
 def package_versions() -> dict[str, str]:
     """Versions of Python and of the packages that a result depends on; ``"unknown"`` for one that is not installed."""
-    versions = {"python": platform.python_version()}
-    for name in _PACKAGES:
-        try:
-            versions[name] = importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:  # a source checkout that is not installed
-            versions[name] = "unknown"
-    return versions
+    return {"python": platform.python_version(), **{name: installed_version(name) for name in _PACKAGES}}
 
 
 def git_state(checkout: Path = CHECKOUT) -> tuple[str | None, bool | None]:
