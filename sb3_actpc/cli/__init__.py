@@ -7,8 +7,11 @@ import importlib
 import pkgutil
 import sys
 from collections.abc import Sequence
+from typing import Any
 
 from sb3_actpc import __version__
+
+RUN_OPTIONS = ("steps", "demonstrations", "gym_packages", "eval_freq", "eval_episodes", "checkpoint_freq", "device", "threads")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -44,6 +47,28 @@ def build_parser() -> argparse.ArgumentParser:
     for module in pkgutil.iter_modules(__path__):
         importlib.import_module(f"{__name__}.{module.name}").add_parser(subparsers)
     return parser
+
+
+def add_run_options(parser: argparse.ArgumentParser, eval_episodes: int) -> None:
+    """Options that ``train`` and ``compare`` share, ``RUN_OPTIONS`` and ``--no-progress``; what is not given is None."""
+    add = parser.add_argument
+    add("--steps", type=steps, metavar="N", help="environment steps of a run, such as 1e5 (default: the preset's)")
+    demonstrations = "file, id of a Minari dataset, 'weak' (the package's weaker) or 'none' (default: the package's)"
+    add("--demonstrations", metavar="FILE", help=demonstrations)
+    modules = "import these, which register environments; also from this folder"
+    add("--gym-packages", nargs="+", metavar="MODULE", help=modules)
+    add("--eval-freq", type=steps, metavar="N", help="steps between evaluations (default: a tenth of all)")
+    add("--eval-episodes", type=int, metavar="N", help=f"episodes in each (default: {eval_episodes})")
+    checkpoints = "steps between checkpoints, 0 for none (default: as --eval-freq)"
+    add("--checkpoint-freq", type=steps, metavar="N", help=checkpoints)
+    add("--device", help="torch device (default: cpu)")
+    add("--threads", type=int, metavar="N", help="torch threads of a run (default: 1)")
+    add("--no-progress", action="store_true", help="no progress bars")
+
+
+def given(args: argparse.Namespace, *names: str) -> dict[str, Any]:
+    """Those of the options, and of ``RUN_OPTIONS``, that the user gave."""
+    return {name: getattr(args, name) for name in (*names, *RUN_OPTIONS) if getattr(args, name) is not None}
 
 
 def steps(text: str) -> int:

@@ -7,27 +7,10 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sb3_actpc.cli import steps
+from sb3_actpc.cli import add_run_options, given
 
 if TYPE_CHECKING:
     from sb3_actpc.experiments.comparison.schedule import Summary
-
-# options that say which runs are compared; a file may say the same
-_COMPARISON = (
-    "envs",
-    "algos",
-    "ablate",
-    "seeds",
-    "steps",
-    "output",
-    "demonstrations",
-    "eval_freq",
-    "eval_episodes",
-    "checkpoint_freq",
-    "device",
-    "threads",
-    "gym_packages",
-)
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -48,17 +31,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     parser.add_argument("--ablate", action="store_true", default=None, help="ActPC with every part, and without each in turn")
     parser.add_argument("--seeds", type=int, metavar="N", help="seeds 0 to N-1 (default: 3)")
-    parser.add_argument("--steps", type=steps, metavar="N", help="environment steps of each run (default: the presets')")
     parser.add_argument("--output", metavar="DIR", help="folder of the comparison (default: runs/comparison)")
-    parser.add_argument("--demonstrations", metavar="FILE", help="as in train (default: the ones in the package)")
-    parser.add_argument("--eval-freq", type=steps, metavar="N", help="steps between evaluations (default: a tenth of all)")
-    parser.add_argument("--eval-episodes", type=int, metavar="N", help="episodes in each (default: 10)")
-    parser.add_argument(
-        "--checkpoint-freq", type=steps, metavar="N", help="steps between checkpoints (default: as --eval-freq)"
-    )
-    parser.add_argument("--gym-packages", nargs="+", metavar="MODULE", help="as in train")
-    parser.add_argument("--device", help="torch device (default: cpu)")
-    parser.add_argument("--threads", type=int, metavar="N", help="threads of each run (default: 1)")
+    add_run_options(parser, eval_episodes=10)
     parser.add_argument("--workers", type=int, metavar="N", help="runs at a time (default: one for each core)")
     parser.add_argument(
         "--engine", default="local", metavar="{local,ray}", help="processes, or a Ray cluster (default: local)"
@@ -68,7 +42,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument(
         "--dry-run", action="store_true", help="print the table of runs, with the seconds of those finished, and end"
     )
-    parser.add_argument("--no-progress", action="store_true", help="lines instead of progress bars")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -98,11 +71,11 @@ def run(args: argparse.Namespace) -> int:
 def _given(args: argparse.Namespace) -> dict[str, Any]:
     from sb3_actpc.experiments.comparison.plan import read_comparison_file
 
-    given = {} if args.file is None else read_comparison_file(Path(args.file))
-    options = {name: getattr(args, name) for name in _COMPARISON if getattr(args, name) is not None}
+    from_file = {} if args.file is None else read_comparison_file(Path(args.file))
+    options = given(args, "envs", "algos", "ablate", "seeds", "output")
     if "steps" in options:  # a file may call them n_timesteps
-        given.pop("n_timesteps", None)
-    return {**given, **options}
+        from_file.pop("n_timesteps", None)
+    return {**from_file, **options}
 
 
 def _conclude(summary: Summary, folder: Path) -> int:

@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sb3_actpc.cli import steps
+from sb3_actpc.cli import add_run_options, given
 
 if TYPE_CHECKING:
     from sb3_actpc.experiments.runs import Run
@@ -28,38 +28,19 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         metavar="DIR",
         help="go on with the run in this folder, with its settings; a finished one with --steps MORE",
     )
-    parser.add_argument("--algo", default="actpc", help="algorithm (default: %(default)s)")
+    parser.add_argument("--algo", help="algorithm (default: actpc)")
     parser.add_argument("--preset", metavar="NAME", help="file of hyperparams/, or a path ending in .yml (default: ALGO)")
     parser.add_argument(
         "--set",
         action="append",
-        default=[],
         metavar="KEY=VALUE",
         help="replace a setting of the preset, such as gamma=0.98 or policy_kwargs.net_arch=[64,64]",
     )
-    parser.add_argument("--env-kwarg", action="append", default=[], metavar="KEY=VALUE", help="keyword of the environment")
-    parser.add_argument(
-        "--demonstrations",
-        default="shipped",
-        metavar="FILE",
-        help="file, id of a Minari dataset, 'weak' (the package's weaker ones) or 'none' (default: the ones in the package)",
-    )
-    parser.add_argument(
-        "--gym-packages", nargs="+", metavar="MODULE", help="import these, which register environments; also from this folder"
-    )
-    parser.add_argument("--steps", type=steps, metavar="N", help="environment steps (default: the preset's), such as 1e5")
-    parser.add_argument("--seed", type=int, default=0, help="seed (default: %(default)s)")
-    parser.add_argument("--eval-freq", type=steps, metavar="N", help="steps between evaluations (default: a tenth of all)")
-    parser.add_argument("--eval-episodes", type=int, default=5, metavar="N", help="episodes in each (default: %(default)s)")
+    parser.add_argument("--env-kwarg", action="append", metavar="KEY=VALUE", help="keyword of the environment")
+    parser.add_argument("--seed", type=int, help="seed (default: 0)")
     parser.add_argument("--output", metavar="DIR", help="run folder (default: runs/ENV/ALGO_PRESET_seedSEED)")
-    parser.add_argument("--device", default="cpu", help="torch device (default: %(default)s)")
     parser.add_argument("--n-envs", type=int, metavar="N", help="parallel environments (default: the preset's, or 1)")
-    parser.add_argument("--threads", type=int, default=1, help="torch threads (default: %(default)s)")
-    parser.add_argument("--no-progress", action="store_true", help="no progress bar")
-    parser.add_argument(
-        "--checkpoint-freq", type=steps, metavar="N", help="steps between checkpoints, 0 for none (default: as --eval-freq)"
-    )
-    parser.set_defaults(default_of=parser.get_default)
+    add_run_options(parser, eval_episodes=5)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -89,10 +70,10 @@ def _report(line: str) -> None:
 
 def _check_only_resume(args: argparse.Namespace) -> None:
     """:raises ValueError: when an option is given that the run's own settings decide"""
-    others = set(vars(args)) - {"resume", "steps", "no_progress", "command", "debug", "default_of"}
-    given = sorted(name for name in others if getattr(args, name) != args.default_of(name))
-    if given:
-        option = "--" + given[0].replace("_", "-")
+    others = set(vars(args)) - {"resume", "steps", "no_progress", "command", "debug"}
+    wrong = sorted(name for name in others if getattr(args, name) is not None)
+    if wrong:
+        option = "--" + wrong[0].replace("_", "-")
         raise ValueError(f"{option} cannot be given with --resume: the run goes on with its own settings, leave it out")
 
 
@@ -100,8 +81,6 @@ def _run(args: argparse.Namespace) -> Run:
     from sb3_actpc.experiments.runs import Run
     from sb3_actpc.experiments.runs.presets import parse_assignments
 
-    names = ["env", "algo", "preset", "steps", "seed", "demonstrations", "eval_freq", "eval_episodes", "checkpoint_freq"]
-    names += ["output", "device", "n_envs", "threads", "gym_packages"]
-    given = {name: getattr(args, name) for name in names if getattr(args, name) is not None}
-    settings, env_kwargs = parse_assignments(args.set), parse_assignments(args.env_kwarg)
-    return Run(**given, settings=settings, env_kwargs=env_kwargs, progress=not args.no_progress)
+    settings, env_kwargs = parse_assignments(args.set or ()), parse_assignments(args.env_kwarg or ())
+    chosen = given(args, "env", "algo", "preset", "seed", "output", "n_envs")
+    return Run(**chosen, settings=settings, env_kwargs=env_kwargs, progress=not args.no_progress)
