@@ -21,6 +21,7 @@ from gymnasium.wrappers import TimeLimit
 from sb3_actpc.checkpoints.encoding import Decoder, Encoder
 from sb3_actpc.checkpoints.simulators import capture_env, env_layers, restore_env
 from sb3_actpc.demonstrations import Demonstrations, resolve
+from sb3_actpc.experiments.runs.evaluation import stacked
 from sb3_actpc.utils.files import atomic_write
 
 Values = Callable[[th.Tensor, th.Tensor], th.Tensor]
@@ -231,7 +232,7 @@ def _visited_states(agent: _Agent, envs: Sequence[gym.Env[Any, Any]], n_states: 
     observations = [env.reset(seed=seed + index)[0] for index, env in enumerate(envs)]
     memory, begins, playing = None, np.ones(len(envs), dtype=bool), np.full(len(envs), n_states > 0)
     while playing.any():
-        actions, following = agent.act(_stack(observations), memory, begins)
+        actions, following = agent.act(stacked(observations), memory, begins)
         disturbance = th.as_tensor(noise * rng.standard_normal(actions.shape), dtype=th.float32)
         unscaled = agent.unscaled((actions + disturbance).clamp(-1.0, 1.0))
         for i in np.flatnonzero(playing):
@@ -305,12 +306,6 @@ def _restore(env: gym.Env[Any, Any], captured: tuple[dict[str, Any], Decoder]) -
             layer._elapsed_steps = 0  # type: ignore[assignment]  # each state has its whole horizon before it
 
 
-def _stack(observations: Sequence[Any]) -> Any:
-    if isinstance(observations[0], dict):
-        return {key: np.stack([one[key] for one in observations]) for key in observations[0]}
-    return np.stack(observations)
-
-
 # ------------------------------------------------------------------ trying actions
 
 
@@ -327,7 +322,7 @@ def _try_all(
     rng, frames = np.random.default_rng(seed), []
     distances = np.full(len(starts), np.nan)
     if agent.demonstrated:
-        distances = agent.nearest(agent.features(_stack([start.observation for start in starts])))[0].numpy()
+        distances = agent.nearest(agent.features(stacked([start.observation for start in starts])))[0].numpy()
     for env in envs:
         env.reset(seed=seed)  # a wrapper refuses steps before
     for first in range(0, len(starts), N_TOGETHER):
@@ -360,10 +355,10 @@ def _roll_out(
     rest = np.full(n, gamma**horizon)
     playing = np.ones(n, dtype=bool)
     for t in range(horizon):
-        actions, memory = agent.act(_stack(observations), memory, begins)
+        actions, memory = agent.act(stacked(observations), memory, begins)
         begins = np.zeros(n, dtype=bool)
         if t < hold:
-            features = agent.features(_stack(observations))
+            features = agent.features(stacked(observations))
             actions = agent.move(features, actions, branches, randoms)
             values = values if t else agent.values(features, actions).double().numpy()
         unscaled = agent.unscaled(actions)
@@ -376,8 +371,8 @@ def _roll_out(
                 rest[i] = 0.0 if terminated else gamma ** (t + 1)
         if not playing.any():
             break
-    actions, _ = agent.act(_stack(observations), memory, begins)
-    rest *= agent.values(agent.features(_stack(observations)), actions).double().numpy()
+    actions, _ = agent.act(stacked(observations), memory, begins)
+    rest *= agent.values(agent.features(stacked(observations)), actions).double().numpy()
     return pd.DataFrame({"value": values, "paid": paid, "dense": dense, "rest": rest, "fell": fell})
 
 

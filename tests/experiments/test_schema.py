@@ -79,7 +79,7 @@ def test_a_filled_run_is_the_same_after_its_trip_through_a_file() -> None:
     assert run.is_resolved and resolve(run) is run
     write_config(run)
     assert read_run(Path("run")) == run
-    assert Run.from_json(run.to_json()) == run
+    assert Run.model_validate_json(run.model_dump_json()) == run
 
 
 def test_what_is_said_comes_before_the_preset_and_later_before_earlier() -> None:

@@ -30,7 +30,7 @@ def main() -> int:
         except BrokenPipeError:  # the command was killed: nobody listens
             pass
 
-    outcome = execute_run(Run.from_json(text), lambda line: print(line, flush=True), lambda steps: send(steps=steps))
+    outcome = execute_run(Run.model_validate_json(text), lambda line: print(line, flush=True), lambda steps: send(steps=steps))
     send(status=outcome.status, message=outcome.message)
     return 0
 

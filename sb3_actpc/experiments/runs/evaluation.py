@@ -159,7 +159,7 @@ def _play_side_by_side(model: Predictor, envs: Sequence[gym.Env[Any, Any]], seed
     episode_start = np.ones(len(envs), dtype=bool)
     state = None
     while playing.any():
-        actions, state = model.predict(_stack(observations), state=state, episode_start=episode_start, deterministic=True)
+        actions, state = model.predict(stacked(observations), state=state, episode_start=episode_start, deterministic=True)
         episode_start = np.zeros(len(envs), dtype=bool)
         for i in np.flatnonzero(playing):
             observations[i], reward, terminated, truncated, info = envs[i].step(actions[i])
@@ -172,7 +172,7 @@ def _play_side_by_side(model: Predictor, envs: Sequence[gym.Env[Any, Any]], seed
     return rows, stages
 
 
-def _stack(observations: list[Any]) -> Any:
+def stacked(observations: Sequence[Any]) -> Any:
     """n observations as one batch: (n, ...), or a dictionary of such."""
     if isinstance(observations[0], dict):
         return {key: np.stack([observation[key] for observation in observations]) for key in observations[0]}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_actpc.checkpoints import CheckpointCallback, DamagedCheckpoint, list_bundles, restore, why_no_checkpoints
 from sb3_actpc.demonstrations import resolve as resolve_demonstrations
+from sb3_actpc.demonstrations.recording import Report, silent
 from sb3_actpc.experiments.runs.algorithms import load_algorithm
 from sb3_actpc.experiments.runs.environments import check_env_id, make_eval_envs, make_train_env
 from sb3_actpc.experiments.runs.episode_log import EpisodeLog
@@ -39,11 +40,6 @@ from sb3_actpc.experiments.runs.summary import plot_learning_curve
 EVALUATION_SEED_OFFSET = 1_000_000
 CHECKPOINTS = "checkpoints"  # folder in the run's folder
 DIAGNOSTICS = "diagnostics.csv"  # what the agent logs about itself
-Report = Callable[[str], None]
-
-
-def silent(line: str) -> None:
-    """:param line: nobody wants to see it"""
 
 
 def train_run(run: Run, report: Report = silent, callbacks: Sequence[BaseCallback] = ()) -> dict[str, Any]:

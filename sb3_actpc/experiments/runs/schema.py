@@ -201,18 +201,6 @@ class Run(Schema):
         """Task, variant and seed, for people."""
         return f"{self.task or self.env} {self.name or self.algo} seed {self.seed}"
 
-    def to_json(self) -> str:
-        """On one line."""
-        return self.model_dump_json()
-
-    @classmethod
-    def from_json(cls, text: str) -> Run:
-        """
-        :param text: what :meth:`to_json` returned
-        :return: the run
-        """
-        return cls(**json.loads(text))
-
 
 def merged(*parts: Run) -> dict[str, Any]:
     """Keywords of a :class:`Run`: everything that was said in the parts; what is said later counts more, ``settings`` and

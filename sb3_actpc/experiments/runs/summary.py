@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
+
+import pandas as pd
 
 from sb3_actpc.utils.files import atomic_write
 
@@ -31,26 +32,19 @@ def result_table(result: Mapping[str, Any]) -> str:
 def plot_learning_curve(progress: Path, output: Path, title: str, demonstrators_return: float | None) -> None:
     """Draw the dense and the sparse return of a ``progress.csv`` against the environment steps, and the demonstrators' as a
     dashed line."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    with open(progress, newline="", encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
-    steps, dense, spread, sparse = (
-        [float(row[name]) for row in rows] for name in ("timesteps", "dense_return", "dense_return_std", "sparse_return")
-    )
+    rows = pd.read_csv(progress)
+    steps, dense, spread = rows["timesteps"], rows["dense_return"], rows["dense_return_std"]
     figure = Figure(figsize=(6.4, 6.4), layout="constrained")
-    FigureCanvasAgg(figure)
     dense_axes, sparse_axes = figure.subplots(2, 1, sharex=True)
     dense_axes.plot(steps, dense, marker="o", label="policy")
-    lower = [value - width for value, width in zip(dense, spread, strict=True)]
-    upper = [value + width for value, width in zip(dense, spread, strict=True)]
-    dense_axes.fill_between(steps, lower, upper, alpha=0.2)
+    dense_axes.fill_between(steps, dense - spread, dense + spread, alpha=0.2)
     if demonstrators_return is not None:
         dense_axes.axhline(demonstrators_return, color="black", linestyle="--", label="demonstrators")
     dense_axes.legend()
     dense_axes.set(title=title, ylabel="dense return (mean ± std)")
-    sparse_axes.plot(steps, sparse, marker="o", color="tab:orange")
+    sparse_axes.plot(steps, rows["sparse_return"], marker="o", color="tab:orange")
     sparse_axes.set(xlabel="environment steps", ylabel="sparse return (mean)")
     with atomic_write(output) as image:
         figure.savefig(image, format="png", dpi=120)

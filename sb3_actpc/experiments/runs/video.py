@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from sb3_actpc.demonstrations.dataset import Demonstrations
+from sb3_actpc.experiments.runs.evaluation import stacked
 from sb3_actpc.utils.files import atomic_write
 
 GL_BACKENDS = ("egl", "osmesa")
@@ -144,7 +145,8 @@ def _play(model: Any, env: Any, seed: int, n_frames: int) -> list[Any]:
     frames = [_frame(env)]
     state, episode_start, finished = None, np.ones(1, dtype=bool), False
     while not finished and len(frames) < n_frames:
-        action, state = model.predict(_batch(observation), state=state, episode_start=episode_start, deterministic=True)
+        batch = stacked([observation])
+        action, state = model.predict(batch, state=state, episode_start=episode_start, deterministic=True)
         observation, _, terminated, truncated, _ = env.step(action[0])
         episode_start = np.zeros(1, dtype=bool)
         finished = terminated or truncated
@@ -157,13 +159,6 @@ def _frame(env: Any) -> np.ndarray:
     if not isinstance(frame, np.ndarray):
         raise NotImplementedError(f"the environment renders {type(frame).__name__}, not an image")
     return frame
-
-
-def _batch(observation: Any) -> Any:
-    """One observation as a batch of one: (1, ...), or a dictionary of such."""
-    if isinstance(observation, dict):
-        return {key: np.asarray(value)[None] for key, value in observation.items()}
-    return np.asarray(observation)[None]
 
 
 def _probe(variables: dict[str, str]) -> bool:

@@ -268,7 +268,7 @@ def test_a_node_without_the_folders_works_on_a_copy_that_comes_back() -> None:
     [run] = small_runs(OUT)
     interrupt_after(run, 33)
     packed = pack_folder(run.folder)
-    status, message, returned = _execute(run.to_json(), "/there/is/no/such/probe", packed, None)
+    status, message, returned = _execute(run.model_dump_json(), "/there/is/no/such/probe", packed, None)
     assert (status, message) == (FINISHED, "") and returned is not None
     assert run_status(run.folder) == UNFINISHED  # the copy was worked on
     unpack_folder(returned, run.folder)

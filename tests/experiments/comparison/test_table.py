@@ -61,7 +61,7 @@ def test_an_id_follows_the_presets_content_not_its_name() -> None:
 
 def test_a_run_survives_its_trip_to_a_worker() -> None:
     for run in small_runs(Path("out"), seeds=2):
-        assert Run.from_json(run.to_json()) == run
+        assert Run.model_validate_json(run.model_dump_json()) == run
 
 
 def test_a_file_says_the_same_as_the_options(capsys: pytest.CaptureFixture[str]) -> None:

@@ -63,7 +63,7 @@ class RayEngine:
         probe = folder / f"{_PROBE}{uuid.uuid4().hex}"
         probe.touch()
         packed = self.ray.put(pack_folder(folder))
-        self._tasks[self._task.remote(run.to_json(), str(probe), packed, self._board)] = run
+        self._tasks[self._task.remote(run.model_dump_json(), str(probe), packed, self._board)] = run
 
     def poll(self, timeout: float) -> list[Event]:
         """News, after some seconds at most."""
@@ -134,7 +134,7 @@ class StepBoard:
 def _execute(job: str, probe: str, packed: bytes, board: Any) -> tuple[str, str, bytes | None]:
     """On a node: bring a run, given as JSON, to its end. Where it sees the probe file it works in the run's folder, else in
     a copy of it, which is sent back with status and message of the outcome."""
-    run = Run.from_json(job)
+    run = Run.model_validate_json(job)
 
     def on_steps(steps: int) -> None:
         if board is not None:

@@ -53,7 +53,7 @@ class LocalEngine:
                 start_new_session=True,  # Ctrl-C is for the command, which tells its workers
             )
         assert worker.stdin is not None
-        _send(worker.stdin, run.to_json())
+        _send(worker.stdin, run.model_dump_json())
         self.workers[run.id] = worker
         threading.Thread(target=self._listen, args=(run.id, worker), daemon=True).start()
 
