@@ -6,7 +6,7 @@ import math
 import random
 import types
 from collections import OrderedDict, defaultdict, deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from enum import Enum
 from typing import Any
 
@@ -150,37 +150,14 @@ class Decoder:
             old = existing if isinstance(existing, list) else []
             return [self.decode(part, old[index] if index < len(old) else None) for index, part in enumerate(node)]
         kind = str(next(iter(node), ""))
+        if kind == "left":
+            return existing
+        if kind in _PLAIN_KINDS:
+            return _PLAIN_KINDS[kind](self, node)
         method = getattr(self, f"_{kind}", None) if not kind.startswith("_") else None
         if method is None:
             raise ValueError(f"a value of the unknown kind {kind!r} is stored: the file was written by another version")
         return method(node, existing)
-
-    def _number(self, node: dict[str, Any], existing: Any) -> float:
-        return _NOT_NUMBERS[node["number"]]
-
-    def _array(self, node: dict[str, Any], existing: Any) -> np.ndarray:
-        return self.arrays[node["array"]].copy()
-
-    def _scalar(self, node: dict[str, Any], existing: Any) -> Any:
-        return self.arrays[node["scalar"]][()]
-
-    def _tensor(self, node: dict[str, Any], existing: Any) -> th.Tensor:
-        return self.tensors[node["tensor"]].clone()
-
-    def _empty(self, node: dict[str, Any], existing: Any) -> np.ndarray:
-        return np.empty(node["empty"], dtype=object)
-
-    def _tuple(self, node: dict[str, Any], existing: Any) -> tuple[Any, ...]:
-        return tuple(self.decode(part) for part in node["tuple"])
-
-    def _set(self, node: dict[str, Any], existing: Any) -> set[Any]:
-        return {self.decode(part) for part in node["set"]}
-
-    def _deque(self, node: dict[str, Any], existing: Any) -> deque[Any]:
-        return deque((self.decode(part) for part in node["deque"]), maxlen=node["maxlen"])
-
-    def _bytes(self, node: dict[str, Any], existing: Any) -> bytes:
-        return bytes.fromhex(node["bytes"])
 
     def _dict(self, node: dict[str, Any], existing: Any) -> dict[Any, Any]:
         old = existing if isinstance(existing, dict) else {}
@@ -225,15 +202,26 @@ class Decoder:
             restore_space_generators(existing, self.decode(node["space"]))
         return existing
 
-    def _left(self, node: dict[str, Any], existing: Any) -> Any:
-        return existing
-
     def _object(self, node: dict[str, Any], existing: Any) -> Any:
         if type(existing).__qualname__ != node["object"]:
             found = type(existing).__qualname__
             raise ValueError(f"expected a {node['object']}, found a {found}: make it as it was made before")
         vars(existing).update(self.decode(node["attributes"], vars(existing)))
         return existing
+
+
+# kinds that are made new from the JSON alone
+_PLAIN_KINDS: dict[str, Callable[[Decoder, dict[str, Any]], Any]] = {
+    "number": lambda decoder, node: _NOT_NUMBERS[node["number"]],
+    "array": lambda decoder, node: decoder.arrays[node["array"]].copy(),
+    "scalar": lambda decoder, node: decoder.arrays[node["scalar"]][()],
+    "tensor": lambda decoder, node: decoder.tensors[node["tensor"]].clone(),
+    "empty": lambda decoder, node: np.empty(node["empty"], dtype=object),
+    "tuple": lambda decoder, node: tuple(decoder.decode(part) for part in node["tuple"]),
+    "set": lambda decoder, node: {decoder.decode(part) for part in node["set"]},
+    "deque": lambda decoder, node: deque((decoder.decode(part) for part in node["deque"]), maxlen=node["maxlen"]),
+    "bytes": lambda decoder, node: bytes.fromhex(node["bytes"]),
+}
 
 
 def _subspaces(space: spaces.Space) -> list[spaces.Space]:

@@ -18,7 +18,6 @@ trained on; here the evaluation has another, as in ``sb3-actpc train``.
 from __future__ import annotations
 
 import argparse
-import importlib
 import os
 import sys
 import tempfile
@@ -28,6 +27,8 @@ from pathlib import Path
 from typing import Any
 
 import yaml
+
+from sb3_actpc.utils.extras import import_extra
 
 # name -> rl-zoo3's function, and what it does
 SCRIPTS = {
@@ -83,7 +84,7 @@ def register_algorithms() -> None:
     """Put our algorithms, and what samples their settings, into rl_zoo3's tables; ``td3`` and ``ddpg`` are then ours."""
     from sb3_actpc.experiments.runs.algorithms import ALGORITHMS, load_algorithm
 
-    zoo, hyperparams = _import("rl_zoo3"), _import("rl_zoo3.hyperparams_opt")
+    zoo, hyperparams = import_extra("rl_zoo3", "zoo"), import_extra("rl_zoo3.hyperparams_opt", "zoo")
     if "actpc" in zoo.ALGOS:
         return
     for name in ALGORITHMS:
@@ -95,7 +96,7 @@ def register_algorithms() -> None:
         converters.setdefault(name, converters[like])
     for name in ("td3", "ddpg", "her"):
         samplers[name] = _with_one_learning_rate(samplers[name])
-    _evaluate_on_other_seeds(_import("rl_zoo3.exp_manager").ExperimentManager)
+    _evaluate_on_other_seeds(import_extra("rl_zoo3.exp_manager", "zoo").ExperimentManager)
 
 
 def _evaluate_on_other_seeds(manager: Any) -> None:
@@ -189,7 +190,7 @@ def _training_arguments(arguments: Sequence[str], folder: Path, optimize: bool) 
     if ours.trained_agent:
         passed += ["--trained-agent", ours.trained_agent]
     if optimize:
-        samplers = _import("rl_zoo3.hyperparams_opt").HYPERPARAMS_SAMPLER
+        samplers = import_extra("rl_zoo3.hyperparams_opt", "zoo").HYPERPARAMS_SAMPLER
         if ours.algo not in samplers:
             known = ", ".join(sorted(set(samplers) & set(ALGORITHMS)))
             raise ValueError(f"zoo optimize does not know what to vary for {ours.algo!r}: choose one of {known}")
@@ -284,7 +285,7 @@ def _plot(script: str, arguments: Sequence[str]) -> int:
 def _run(script: str, arguments: Sequence[str]) -> int:
     """Call one of rl_zoo3's functions, which read their arguments from the process."""
     module, _, name = script.partition(":")
-    function = getattr(_import(module), name)
+    function = getattr(import_extra(module, "zoo"), name)
     given = sys.argv
     sys.argv = [script.replace(":", " "), *arguments]
     try:
@@ -292,10 +293,3 @@ def _run(script: str, arguments: Sequence[str]) -> int:
     finally:
         sys.argv = given
     return 0
-
-
-def _import(module: str) -> Any:
-    try:
-        return importlib.import_module(module)
-    except ImportError as error:
-        raise ImportError(f"{error}: rl-zoo3 is an extra, install it with pip install 'sb3-actpc[zoo]'") from error

@@ -6,10 +6,10 @@ import os
 from pathlib import Path
 
 from sb3_actpc.demonstrations.dataset import Demonstrations
-from sb3_actpc.demonstrations.hdf5 import import_h5py
 from sb3_actpc.demonstrations.recording import Report, silent
 from sb3_actpc.demonstrations.robomimic import read_robomimic
 from sb3_actpc.envs.robosuite_layouts import robosuite_task
+from sb3_actpc.utils.extras import import_extra
 
 REPOSITORY = "https://huggingface.co/datasets/robomimic/robomimic_datasets/resolve/main"
 KINDS = {"mh": "300 by six humans of three levels", "ph": "200 by one proficient human"}
@@ -48,7 +48,7 @@ def download_robomimic(
     """
     import pooch
 
-    import_h5py()  # before the long part
+    import_extra("h5py", "robosuite")  # before the long part
     path = Path(path)
     if not url.startswith(("http://", "https://")):
         raise ValueError(f"url={url!r} must begin with http:// or https://")

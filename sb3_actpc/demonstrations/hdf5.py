@@ -12,6 +12,8 @@ from typing import Any
 
 import numpy as np
 
+from sb3_actpc.utils.extras import import_extra
+
 # what h5py raises on bytes that are not there, or not HDF5's
 _READ_ERRORS = (OSError, RuntimeError, KeyError, ValueError, TypeError)
 
@@ -24,7 +26,7 @@ def open_hdf5(path: str | os.PathLike[str]) -> Iterator[Any]:
     :raises ValueError: when it is not a whole HDF5 file, or has no demonstrations
     :raises ImportError: when h5py is not installed
     """
-    h5py = import_h5py()
+    h5py = import_extra("h5py", "robosuite")
     if not Path(path).is_file():
         raise FileNotFoundError(f"no demonstrations file at {path}")
     try:
@@ -40,15 +42,6 @@ def open_hdf5(path: str | os.PathLike[str]) -> Iterator[Any]:
         if not names:
             raise ValueError(f"{path}: expected demonstrations data/demo_0, data/demo_1, ..., found none")
         yield data
-
-
-def import_h5py() -> Any:
-    """:raises ImportError: when h5py is not installed; the message says how to install it"""
-    try:
-        import h5py
-    except ImportError as error:
-        raise ImportError('HDF5 demonstrations need h5py: pip install "sb3-actpc[robosuite]"') from error
-    return h5py
 
 
 def demo_names(data: Any) -> list[str]:

@@ -11,15 +11,7 @@ import numpy as np
 from gymnasium import spaces
 
 from sb3_actpc.demonstrations.rows import box_paths, field_error, join_observations, split_observations
-
-
-def import_minari() -> Any:
-    """:raises ImportError: when Minari is not installed; the message says how to install it"""
-    try:
-        import minari
-    except ImportError as error:
-        raise ImportError('Minari datasets need the extra: pip install "sb3-actpc[minari]"') from error
-    return minari
+from sb3_actpc.utils.extras import import_extra
 
 
 def read_minari(
@@ -31,7 +23,7 @@ def read_minari(
     """
     if isinstance(dataset, str):
         minari_files(dataset)
-        dataset = import_minari().load_dataset(dataset)
+        dataset = import_extra("minari", "minari").load_dataset(dataset)
     source = f"Minari dataset {dataset.spec.dataset_id}"
     metadata = dataset.storage.metadata
     paths = metadata.get("observation_keys", box_paths(dataset.observation_space))
@@ -65,7 +57,7 @@ def write_minari(
 ) -> Any:
     """The ``minari.MinariDataset`` of the columns of each episode, with further metadata; for the rest see
     ``Demonstrations.to_minari``."""
-    dataset = import_minari().create_dataset_from_buffers(
+    dataset = import_extra("minari", "minari").create_dataset_from_buffers(
         dataset_id,
         [episode_buffer(episode, observation_space, action_space) for episode in episodes],
         env=env if _has_json_spec(env) else None,
@@ -99,15 +91,12 @@ def episode_buffer(episode: dict[str, Any], observation_space: spaces.Space[Any]
 
 
 def minari_files(dataset_id: str) -> list[Path]:
-    """
-    :param dataset_id: of a Minari dataset
-    :return: the files that hold it
+    """The files that hold a Minari dataset.
+
     :raises ImportError: when Minari is not installed
     :raises FileNotFoundError: when there is no such dataset; the message says how to fetch it
     """
-    import_minari()
-    from minari.storage import get_dataset_path
-
+    get_dataset_path = import_extra("minari.storage", "minari").get_dataset_path
     files = sorted(path for path in (get_dataset_path(dataset_id) / "data").rglob("*") if path.is_file())
     if not files:
         raise FileNotFoundError(

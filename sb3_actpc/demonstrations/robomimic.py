@@ -17,13 +17,13 @@ from sb3_actpc.demonstrations.dataset import ACTION_TOLERANCE, Demonstrations
 from sb3_actpc.demonstrations.hdf5 import (
     check_recorded_task,
     demo_names,
-    import_h5py,
     open_hdf5,
     read_array,
     read_json_attribute,
 )
 from sb3_actpc.demonstrations.recording import Columns
 from sb3_actpc.envs.robosuite_layouts import ACTION_DIM, OBSERVATIONS, PROPRIOCEPTION, RobosuiteTask, robosuite_task
+from sb3_actpc.utils.extras import import_extra
 from sb3_actpc.utils.files import atomic_write
 
 ROBOSUITE_TYPE = 1  # robomimic's EnvType
@@ -75,7 +75,7 @@ def write_robomimic(demonstrations: Demonstrations, path: str | os.PathLike[str]
     :raises ValueError: when they are of another task or layout
     :raises ImportError: when h5py is not installed
     """
-    h5py = import_h5py()
+    h5py = import_extra("h5py", "robosuite")
     task = robosuite_task(demonstrations.env_id)
     layout = task.layout(task.obs_of_size(demonstrations.observations.shape[1]))
     content = io.BytesIO()

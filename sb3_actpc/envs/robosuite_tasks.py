@@ -11,7 +11,6 @@ step); the random numbers are Gymnasium's.
 
 from __future__ import annotations
 
-import importlib
 import logging
 import os
 from collections.abc import Iterator
@@ -24,6 +23,7 @@ import numpy as np
 from gymnasium import spaces, utils
 
 from sb3_actpc.envs.robosuite_layouts import ACTION_DIM, RobosuiteTask, robosuite_task
+from sb3_actpc.utils.extras import import_extra
 
 CONTROL_FREQUENCY = 20
 # of robosuite 1.5.2 (environments/manipulation/lift.py): half edges in metres, density in kg/m^3
@@ -275,12 +275,7 @@ def make_simulation(name: str, **kwargs: Any) -> Any:
     :raises ImportError: when robosuite is not installed; the message says how to install it
     """
     with _quiet_import():
-        try:
-            robosuite = importlib.import_module("robosuite")
-        except ModuleNotFoundError as error:
-            if error.name != "robosuite":
-                raise
-            raise ImportError('the robosuite tasks need robosuite: pip install "sb3-actpc[robosuite]"') from error
+        robosuite = import_extra("robosuite", "robosuite")
         settings = dict(
             robots="Panda",
             controller_configs=robosuite.load_composite_controller_config(robot="Panda"),

@@ -7,7 +7,7 @@ import json
 import time
 import traceback
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -75,11 +75,8 @@ def is_disk_full(error: Exception) -> bool:
 
 def run_status(folder: Path) -> str:
     """``"finished"``, ``"failed"``, ``"unfinished"`` or ``"new"``, from a run's folder."""
-    try:
+    with suppress(FileNotFoundError, ValueError):
         read_result(folder)
-    except (FileNotFoundError, ValueError):
-        pass
-    else:
         return FINISHED
     if (folder / ERROR).is_file():
         return FAILED
@@ -104,20 +101,15 @@ def write_error(folder: Path, message: str, details: str = "") -> None:
 
 def repair_result(folder: Path, report: Callable[[str], None]) -> None:
     """Write a damaged ``result.json`` again from the run's other files, or remove it, so that the run goes on."""
-    try:
-        read_result(folder)
+    if run_status(folder) == FINISHED or not (folder / RESULT).is_file():
         return
-    except FileNotFoundError:
-        return
-    except ValueError as error:
-        damage = str(error)
+    mend = "written again from the run's other files"
     try:
         write_result(folder)
     except (FileNotFoundError, ValueError):
         (folder / RESULT).unlink()
-        report(f"{damage}: removed, the run goes on from its last checkpoint")
-    else:
-        report(f"{damage}: written again from the run's other files")
+        mend = "removed, the run goes on from its last checkpoint"
+    report(f"{folder / RESULT} is damaged: {mend}")
 
 
 def execute_run(run: Run, report: Callable[[str], None], on_steps: Callable[[int], None]) -> Outcome:

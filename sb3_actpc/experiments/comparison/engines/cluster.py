@@ -16,6 +16,7 @@ from typing import Any
 from sb3_actpc.experiments.comparison.engines.base import Event
 from sb3_actpc.experiments.comparison.execution import LOCK, LOG, LOST, STOPPED, Outcome, execute_run
 from sb3_actpc.experiments.runs import Run
+from sb3_actpc.utils.extras import import_extra
 
 CONNECTION_TIME = 10.0  # seconds
 _PROBE = ".shared-"  # a file by which a node sees whether it shares the folders
@@ -37,7 +38,8 @@ class RayEngine:
     """
 
     def __init__(self, n_workers: int | None = None, threads: int = 1, address: str | None = None) -> None:
-        self.ray = _import_ray()
+        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # nothing is reported to anybody unless the user asks for it
+        self.ray = import_extra("ray", "ray")
         self.n_workers, self.threads = n_workers, threads
         self._is_mine = not self.ray.is_initialized()
         if self._is_mine:
@@ -193,12 +195,3 @@ def _check_address(address: str | None) -> None:
             f"no Ray cluster answers at address={address!r} ({error.strerror or error}): give that of `ray start --head`, or "
             "leave it out to start one on this machine"
         ) from error
-
-
-def _import_ray() -> Any:
-    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # nothing is reported to anybody unless the user asks for it
-    try:
-        import ray
-    except ImportError as error:
-        raise ImportError("the engine 'ray' needs Ray: pip install 'sb3-actpc[ray]', or leave --engine out") from error
-    return ray
