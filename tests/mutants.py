@@ -1,20 +1,23 @@
 """Plant one-line mistakes, one at a time, and see that the tests which are about them fail.
 
-    python tests/mutants.py               # all of them, two at a time
-    python tests/mutants.py discount      # those whose name contains a text
+    python tests/mutants.py                        # all of them, two at a time
+    python tests/mutants.py discount               # those whose name contains a text
+    python tests/mutants.py --log mutants.log      # goes on where it was stopped: what is in the log is not tried again
 
-Each mutant is planted in a copy of the package, where the named tests then run. It is killed when a test fails; one that lives
-shows a claim that no test makes. Exit code 1 when one lives, when its tests did not run, or when the line that it changes is
-not there exactly once (which the normal tests check too).
+Each mutant is planted in a copy of the package, where the named tests then run, in a process that is forked from one which has
+imported torch and the like. It is killed when a test fails; one that lives shows a claim that no test makes. Exit code 1 when
+one lives, when its tests did not run, or when the line that it changes is not there exactly once (which the normal tests check
+too).
 """
 
 from __future__ import annotations
 
 import argparse
+import compileall
+import multiprocessing
 import os
 import shlex
 import shutil
-import subprocess
 import sys
 import tempfile
 import time
@@ -25,6 +28,8 @@ from typing import NamedTuple
 
 ROOT = Path(__file__).resolve().parents[1]
 COPIED = ("sb3_actpc", "tests", "hyperparams", "benchmarks", "examples", "pyproject.toml")
+PRELOADED = ["torch", "stable_baselines3", "sb3_contrib", "gymnasium", "mujoco", "pandas", "scipy.stats", "pytest"]
+SAID = "said.txt"  # what pytest printed, in the copy
 TESTS_FAILED = 1  # pytest's exit code
 TIMEOUT = 600  # seconds: a mutant may make something endless, which counts as a failed test
 
@@ -616,11 +621,31 @@ def plant(mutant: Mutant, folder: Path) -> None:
     """
     for name in COPIED:
         if (ROOT / name).is_dir():
-            shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__", "results"))
+            shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("results"))
         else:
             shutil.copy(ROOT / name, folder / name)
     file = folder / "sb3_actpc" / mutant.file
     file.write_text(file.read_text(encoding="utf-8").replace(mutant.old, mutant.new), encoding="utf-8")
+
+
+def run_tests(folder: str, arguments: list[str]) -> None:
+    """In a process of its own: end it with pytest's exit code.
+
+    :param folder: the copy
+    :param arguments: pytest's
+    """
+    os.chdir(folder)
+    sys.dont_write_bytecode = True
+    sys.path.insert(0, folder)
+    for name in [name for name in sys.modules if name.partition(".")[0] in ("tests", "sb3_actpc")]:
+        del sys.modules[name]
+    os.environ["PYTHONPATH"] = folder  # for processes that the tests start
+    with open(SAID, "w", encoding="utf-8") as said:
+        os.dup2(said.fileno(), 1)
+        os.dup2(said.fileno(), 2)
+    import pytest
+
+    sys.exit(int(pytest.main(["-q", "-x", "-p", "no:cacheprovider", *arguments])))
 
 
 def outcome(mutant: Mutant) -> str:
@@ -630,27 +655,36 @@ def outcome(mutant: Mutant) -> str:
     """
     if occurrences(mutant) != 1:
         return f"NOT PLANTED: {mutant.old!r} is {occurrences(mutant)} times in {mutant.file}"
-    command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", *shlex.split(mutant.tests)]
     with tempfile.TemporaryDirectory() as folder:
         plant(mutant, Path(folder))
-        environment = {**os.environ, "PYTHONPATH": folder, "OMP_NUM_THREADS": "1", "PYTHONDONTWRITEBYTECODE": "1"}
-        try:
-            done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=TIMEOUT)
-        except subprocess.TimeoutExpired:
+        process = multiprocessing.get_context("forkserver").Process(target=run_tests, args=(folder, shlex.split(mutant.tests)))
+        process.start()
+        process.join(TIMEOUT)
+        if process.is_alive():
+            process.kill()
             return "killed"
-    if done.returncode == TESTS_FAILED:
-        return "killed"
-    return "LIVES" if done.returncode == 0 else f"NOT TESTED: {done.stdout.strip().splitlines()[-1:]}"
+        if process.exitcode == TESTS_FAILED:
+            return "killed"
+        said = (Path(folder) / SAID).read_text(encoding="utf-8").strip().splitlines()
+    return "LIVES" if process.exitcode == 0 else f"NOT TESTED: {said[-1:]}"
 
 
-def outcomes(mutants: list[Mutant], jobs: int) -> Iterator[tuple[Mutant, str]]:
+def outcomes(mutants: list[Mutant], jobs: int) -> Iterator[tuple[Mutant, str, float]]:
     """
     :param mutants: to try
     :param jobs: how many at a time
-    :return: each with its :func:`outcome`, in their order
+    :return: each with its :func:`outcome` and the seconds that it took, in their order
     """
+
+    def timed(mutant: Mutant) -> tuple[Mutant, str, float]:
+        started = time.monotonic()
+        return mutant, outcome(mutant), time.monotonic() - started
+
+    os.environ["OMP_NUM_THREADS"] = "1"
+    compileall.compile_dir(ROOT / "sb3_actpc", quiet=1)  # once, not in every copy
+    multiprocessing.get_context("forkserver").set_forkserver_preload(PRELOADED)
     with ThreadPoolExecutor(jobs) as workers:
-        yield from zip(mutants, workers.map(outcome, mutants), strict=True)
+        yield from workers.map(timed, mutants)
 
 
 def main() -> int:
@@ -658,16 +692,22 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("part", nargs="?", default="", help="of the names of those to try (default: all)")
     parser.add_argument("--jobs", type=int, default=2, help="mutants at a time (default: %(default)s)")
+    parser.add_argument("--log", type=Path, help="file of those killed, which are not tried again")
     args = parser.parse_args()
     started, alive = time.monotonic(), []
-    chosen = [mutant for mutant in MUTANTS if args.part in mutant.name]
-    for mutant, result in outcomes(chosen, args.jobs):
-        print(f"{time.monotonic() - started:6.0f} s  {mutant.name}: {result}", flush=True)
-        alive += [] if result == "killed" else [mutant.name]
+    done = args.log.read_text(encoding="utf-8").splitlines() if args.log and args.log.is_file() else []
+    chosen = [mutant for mutant in MUTANTS if args.part in mutant.name and mutant.name not in done]
+    for mutant, result, seconds in outcomes(chosen, args.jobs):
+        print(f"{time.monotonic() - started:6.0f} s  {mutant.name}: {result} ({seconds:.0f} s)", flush=True)
+        if result != "killed":
+            alive.append(mutant.name)
+        elif args.log:
+            with open(args.log, "a", encoding="utf-8") as log:
+                log.write(f"{mutant.name}\n")
     print(f"{len(chosen) - len(alive)} of {len(chosen)} mutants killed")
     for name in alive:
         print(f"not killed: {name}")
-    return 1 if alive or not chosen else 0
+    return 1 if alive or not (chosen or done) else 0
 
 
 if __name__ == "__main__":
