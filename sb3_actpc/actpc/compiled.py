@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import Any, NamedTuple
 
 import torch as th
 from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 
 from sb3_actpc.actpc.features import Batch
 from sb3_actpc.ngc import HebbianChanges, settle_coupled
-
-if TYPE_CHECKING:
-    from sb3_actpc.actpc.actpc import ActPC
 
 # compiling takes one to three minutes on a CPU, and saves a quarter of an update's products and calls
 ENOUGH_UPDATES = 200_000
@@ -37,7 +34,7 @@ class CompiledUpdate:
     :param agent: whose circuits are updated
     """
 
-    def __init__(self, agent: ActPC) -> None:
+    def __init__(self, agent: Any) -> None:
         self.agent = agent
         self._changes = th.compile(self._all_changes, fullgraph=True, dynamic=False)
 
@@ -88,7 +85,7 @@ class CompiledUpdate:
         return HebbianChanges(changes[:n], changes[n : 2 * n], changes[2 * n :])
 
 
-def compiled_update(agent: ActPC, total_timesteps: int) -> CompiledUpdate | None:
+def compiled_update(agent: Any, total_timesteps: int) -> CompiledUpdate | None:
     """
     The compiled update that ``agent.compile`` asks for, or None where the eager one is meant or is all there is.
 
@@ -108,7 +105,7 @@ def compiled_update(agent: ActPC, total_timesteps: int) -> CompiledUpdate | None
     return CompiledUpdate(agent)
 
 
-def _updates_per_step(agent: ActPC) -> float:
+def _updates_per_step(agent: Any) -> float:
     """Updates for each transition collected; of episodes, whose length nobody knows beforehand, one."""
     every = agent.train_freq
     assert isinstance(every, TrainFreq)
