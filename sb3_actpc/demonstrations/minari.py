@@ -96,7 +96,9 @@ def minari_files(dataset_id: str) -> list[Path]:
     :raises ImportError: when Minari is not installed
     :raises FileNotFoundError: when there is no such dataset; the message says how to fetch it
     """
-    get_dataset_path = import_extra("minari.storage", "minari").get_dataset_path
+    import_extra("minari", "minari")
+    from minari.storage import get_dataset_path
+
     files = sorted(path for path in (get_dataset_path(dataset_id) / "data").rglob("*") if path.is_file())
     if not files:
         raise FileNotFoundError(
