@@ -94,7 +94,8 @@ class DemonstratedAlgorithm(LearnsFromDemonstrations, OffPolicyAlgorithm):
         size = self.buffer_size
         demonstrations = None
         if self.env is None:
-            kind, kwargs, size = _placeholder(kind), {}, self.n_envs
+            kind = DemonstrationDictReplayBuffer if issubclass(kind, DictReplayBuffer) else kind  # which needs none
+            kwargs, size = {}, self.n_envs
         else:
             if self.demonstrations is not None:
                 demonstrations = self._fitted_demonstrations()
@@ -136,8 +137,3 @@ class DemonstratedAlgorithm(LearnsFromDemonstrations, OffPolicyAlgorithm):
     def _n_demonstrated(self) -> int:
         demonstrated = getattr(self.replay_buffer, "demonstrated", None)
         return 0 if demonstrated is None else demonstrated.buffer_size
-
-
-def _placeholder(kind: type[WithDemonstrations]) -> type[WithDemonstrations]:
-    """A class that needs no environment, with observations of the same kind."""
-    return DemonstrationDictReplayBuffer if issubclass(kind, DictReplayBuffer) else kind

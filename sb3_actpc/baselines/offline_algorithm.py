@@ -9,7 +9,6 @@ from typing import Any, ClassVar, TypeVar
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 
@@ -137,15 +136,13 @@ class OfflineAlgorithm(LearnsFromDemonstrations):
             self.num_timesteps += 1
             if self._n_updates % log_interval == 0:
                 self.logger.dump(self.num_timesteps)
-            if not self._step_callback(callback):
+            # what callbacks look for after a step of the environment: there was none
+            nothing = np.empty(0, dtype=bool)
+            callback.update_locals({"actions": np.empty(0, dtype=np.float32), "infos": [], "dones": nothing})
+            if not callback.on_step():
                 break
         callback.on_training_end()
         return self
-
-    def _step_callback(self, callback: BaseCallback) -> bool:
-        # what callbacks look for after a step of the environment: there was none
-        callback.update_locals({"actions": np.empty(0, dtype=np.float32), "infos": [], "dones": np.empty(0, dtype=bool)})
-        return callback.on_step()
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_is_shown"]

@@ -146,8 +146,9 @@ def write_bundle(folder: Path, num_timesteps: int, keep: int, manifest: Mapping[
     except BaseException:
         shutil.rmtree(temporary, ignore_errors=True)
         raise
-    for _, old in _list(folder)[:-keep]:
-        _remove(old)
+    for _, old in _list(folder)[:-keep]:  # renamed first: a bundle never has its name while half of it is gone
+        os.replace(old, temporary)
+        shutil.rmtree(temporary, ignore_errors=True)
 
 
 def list_bundles(folder: str | os.PathLike[str]) -> list[Path]:
@@ -224,10 +225,3 @@ def _sync_folder(folder: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
-
-
-def _remove(bundle: Path) -> None:
-    """Rename first: a bundle never has its name while half of it is gone."""
-    doomed = bundle.with_name(f"{_TEMPORARY}{uuid.uuid4().hex[:12]}")
-    os.replace(bundle, doomed)
-    shutil.rmtree(doomed, ignore_errors=True)

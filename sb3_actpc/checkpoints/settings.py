@@ -45,7 +45,8 @@ def constructor_settings(model: BaseAlgorithm) -> dict[str, Any]:
     :return: JSON: its constructor's keywords by name, the policy's name among them; a value that cannot be named is left
         out and its keyword listed under ``"unnamed"``
     """
-    record: dict[str, Any] = {"policy": policy_name(model), "keywords": {}, "unnamed": []}
+    policy = next((name for name, kind in model.policy_aliases.items() if kind is model.policy_class), None)
+    record: dict[str, Any] = {"policy": policy, "keywords": {}, "unnamed": []}  # None for a class of the user's
     for name in constructor_keywords(type(model)):
         attribute = _ATTRIBUTE_OF.get(name, name)
         if name in _NOT_STORED or not hasattr(model, attribute):
@@ -71,11 +72,6 @@ def read_settings(record: Mapping[str, Any], overrides: Mapping[str, Any]) -> di
     if policy is None:
         raise ValueError("the policy's class could not be stored by name: pass the same again, policy=...")
     return {**keywords, **overrides, "policy": policy}
-
-
-def policy_name(model: BaseAlgorithm) -> str | None:
-    """The name under which the algorithm knows its policy's class; None for a class of the user's."""
-    return next((name for name, kind in model.policy_aliases.items() if kind is model.policy_class), None)
 
 
 def _name_value(value: Any) -> Any:

@@ -16,6 +16,7 @@ _SKIPPED = {"venv", "env", "class_attributes", "results_writer", "obs_spaces", "
 _SKIPPED |= {"t_start"}
 # under this name, what an environment's own checkpoint_state() returned
 _OWN_STATE = "checkpoint_state()"
+_GENERATORS = {"generator", "random_state", "random", "space"}  # kinds of stored values
 _IN_ARENA = ("efc_", "contact", "iefc_", "iM", "iLD", "iacc", "ifrc_")  # of MuJoCo's data
 
 
@@ -121,7 +122,7 @@ def _layer_values(layer: gym.Env[Any, Any]) -> dict[str, Any]:
 
 
 def _encode_attribute(value: Any, encoder: Encoder, where: str) -> Any:
-    if _is_physics(value):
+    if type(value).__name__ == "MjData" and type(value).__module__.startswith("mujoco"):
         return {"physics": encoder.encode(capture_physics(value.model, value), where)}
     return encoder.encode(value, where)
 
@@ -138,7 +139,7 @@ def restore_env(env: gym.Env[Any, Any], entry: dict[str, Any], decoder: Decoder,
     alone."""
     for layer, attributes in zip(env_layers(env), entry.get("layers", []), strict=False):
         for name, node in attributes.items():
-            if generators_only and not _is_generator(node):
+            if generators_only and not (isinstance(node, dict) and _GENERATORS & node.keys()):
                 continue
             if name == _OWN_STATE:
                 layer.restore_checkpoint_state(decoder.decode(node))  # type: ignore[attr-defined]
@@ -158,10 +159,6 @@ def _set_attribute(layer: Any, name: str, node: Any, decoder: Decoder) -> None:
         setattr(layer, name, value)
 
 
-def _is_generator(node: Any) -> bool:
-    return isinstance(node, dict) and bool({"generator", "random_state", "random", "space"} & node.keys())
-
-
 def _capture_wrapper(wrapper: VecEnv, encoder: Encoder, where: str) -> dict[str, Any]:
     attributes = {}
     for name, value in vars(wrapper).items():
@@ -175,10 +172,6 @@ def _capture_wrapper(wrapper: VecEnv, encoder: Encoder, where: str) -> dict[str,
 
 
 # ------------------------------------------------------------------ MuJoCo
-
-
-def _is_physics(value: Any) -> bool:
-    return type(value).__name__ == "MjData" and type(value).__module__.startswith("mujoco")
 
 
 def capture_physics(model: Any, data: Any) -> dict[str, np.ndarray]:

@@ -174,11 +174,6 @@ def replay_buffer(model: BaseAlgorithm) -> ReplayBuffer | None:
     return getattr(model, "replay_buffer", None)
 
 
-def stored_rows(buffer: ReplayBuffer) -> int:
-    """How many rows of the buffer's arrays are in use; with ``optimize_memory_usage`` the next one holds an observation."""
-    return buffer.buffer_size if buffer.full else min(buffer.pos + 1, buffer.buffer_size)
-
-
 def buffer_arrays(buffer: ReplayBuffer) -> dict[str, np.ndarray]:
     """A replay buffer's arrays with a row per step, (buffer_size, n_envs, ...), by name; dictionaries' as ``name.key``."""
     arrays: dict[str, np.ndarray] = {}
@@ -192,7 +187,8 @@ def buffer_arrays(buffer: ReplayBuffer) -> dict[str, np.ndarray]:
 
 
 def _capture_buffer(buffer: ReplayBuffer, encoder: Encoder, writer: BundleWriter) -> dict[str, Any]:
-    rows = stored_rows(buffer)
+    # with ``optimize_memory_usage`` the row after the last holds an observation
+    rows = buffer.buffer_size if buffer.full else min(buffer.pos + 1, buffer.buffer_size)
     files: dict[str, str] = {}
     for name, array in buffer_arrays(buffer).items():
         files[name] = f"buffer_{len(files):02d}.npy"

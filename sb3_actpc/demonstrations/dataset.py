@@ -342,7 +342,8 @@ class Demonstrations:
         if env is None and self.env_id in gym.registry:
             with gym.make(self.env_id) as made:
                 return self.to_minari(dataset_id, made, **options)
-        observation_space, action_space = map(_unbounded_box, (self.observations.shape[1], self.actions.shape[1]))
+        sizes = self.observations.shape[1], self.actions.shape[1]
+        observation_space, action_space = (spaces.Box(-np.inf, np.inf, (size,), np.float32) for size in sizes)
         if env is not None:
             observation_space, action_space = env.observation_space, env.action_space
             self.check(observation_space, action_space, None if env.spec is None else env.spec.id)
@@ -422,10 +423,6 @@ def shipped_demonstrations(env_id: str, weak: bool = False) -> Path:
             f"{env_id}) and pass --demonstrations FILE, or train without (--demonstrations none)"
         )
     return path
-
-
-def _unbounded_box(size: int) -> spaces.Space[Any]:
-    return spaces.Box(-np.inf, np.inf, (size,), np.float32)
 
 
 def base_name(env_id: str) -> str:

@@ -80,7 +80,9 @@ def plan_runs(comparison: Comparison, folder: Path | None = None) -> list[Run]:
     """
     folder = Path(comparison.output) if folder is None else folder
     filled = [_fill(comparison.shared, task, variant) for task in comparison.tasks for variant in comparison.variants]
-    return [_placed(run, seed, folder) for seed in range(comparison.seeds) for run in filled]
+    seeded = [run.model_copy(update={"seed": seed}) for seed in range(comparison.seeds) for run in filled]
+    own = [folder / str(run.task).replace(":", "_") / str(run.name) / f"seed{run.seed}_{run.id}" for run in seeded]
+    return [run.model_copy(update={"output": str(place)}) for run, place in zip(seeded, own, strict=True)]
 
 
 def _fill(shared: Run, task: Run, variant: Run) -> Run:
@@ -91,12 +93,6 @@ def _fill(shared: Run, task: Run, variant: Run) -> Run:
         return resolve(run)
     except (ValueError, FileNotFoundError) as error:
         raise type(error)(f"{task.env}, {variant.name}: {error}") from error
-
-
-def _placed(run: Run, seed: int, folder: Path) -> Run:
-    run = run.model_copy(update={"seed": seed})
-    own = folder / str(run.task).replace(":", "_") / str(run.name) / f"seed{seed}_{run.id}"
-    return run.model_copy(update={"output": str(own)})
 
 
 def _parse_task(entry: Any) -> Run:

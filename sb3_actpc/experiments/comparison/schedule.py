@@ -74,7 +74,8 @@ def run_comparison(
     with folder_lock(folder, LOCK_WAIT, display.line):
         for run in runs:
             repair_result(run.folder, display.line)
-        to_do = [run for run in runs if is_to_do(run_status(run.folder), retry_failed)]
+        left_alone = (FINISHED,) if retry_failed else (FINISHED, FAILED)
+        to_do = [run for run in runs if run_status(run.folder) not in left_alone]
         display.begin(to_do, sum(run_status(run.folder) == FINISHED for run in runs))
         summary = Summary()
         if to_do:
@@ -88,11 +89,6 @@ def run_comparison(
             else:
                 summary.unfinished.append(run)
         return summary
-
-
-def is_to_do(status: str, retry_failed: bool) -> bool:
-    """Whether the command will execute a run of this status."""
-    return status != FINISHED and (retry_failed or status != FAILED)
 
 
 class _Scheduler:

@@ -282,15 +282,15 @@ class EvaluationCallback(BaseCallback):
         now = time.perf_counter()
         self.evaluation_seconds += now - started
         self._last_timesteps = self.num_timesteps
-        self._append_row(
-            {
-                **self.last_summary,
-                "timesteps": self.num_timesteps,
-                "updates": getattr(self.model, "_n_updates", 0),
-                "seconds": round(self.wall_seconds, 2),
-                "evaluation_seconds": round(self.evaluation_seconds, 2),
-            }
-        )
+        row: dict[str, Any] = {
+            **self.last_summary,
+            "timesteps": self.num_timesteps,
+            "updates": getattr(self.model, "_n_updates", 0),
+            "seconds": round(self.wall_seconds, 2),
+            "evaluation_seconds": round(self.evaluation_seconds, 2),
+        }
+        with open(self.folder / PROGRESS, "a", newline="", encoding="utf-8") as file:
+            csv.DictWriter(file, PROGRESS_COLUMNS, lineterminator="\n").writerow(row)
         for name in ("dense_return", "sparse_return", "success_rate"):
             if self.last_summary[name] is not None:
                 self.logger.record(f"eval/{name}", self.last_summary[name])
@@ -304,10 +304,6 @@ class EvaluationCallback(BaseCallback):
             with atomic_write(self.folder / "model.zip") as file:
                 self.model.save(cast(BufferedIOBase, file))
         self.best_return = max(self.best_return, dense_return)
-
-    def _append_row(self, values: dict[str, Any]) -> None:
-        with open(self.folder / PROGRESS, "a", newline="", encoding="utf-8") as file:
-            csv.writer(file, lineterminator="\n").writerow([values[name] for name in PROGRESS_COLUMNS])
 
 
 def _evaluation_line(timesteps: int, summary: dict[str, float | None]) -> str:

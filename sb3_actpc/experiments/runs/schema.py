@@ -67,11 +67,6 @@ def _algorithm(name: str) -> str:
     return name
 
 
-def _device(name: str) -> str:
-    check_device(name)
-    return name
-
-
 def _keywords(value: Any) -> Any:
     """As in rl-zoo3: true, false, or keywords."""
     return {True: {}, False: None}[value] if isinstance(value, bool) else value
@@ -164,7 +159,7 @@ class Run(Schema):
     keep: Literal["last", "best"] = "last"
     target_return: Real | None = None
     output: str | None = None
-    device: Annotated[str, AfterValidator(_device)] = "cpu"
+    device: Annotated[str, AfterValidator(lambda name: check_device(name) or name)] = "cpu"
     threads: Annotated[Count, Field(le=1024)] = 1
     progress: bool = True
     continuable: bool = True
@@ -231,9 +226,5 @@ def _describe(error: ValidationError, known: list[str]) -> str:
         return f"{key}={first['input']!r} must be letters, digits and . _ + -: it becomes a folder's"
     context = first.get("ctx", {})
     message = _MESSAGES.get(first["type"], first["msg"].removeprefix("Value error, ")).format(**context)
-    return f"{key}={first['input']!r} {message}" if first["type"] != "value_error" or not _names_itself(message) else message
-
-
-def _names_itself(message: str) -> bool:
-    """Whether an error of ours names the value already."""
-    return message.partition("=")[0].isidentifier()
+    names_itself = first["type"] == "value_error" and message.partition("=")[0].isidentifier()  # one of ours
+    return message if names_itself else f"{key}={first['input']!r} {message}"
