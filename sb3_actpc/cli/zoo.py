@@ -11,6 +11,9 @@ What rl_zoo3 gets is a settings file with one entry, made from the preset, becau
 * logs the success rate only where it is told to (``monitor_kwargs``), and its plots need it;
 * begins a continued run (``-i model.zip``) with the random warm-up again: ``learning_starts`` is then 0.
 
+The settings of a search's best trial are written as a preset, which ``sb3-actpc train`` takes too. (rl_zoo3's ``--trial-id``
+takes the number 0, the first trial, for none.)
+
 rl_zoo3 gives its training and its evaluation environments one seed, so that an agent is evaluated on the starts that it
 trained on; here the evaluation has another, as in ``sb3-actpc train``.
 """
@@ -96,7 +99,10 @@ def register_algorithms() -> None:
         converters.setdefault(name, converters[like])
     for name in ("td3", "ddpg", "her"):
         samplers[name] = _with_one_learning_rate(samplers[name])
-    _evaluate_on_other_seeds(import_extra("rl_zoo3.exp_manager", "zoo").ExperimentManager)
+        converters[name] = _with_one_learning_rate(converters[name])
+    manager = import_extra("rl_zoo3.exp_manager", "zoo").ExperimentManager
+    _evaluate_on_other_seeds(manager)
+    _keep_the_best_trial(manager)
 
 
 def _evaluate_on_other_seeds(manager: Any) -> None:
@@ -116,6 +122,34 @@ def _evaluate_on_other_seeds(manager: Any) -> None:
     manager.create_envs = create_envs_with_other_seeds
 
 
+def _keep_the_best_trial(manager: Any) -> None:
+    """:param manager: as :func:`_evaluate_on_other_seeds`'s; its search then also writes a preset"""
+    from sb3_actpc.experiments.runs.presets import load_preset
+
+    search = manager.hyperparameters_optimization
+
+    def search_and_keep(self: Any) -> None:
+        search(self)
+        if not self.storage or Path(self.config).suffix not in (".yml", ".yaml"):
+            return
+        env_id, best = self.env_name.gym_id, self.load_trial(self.storage, self.study_name)
+        settings = {**load_preset(self.config, env_id), **(self.custom_hyperparams or {}), **best}
+        sampled = self.load_trial(self.storage, self.study_name, convert=False)
+        if "activation_fn" in sampled:  # the class has no place in a preset, its name has
+            settings["policy_kwargs"]["activation_fn"] = sampled["activation_fn"]
+        for name in ("demonstrations", "monitor_kwargs"):
+            settings.pop(name, None)
+        preset = Path(self.log_folder, self.algo, f"{self.study_name}.yml")
+        try:
+            preset.write_text(yaml.safe_dump({env_id: settings}, sort_keys=False), encoding="utf-8")
+        except yaml.YAMLError as error:
+            print(f"The best trial makes no preset: {' '.join(str(error).split())}")
+        else:
+            print(f"The best trial as a preset: sb3-actpc train --algo {self.algo} --env {env_id} --preset {preset}")
+
+    manager.hyperparameters_optimization = search_and_keep
+
+
 def sample_actpc_params(trial: Any, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> dict[str, Any]:
     """Settings of ActPC for one trial of a search: those that matter under either settling."""
     trial.suggest_float("learning_rate", 1e-5, 2e-3, log=True)
@@ -125,8 +159,8 @@ def sample_actpc_params(trial: Any, n_actions: int, n_envs: int, additional_args
     trial.suggest_categorical("net_arch", list(NET_ARCHS))
     trial.suggest_float("actor_pressure", 0.01, 3.0, log=True)
     trial.suggest_float("refresh_weight", 0.1, 3.0, log=True)
-    trial.suggest_float("alpha_ep", 0.01, 1.0, log=True)
-    trial.suggest_float("alpha_in", 0.01, 1.0, log=True)
+    trial.suggest_categorical("alpha_ep", [0.0, 0.1, 1.0])
+    trial.suggest_categorical("alpha_in", [0.0, 0.1, 1.0])
     trial.suggest_categorical("weight_decay", [0.0, 0.1, 0.3, 1.0])
     trial.suggest_categorical("refresh_noise", [0.0, 0.05, 0.1, 0.2])
     params = convert_actpc_params(trial.params)
@@ -146,7 +180,6 @@ def convert_actpc_params(sampled: dict[str, Any]) -> dict[str, Any]:
         "batch_size": 2 ** sampled["batch_size_pow"],
         "policy_kwargs": {
             "net_arch": NET_ARCHS[sampled["net_arch"]],
-            "n_critics": 2,
             "circuit_kwargs": {"weight_decay": sampled["weight_decay"]},
         },
     }

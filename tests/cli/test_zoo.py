@@ -8,11 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 import yaml
 
 from sb3_actpc.cli import main as command_line
 from sb3_actpc.cli.zoo import NET_ARCHS, convert_actpc_params
+from sb3_actpc.experiments.runs import Run, resolve
 from tests.recordings import record
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -147,6 +149,22 @@ def test_a_search_tries_settings_and_keeps_them_in_a_journal(ran: tuple[Path, di
     assert states.count("COMPLETE") == 2  # none was pruned by an error
 
 
+@pytest.mark.parametrize("algo", ["actpc", "her"])
+def test_the_best_trial_of_a_search_is_a_preset(ran: tuple[Path, dict[str, str]], algo: str) -> None:
+    env_id = {"actpc": "SparseReacher-v5", "her": "GoalReacher-v5"}[algo]
+    folder = ran[0] / "logs" / algo
+    (report,) = folder.glob("report_*.csv")
+    trials = pd.read_csv(report)
+    best = trials.loc[trials["value"].idxmax()]
+    preset = folder / f"{algo}_{env_id}.yml"
+    run = resolve(Run(env=env_id, algo=algo, preset=str(preset), demonstrations="none"))
+    assert run.settings["learning_rate"] == pytest.approx(best["params_learning_rate"])  # not the file's, which is another
+    assert run.settings["gamma"] == pytest.approx(1.0 - best["params_one_minus_gamma"])
+    assert run.settings["buffer_size"] == FEWER["buffer_size"] and run.n_timesteps == PRESETS[algo]["n_timesteps"]
+    assert run.settings.get("actor_kwargs") is None  # it has the sampled rate
+    assert f"--preset {preset.relative_to(ran[0])}" in ran[1]["optimize" if algo == "actpc" else "optimize her"]
+
+
 def test_sampled_parameters_become_keywords() -> None:
     sampled = {
         **dict.fromkeys(("learning_rate", "tau", "actor_pressure", "refresh_weight", "alpha_ep", "alpha_in"), 0.5),
@@ -158,7 +176,7 @@ def test_sampled_parameters_become_keywords() -> None:
     }
     params = convert_actpc_params(sampled)
     assert (params["gamma"], params["batch_size"]) == (0.99, 128)
-    circuits = {"n_critics": 2, "circuit_kwargs": {"weight_decay": 0.3}}
+    circuits = {"circuit_kwargs": {"weight_decay": 0.3}}
     assert params["policy_kwargs"] == {"net_arch": NET_ARCHS["small"], **circuits} and params["refresh_noise"] == 0.1
 
 

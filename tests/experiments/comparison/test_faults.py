@@ -1,12 +1,14 @@
 """SIGKILL and SIGTERM, to the command and to its workers: real processes on a comparison of a few steps."""
 
 import os
+import random
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
@@ -15,7 +17,7 @@ from sb3_actpc.checkpoints import EXIT_STOPPED, list_bundles
 from sb3_actpc.experiments.comparison.execution import FINISHED, run_status
 from sb3_actpc.experiments.runs.run import CHECKPOINTS
 from tests.checkpoints.runs import log_rows
-from tests.experiments.comparison.tasks import ROOT, TASK, bring_to_end, small_runs, write_preset
+from tests.experiments.comparison.tasks import ROOT, TASK, bring_to_end, small_runs, write_demonstrations, write_preset
 
 OUT = Path("out")
 PATIENCE = 300.0  # seconds
@@ -28,11 +30,14 @@ def comparison_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_preset()
 
 
-def write_comparison(algos: list[str], **env_kwargs: object) -> None:
+def write_comparison(algos: list[Any], **env_kwargs: object) -> None:
     """What :func:`small_runs` plans, as a file for the command."""
     discounts = {"first": 0.9, "second": 0.8}
     entries = [
-        {"name": name, "algo": "actpc", "preset": "small.yml", "settings": {"gamma": discounts[name]}} for name in algos
+        {"name": one, "algo": "actpc", "preset": "small.yml", "settings": {"gamma": discounts[one]}}
+        if isinstance(one, str)
+        else one
+        for one in algos
     ]
     given = {
         "envs": [{"env": TASK, "env_kwargs": env_kwargs, "demonstrations": "none"}],
@@ -50,9 +55,8 @@ def start_command(*options: str) -> subprocess.Popen[str]:
     code = "import sys; from sb3_actpc.cli import main; sys.exit(main(sys.argv[1:]))"
     command = [sys.executable, "-c", code, "compare", "c.yml", *options]
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
-    return subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, stdin=subprocess.DEVNULL, text=True, env=environment
-    )
+    pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "stdin": subprocess.DEVNULL}
+    return subprocess.Popen(command, text=True, env=environment, start_new_session=True, **pipes)
 
 
 def wait_until(condition: Callable[[], bool]) -> None:
@@ -119,3 +123,29 @@ def test_a_command_that_is_killed_or_stopped_goes_on_where_it_was(number: int) -
     bring_to_end([straight], Path("straight"))
     for name in FILES:
         assert log_rows(run.folder / name) == log_rows(straight.folder / name) != []
+
+
+@pytest.mark.slow
+def test_a_command_that_is_killed_ten_times_ends_as_if_it_never_was() -> None:
+    """SIGKILL at random moments, to the command alone or to its workers too; one run has a warm start and a habit."""
+    write_demonstrations()
+    shown = {"name": "shown", "algo": "actpc", "preset": "small.yml", "demonstrations": "demonstrations.npz"}
+    shown["settings"] = {"actor_warm_start": 40, "critic_warmup": 10}
+    write_comparison(["first", shown], pause=0.1)
+    moments, n_kills, finished = random.Random(0), 0, False
+    while not finished:
+        command = start_command("--workers", "2")
+        try:
+            _, errors = command.communicate(timeout=moments.uniform(4.0, 20.0) if n_kills < 10 else PATIENCE)
+            assert command.returncode == 0, errors
+            finished = True
+        except subprocess.TimeoutExpired:
+            n_kills += 1
+            (os.killpg if n_kills % 2 else os.kill)(command.pid, signal.SIGKILL)
+            command.communicate()
+    assert n_kills >= 3
+    straight = small_runs(Path("straight"), ["first", shown])
+    bring_to_end(straight, Path("straight"))
+    for run, other in zip(small_runs(OUT, ["first", shown], pause=0.1), straight, strict=True):
+        for name in FILES:
+            assert log_rows(run.folder / name) == log_rows(other.folder / name) != []
