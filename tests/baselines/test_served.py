@@ -279,6 +279,16 @@ def make_nothing(recipe: Any, place: Path, report: Any) -> None:
 
 
 @pytest.mark.skipif(os.name == "nt", reason="other paths")
+def test_a_python_without_wheels_is_refused_before_anything_is_compiled(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(installation.sys, "version_info", (3, 13, 0))
+    monkeypatch.setattr(installation, "_make", make_nothing)
+    with pytest.raises(ValueError, match=r"no wheels for Python 3\.13: install it from Python 3\.10 to 3\.12"):
+        install("robomimic", tmp_path / "none")
+    assert not (tmp_path / "none").exists()
+
+
 def test_an_environment_is_made_once_and_half_of_one_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(installation, "_make", make_nothing)
     with pytest.raises(ImportError, match=r"robomimic is not installed in .*: run sb3-actpc baselines install robomimic"):

@@ -28,6 +28,7 @@ class Recipe:
 
 # torch comes first and by number, so that no CUDA libraries come with it where an index of CPU wheels is set
 _TORCH = ("torch==2.13.0", "numpy==1.26.4")
+NEWEST_PYTHON = (3, 12)  # with wheels of that NumPy: where there is none, pip would compile it
 RECIPES = {
     "d3rlpy": Recipe((_TORCH, ("d3rlpy==2.8.1",)), "import d3rlpy"),
     # without its dependencies: egl_probe has to be compiled, torchvision must fit torch, and neither is used without images
@@ -65,7 +66,7 @@ def install(name: str, folder: Path | None = None, report: Callable[[str], None]
     :param folder: where to make it, by default :func:`environments_folder`
     :param report: given a line of text before each step
     :return: the environment's folder
-    :raises ValueError: when there is no such name
+    :raises ValueError: when there is no such name, or Python is too new
     :raises OSError: when a step fails (no network, a full disk); the message is the last thing that it said
     """
     if name not in RECIPES:
@@ -75,6 +76,11 @@ def install(name: str, folder: Path | None = None, report: Callable[[str], None]
     if _is_complete(name, place):
         report(f"{name} is already installed in {place}")
         return place
+    if sys.version_info[:2] > NEWEST_PYTHON:
+        raise ValueError(
+            f"{name} needs NumPy 1, which has no wheels for Python {sys.version_info[0]}.{sys.version_info[1]}: install it from "
+            f"Python 3.10 to 3.{NEWEST_PYTHON[1]}, {place} then serves any other too"
+        )
     folder.mkdir(parents=True, exist_ok=True)
     for left in folder.glob(f".{name}.*.tmp"):  # of a command that was killed, not of one that is at work
         if time.time() - left.stat().st_mtime > ABANDONED_AFTER:
