@@ -278,7 +278,6 @@ def make_nothing(recipe: Any, place: Path, report: Any) -> None:
     (place / "bin" / "python").touch()
 
 
-@pytest.mark.skipif(os.name == "nt", reason="other paths")
 def test_a_python_without_wheels_is_refused_before_anything_is_compiled(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -289,6 +288,7 @@ def test_a_python_without_wheels_is_refused_before_anything_is_compiled(
     assert not (tmp_path / "none").exists()
 
 
+@pytest.mark.skipif(os.name == "nt", reason="other paths")
 def test_an_environment_is_made_once_and_half_of_one_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(installation, "_make", make_nothing)
     with pytest.raises(ImportError, match=r"robomimic is not installed in .*: run sb3-actpc baselines install robomimic"):
