@@ -78,8 +78,8 @@ def install(name: str, folder: Path | None = None, report: Callable[[str], None]
         return place
     if sys.version_info[:2] > NEWEST_PYTHON:
         raise ValueError(
-            f"{name} needs NumPy 1, which has no wheels for Python {sys.version_info[0]}.{sys.version_info[1]}: install it from "
-            f"Python 3.10 to 3.{NEWEST_PYTHON[1]}, {place} then serves any other too"
+            f"{name} needs NumPy 1, which has no wheels for Python {sys.version_info[0]}.{sys.version_info[1]}: install it "
+            f"from Python 3.10 to 3.{NEWEST_PYTHON[1]}, {place} then serves any other too"
         )
     folder.mkdir(parents=True, exist_ok=True)
     for left in folder.glob(f".{name}.*.tmp"):  # of a command that was killed, not of one that is at work
