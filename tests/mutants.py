@@ -257,16 +257,16 @@ MUTANTS = [
     ),
     Mutant(
         "signals are stored as they are, and paid so",
-        AGENT,
-        "rewards_of = self._rewards_of_signals if",
-        "rewards_of = STORED if",
+        SIGNALS,
+        "return self.paid if",
+        "return STORED if",
         f"{LEARNS} -k normalised_when_sampled",
     ),
     Mutant(
         "the target actor never moves",
         AGENT,
-        "zip([self.actor_target, *self.critic_target], [self.actor.circuit, *self.critic], strict",
-        "zip(self.critic_target, self.critic, strict",
+        "_follow([self.actor_target, *self.critic_target], [self.actor.circuit, *self.critic], tau)",
+        "_follow([*self.critic_target], [*self.critic], tau)",
         f"{LEARNS} -k target",
     ),
     Mutant(
@@ -361,7 +361,7 @@ MUTANTS = [
     Mutant(
         "chance is held against a candidate", TRIALS, "gain + error < -GREAT_LOSS", "gain < -GREAT_LOSS", f"{HABIT} -k chance"
     ),
-    Mutant("a candidate plays on for ever", TRIALS, "and n < MOST_PROOFS", "", f"{HABIT} -k plays_on"),
+    Mutant("a candidate plays on for ever", TRIALS, " and not is_known", "", f"{HABIT} -k plays_on"),
     Mutant("candidates before anything is learned", TRIALS, "not has_learned or len", "len", f"{HABIT} -k before"),
     Mutant(
         "the spread of the habit does not count",

@@ -14,7 +14,17 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 from sb3_actpc import ActPC
 from sb3_actpc.actpc import habit as habit_module
 from sb3_actpc.actpc.actpc import AVERAGING_RATE
-from sb3_actpc.actpc.habit import ENOUGH_PROOFS, HABIT_PROOFS, KEPT_RETURNS, MOST_PROOFS, N_PROOFS, PROOF_STEPS, Trials
+from sb3_actpc.actpc.habit import (
+    ENOUGH_PROOFS,
+    HABIT_PROOFS,
+    KEPT_RETURNS,
+    MOST_PROOF_STEPS,
+    MOST_PROOFS,
+    N_PROOFS,
+    PROOF_STEPS,
+    STANDARD_ERRORS,
+    Trials,
+)
 from sb3_actpc.actpc.trust_region import RADIUS_FACTORS
 from tests.actpc.agents import QUICK, differ, make, weights_of
 from tests.actpc.envs import CountingEnv, demonstrations
@@ -110,8 +120,8 @@ def test_a_candidate_must_gain_a_hundredth_and_is_rejected_for_the_loss_of_one(h
 
 
 def test_a_great_loss_that_may_be_chance_is_not_held_against_a_candidate_at_once():
-    """Habit's returns of 50 and 150: squares of 5,000 in one degree of freedom, so an error of sqrt(5000 * 1.5) = 87."""
-    for first, verdict in ((7.0, None), (-8.0, "rejected")):
+    """Habit's returns of 50 and 150: squares of 5,000 in one degree of freedom, so 1.5 errors of sqrt(5000 * 1.5) = 87."""
+    for first, verdict in ((-49.0, None), (-51.0, "rejected")):
         trials = Trials(1)
         play_quiet(trials, 50.0)
         play_quiet(trials, 150.0)
@@ -121,10 +131,10 @@ def test_a_great_loss_that_may_be_chance_is_not_held_against_a_candidate_at_once
 @pytest.mark.parametrize(
     ("candidate", "verdicts"),
     [
-        ([99.0, 125.0], [None, None]),  # a gain of 12, and an error of 13
-        ([102.0, 122.0], [None, "accepted"]),  # of 12, and an error of 10
-        ([90.0, 120.0, 120.0, 120.0], [None, None, None, "accepted"]),  # 12.5, and 13.0 * sqrt(675 / 4 * 3 / 4) = 11.25
-        ([110.0, 95.0, 105.0, 100.0, 105.0, 97.0], [None] * (MOST_PROOFS - 1) + ["tied"]),  # 2 in the end, and 4.2
+        ([102.0, 122.0], [None, None]),  # a gain of 12, and 1.5 errors of 10
+        ([106.0, 118.0], [None, "accepted"]),  # of 12, and 1.5 errors of 6
+        ([96.0, 120.0, 120.0, 120.0], [None, None, None, "accepted"]),  # 14, and 1.5 sqrt(432 / 4 * 3 / 4) = 13.5
+        ([110.0, 95.0, 105.0, 100.0, 105.0, 97.0], [None] * (MOST_PROOFS - 1) + ["tied"]),  # 2 in the end, and 1.5 errors of 4.2
     ],
 )
 def test_a_gain_must_pass_its_standard_error_and_the_candidate_plays_on_until_it_does(candidate, verdicts):
@@ -132,8 +142,17 @@ def test_a_gain_must_pass_its_standard_error_and_the_candidate_plays_on_until_it
     n = len(candidate)
     mean = sum(candidate) / n
     error = (sum((one - mean) ** 2 for one in candidate) / n * (1 / n + 1 / N_PROOFS)) ** 0.5
-    assert (mean - 100.0 > error) == (verdicts[-1] == "accepted")
+    assert (mean - 100.0 > STANDARD_ERRORS * error) == (verdicts[-1] == "accepted")
     assert tried(100.0, candidate) == verdicts
+
+
+def test_of_short_episodes_a_candidate_may_play_as_many_as_it_takes():
+    """Successes of 0 or 1, two fifths against one: 35 episodes tell the two apart by the errors asked for, ten do not."""
+    length = MOST_PROOF_STEPS // 40
+    for n_needed, paid in ((35, [0.0, 0.0, 1.0, 0.0, 1.0] * 7), (40, [0.0, 1.0, 0.0, 0.0] * 10)):
+        trials = Trials(1, habit_returns=[0.0, 0.0, 1.0, 0.0, 0.0] * 4, tests_habit=False)
+        verdicts = [play_quiet(trials, one, length)[1] for one in paid[:n_needed]]
+        assert verdicts == [None] * (n_needed - 1) + ["accepted" if n_needed == 35 else "tied"]
 
 
 def test_the_spread_of_the_habits_own_returns_counts_too():
@@ -432,6 +451,7 @@ def test_random_actions_prove_nothing():
 def test_a_run_stopped_between_verdicts_is_the_run_never_stopped(n_envs, tmp_path, monkeypatch):
     monkeypatch.setattr(habit_module, "PROOF_STEPS", 1)  # every few episodes a verdict
     monkeypatch.setattr(habit_module, "MOST_PROOFS", 2)
+    monkeypatch.setattr(habit_module, "MOST_PROOF_STEPS", 1)
 
     def make_agent():
         return imitating(DummyVecEnv([CountingEnv] * n_envs), {"memory_history": 3}, buffer_size=200)
