@@ -134,7 +134,7 @@ def test_a_great_loss_that_may_be_chance_is_not_held_against_a_candidate_at_once
         ([102.0, 122.0], [None, None]),  # a gain of 12, and 1.5 errors of 10
         ([106.0, 118.0], [None, "accepted"]),  # of 12, and 1.5 errors of 6
         ([96.0, 120.0, 120.0, 120.0], [None, None, None, "accepted"]),  # 14, and 1.5 sqrt(432 / 4 * 3 / 4) = 13.5
-        ([110.0, 95.0, 105.0, 100.0, 105.0, 97.0], [None] * (MOST_PROOFS - 1) + ["tied"]),  # 2 in the end, and 1.5 errors of 4.2
+        ([110.0, 95.0, 105.0, 100.0, 105.0, 97.0], [None] * (MOST_PROOFS - 1) + ["tied"]),  # 2 in the end; 1.5 errors of 4.2
     ],
 )
 def test_a_gain_must_pass_its_standard_error_and_the_candidate_plays_on_until_it_does(candidate, verdicts):
