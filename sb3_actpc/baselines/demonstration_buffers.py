@@ -73,7 +73,8 @@ class WithDemonstrations(ReplayBuffer):
         if demonstrations is not None:
             skipped = {"n_envs", "optimize_memory_usage", *self._own_keywords}
             kwargs = {key: value for key, value in kwargs.items() if key not in skipped}
-            self.demonstrated = self._demonstrated_class(len(demonstrations), *args[1:], n_envs=1, **kwargs)
+            kind: Any = self._demonstrated_class
+            self.demonstrated = kind(len(demonstrations), *args[1:], n_envs=1, **kwargs)
             assert isinstance(self.action_space, spaces.Box)
             fill_with_demonstrations(self.demonstrated, demonstrations, self.observation_space, self.action_space)
 

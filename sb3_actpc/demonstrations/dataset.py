@@ -343,7 +343,8 @@ class Demonstrations:
             with gym.make(self.env_id) as made:
                 return self.to_minari(dataset_id, made, **options)
         sizes = self.observations.shape[1], self.actions.shape[1]
-        observation_space, action_space = (spaces.Box(-np.inf, np.inf, (size,), np.float32) for size in sizes)
+        boxes: list[spaces.Space[Any]] = [spaces.Box(-np.inf, np.inf, (size,), np.float32) for size in sizes]
+        observation_space, action_space = boxes
         if env is not None:
             observation_space, action_space = env.observation_space, env.action_space
             self.check(observation_space, action_space, None if env.spec is None else env.spec.id)

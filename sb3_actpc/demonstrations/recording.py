@@ -69,8 +69,9 @@ def record_episodes(
             f"only {len(episodes)} of {n_tries} episodes succeeded in {env_name(env)}, {n_episodes} are needed: take a better "
             "demonstrator (train it longer: --steps), allow more tries (--max-tries), or ask for fewer episodes (--episodes)"
         )
-    simulators = {name: installed_version(name) for name in ("gymnasium", "mujoco", "robosuite") if name in sys.modules}
-    return episodes, {"seed": seed, "n_tries": n_tries, "deterministic": deterministic, **simulators}
+    made_by: dict[str, Any] = {"seed": seed, "n_tries": n_tries, "deterministic": deterministic}
+    simulators = [name for name in ("gymnasium", "mujoco", "robosuite") if name in sys.modules]
+    return episodes, made_by | {name: installed_version(name) for name in simulators}
 
 
 def env_name(env: gym.Env[Any, Any]) -> str:

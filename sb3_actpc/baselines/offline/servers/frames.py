@@ -34,7 +34,7 @@ def pack(values: Values, arrays: Arrays) -> bytes:
         if array.dtype.hasobject:
             raise ValueError(f"array {name!r} has the type {array.dtype}, which no message holds")
     message = io.BytesIO()
-    np.savez(message, **{VALUES: np.frombuffer(json.dumps(values).encode(), np.uint8)}, **arrays)  # type: ignore[arg-type]
+    np.savez(message, **{VALUES: np.frombuffer(json.dumps(values).encode(), np.uint8)}, **arrays)
     return message.getvalue()
 
 
