@@ -8,7 +8,6 @@ packages pin other versions than this one. Demonstrations go in and actions come
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -102,9 +101,8 @@ class ServedAlgorithm(OfflineAlgorithm):
                 f"learning_rate={options['learning_rate']!r} has no effect on {type(self).__name__}: each of its networks has "
                 f"a rate of its own, set them in method_kwargs ({self.rates})"
             )
-        self.method_kwargs = _plain(method_kwargs or {})
         try:
-            json.dumps(self.method_kwargs)
+            self.method_kwargs = json.loads(json.dumps(method_kwargs or {}))
         except TypeError as error:
             raise ValueError(f"method_kwargs={method_kwargs!r} must hold plain values alone: {error}") from None
         self.timeout = timeout
@@ -235,11 +233,6 @@ class ServedAlgorithm(OfflineAlgorithm):
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return [], ["trained", "normalization"]
-
-
-def _plain(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Mappings within mappings as dictionaries, which JSON can hold."""
-    return {key: _plain(value) if isinstance(value, Mapping) else value for key, value in settings.items()}
 
 
 class BCQ(ServedAlgorithm):
