@@ -127,13 +127,8 @@ class DemonstrationHerReplayBuffer(WithDemonstrations, HerReplayBuffer):
 def demonstration_buffer_class(
     given: type[ReplayBuffer] | str | None, observation_space: spaces.Space, n_steps: int = 1
 ) -> type[WithDemonstrations]:
-    """
-    :param given: a class of SB3's or of this module, its name, or None
-    :param observation_space: Dict or not
-    :param n_steps: length of n-step returns
-    :return: the class of this module that does what ``given`` does
-    :raises ValueError: for another class, or n-step returns with Dict observations
-    """
+    """The class of this module that does what a class of SB3's, or its name, does; ValueError for another class, or n-step
+    returns with Dict observations."""
     is_dict = isinstance(observation_space, spaces.Dict)
     if n_steps > 1 and (is_dict or given is not None):
         raise ValueError(f"n_steps={n_steps} works with vector observations and replay_buffer_class=None alone; use n_steps=1")

@@ -104,10 +104,8 @@ class PrioritizedHerReplayBuffer(HerReplayBuffer):
         self._tree[np.concatenate([first, first + 1])] = priority
 
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> DictReplayBufferSamples:  # type: ignore[override]
-        """
-        :param batch_size: B
-        :param env: VecNormalize whose statistics normalise observations and rewards
-        :return: B transitions, those with their own goals first; ``importance_weights`` then holds their weights, (B, 1)
+        """B transitions, those with their own goals first; ``importance_weights`` then holds their weights, (B, 1).
+
         :raises RuntimeError: before the end of the first episode
         """
         if not self._tree.total:

@@ -66,10 +66,8 @@ class Encoder:
         self._open: set[int] = set()
 
     def encode(self, value: Any, where: str) -> Any:
-        """
-        :param value: what to store
-        :param where: its path, for the message and for the names of arrays
-        :return: JSON
+        """JSON of a value; its path names the arrays in it.
+
         :raises OpaqueValue: when it, or something in it, is of another kind or contains itself
         """
         if value is None or isinstance(value, (bool, str)) or type(value) is int:
@@ -138,10 +136,9 @@ class Decoder:
         self.arrays, self.tensors = arrays, tensors
 
     def decode(self, node: Any, existing: Any = None) -> Any:
-        """
-        :param node: JSON that :meth:`Encoder.encode` returned
-        :param existing: the value that is there now; generators, spaces and objects are changed in place
-        :return: the value, new where it could be made new
+        """The value of JSON that :meth:`Encoder.encode` returned, new where it can be; of ``existing``, the value that is
+        there now, generators, spaces and objects are changed in place.
+
         :raises ValueError: when the JSON is of another form, or the existing value of another kind
         """
         if not isinstance(node, (dict, list)):

@@ -17,12 +17,8 @@ TIMEOUT_SECONDS = 30.0
 
 
 def robomimic_url(env_id: str, kind: str = "mh") -> str:
-    """
-    :param env_id: ``SparseLift-v0`` or ``SparsePickPlaceCan-v0``
-    :param kind: key of ``KINDS``
-    :return: address of the file of low-dimensional observations (MIT licence; 30 to 130 MB)
-    :raises ValueError: when an argument is not allowed
-    """
+    """Address of a file of low-dimensional observations of a robosuite task and a key of ``KINDS`` (MIT licence; 30 to 130
+    MB)."""
     folder = {"Lift": "lift", "PickPlaceCan": "can"}[robosuite_task(env_id).name]
     if kind not in KINDS:
         raise ValueError(f"kind={kind!r} is not one of {', '.join(KINDS)}: choose one of these")

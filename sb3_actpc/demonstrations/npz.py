@@ -24,15 +24,9 @@ _NEXT = ("next_observation_indices", "next_observation_rows")
 
 
 def write_npz(path: str | os.PathLike[str], fields: Mapping[str, Any]) -> None:
-    """Write a file, all at once or not at all.
-
-    A next observation is stored only where it is not, bit for bit, the following row of ``observations`` of the same
-    episode, so that the file holds the observations about once.
-
-    :param path: file to write (exactly this name)
-    :param fields: the fields of a ``Demonstrations``
-    :raises OSError: when it cannot be written; an old file at ``path`` then stays as it was
-    """
+    """Write the fields of a ``Demonstrations``, all at once or not at all. A next observation is stored only where it is
+    not, bit for bit, the following row of ``observations`` of the same episode, so that the file holds the observations
+    about once."""
     next_observations, dense_rewards = fields["next_observations"], fields["dense_rewards"]
     indices = unchained_indices(fields["observations"], next_observations, fields["episode_starts"])
     arrays = {
@@ -48,11 +42,8 @@ def write_npz(path: str | os.PathLike[str], fields: Mapping[str, Any]) -> None:
 
 
 def read_npz(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """Read a file written by :func:`write_npz`; never unpickles.
+    """The fields of a ``Demonstrations``, bit for bit as :func:`write_npz` wrote them; never unpickles.
 
-    :param path: the file
-    :return: the fields of a ``Demonstrations``, bit for bit as saved
-    :raises FileNotFoundError: when there is no such file
     :raises ValueError: when the file is empty, cut short, damaged, lacks an entry, holds one of a wrong type, or has a newer
         format; the message names the file and the entry
     """

@@ -82,14 +82,7 @@ def env_name(env: gym.Env[Any, Any]) -> str:
 def trajectory_columns(
     trajectory: Any, observation_space: spaces.Space[Any] | None = None, final_reward: float | None = None
 ) -> Columns:
-    """
-    :param trajectory: an object with ``obs`` (n + 1 rows), ``acts`` (n rows), ``terminal``, and perhaps ``infos`` and
-        ``rews``, as the ``imitation`` library's are
-    :param observation_space: needed for dict observations
-    :param final_reward: what its last step is paid, and all others 0, where it has no ``rews``
-    :return: its columns
-    :raises ValueError: when something needed is missing
-    """
+    """The columns of a trajectory, see ``Demonstrations.from_trajectories``; ValueError when something needed is missing."""
     observations = trajectory.obs.unwrap() if hasattr(trajectory.obs, "unwrap") else trajectory.obs
     if isinstance(observations, Mapping) and observation_space is None:
         raise ValueError("trajectories with dict observations need observation_space: give the environment's")

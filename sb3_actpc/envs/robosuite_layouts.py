@@ -94,15 +94,9 @@ class RobosuiteTask:
         return np.concatenate([relative_positions, relative_quats, positions, quats], axis=1)
 
     def is_success(self, object_states: np.ndarray, eef_positions: np.ndarray) -> np.ndarray:
-        """robosuite's success, from observed quantities.
-
-        Lift: the cube's centre is more than 4 cm above the table. Can: the can lies in its quarter of the right-hand bin
-        and the gripper is off it.
-
-        :param object_states: (N, object_dim)
-        :param eef_positions: (N, 3) of the gripper
-        :return: (N,) bool
-        """
+        """robosuite's success, (N,) bool, from observed states of the object (N, object_dim) and positions of the gripper
+        (N, 3). Lift: the cube's centre is more than 4 cm above the table. Can: the can lies in its quarter of the right-
+        hand bin and the gripper is off it."""
         positions = object_states[:, self.object_columns()["pos"]]
         if self.name == "Lift":
             return positions[:, 2] > TABLE_HEIGHT + 0.04

@@ -123,12 +123,8 @@ class SparseRobosuiteEnv(gym.Env[np.ndarray, np.ndarray], utils.EzPickle):
         return observation, float(is_success), is_success, is_truncated, info
 
     def observe_state(self, state: np.ndarray) -> np.ndarray:
-        """Put the simulation into a recorded state and observe it.
-
-        :param state: (1 + n_positions + n_velocities,): time, joint positions, joint velocities, as robosuite records them
-        :return: observation (obs_dim,)
-        :raises ValueError: when the state is of another size, so of another task
-        """
+        """Put the simulation into a recorded state (time, joint positions, joint velocities, as robosuite records them) and
+        observe it; ValueError when the state is of another size, so of another task."""
         size = 1 + self.model.nq + self.model.nv
         if np.shape(state) != (size,):
             raise ValueError(f"a state of {self.env_id} has {size} numbers, found shape {np.shape(state)}: use its own states")
@@ -265,15 +261,9 @@ class SparsePickPlaceCanEnv(SparseRobosuiteEnv):
 
 
 def make_simulation(name: str, **kwargs: Any) -> Any:
-    """A robosuite environment of the Panda with soft resets, shaped rewards and neither renderer nor time limit.
-
-    robosuite's own observations are off, unless ``use_object_obs`` is asked for: ours are read from the simulation.
-
-    :param name: ``"Lift"`` or ``"PickPlaceCan"``
-    :param kwargs: robosuite's keywords, in the place of ours
-    :return: the robosuite environment
-    :raises ImportError: when robosuite is not installed; the message says how to install it
-    """
+    """A robosuite environment of the Panda with soft resets, shaped rewards and neither renderer nor time limit; ``name``
+    is robosuite's, ``kwargs`` are its keywords, in the place of ours. robosuite's own observations are off, unless
+    ``use_object_obs`` is asked for: ours are read from the simulation."""
     with _quiet_import():
         robosuite = import_extra("robosuite", "robosuite")
         settings = dict(

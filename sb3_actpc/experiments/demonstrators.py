@@ -30,12 +30,7 @@ EARLIER = 0.5  # share of the return at which the weaker half of a mixed set sto
 
 @dataclass(frozen=True)
 class Demonstrator:
-    """A trained agent.
-
-    :param policy: has SB3's ``predict``, for raw observations
-    :param n_steps: environment steps it was trained for
-    :param mean_return: mean dense return of its deterministic policy
-    """
+    """A trained agent: its policy has SB3's ``predict``, for raw observations; its mean dense return is without noise."""
 
     policy: Predictor
     n_steps: int
@@ -131,18 +126,8 @@ def record_demonstrators(
     metadata: dict[str, Any] | None = None,
     **options: Any,
 ) -> Demonstrations:
-    """Record demonstrators, who take turns, in the task itself.
-
-    :param demonstrators: at least one
-    :param env_id: Gymnasium id of the task
-    :param n_episodes: successful episodes wanted
-    :param stochastic: sample the actions instead of taking the most likely ones
-    :param seed: of the sampling and of the episodes
-    :param metadata: JSON values to keep with the demonstrations
-    :param options: further ones of :func:`~sb3_actpc.demonstrations.recording.record_episodes`
-    :return: the demonstrations
-    :raises ValueError: if too few of the tries succeed, or ``n_episodes`` is below 1
-    """
+    """Record demonstrators, who take turns, in the task itself, see ``Demonstrations.record``; ``stochastic`` samples the
+    actions instead of taking the most likely ones."""
     set_random_seed(seed)
     steps, returns = [one.n_steps for one in demonstrators], [one.mean_return for one in demonstrators]
     kept = {"demonstrator_steps": steps, "demonstrator_returns": returns, **(metadata or {})}

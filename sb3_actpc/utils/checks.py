@@ -92,12 +92,8 @@ def named_in_errors(what: str, *passed_on: type[Exception]) -> Iterator[None]:
 
 
 def check_device(device: Any) -> None:
-    """
-    Warns where SB3 will silently take the CPU: for a CUDA device on a machine without one.
-
-    :param device: what the user passed
-    :raises ValueError: when it is no torch device, or one that this machine cannot compute on
-    """
+    """ValueError when it is no torch device, or one that this machine cannot compute on. Warns where SB3 will silently take
+    the CPU: for a CUDA device on a machine without one."""
     try:
         if not isinstance(device, (str, th.device)):
             raise RuntimeError(f"found a {type(device).__name__}")

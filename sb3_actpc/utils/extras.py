@@ -5,11 +5,8 @@ from typing import Any
 
 
 def import_extra(module: str, extra: str) -> Any:
-    """Import a module of an extra.
+    """Import a module that an extra of this package installs.
 
-    :param module: its name
-    :param extra: of this package, which installs it
-    :return: the module
     :raises ImportError: when it, or something that it needs, is not installed; the message says how to install it
     """
     try:

@@ -57,16 +57,11 @@ def environment_python(name: str, folder: Path | None = None) -> Path:
 
 
 def install(name: str, folder: Path | None = None, report: Callable[[str], None] = lambda line: None) -> Path:
-    """
-    Make the environment of a package; one that is there and whole stays as it is, any other is made anew.
+    """Make the environment of a package; one that is there and whole stays as it is, any other is made anew, under another
+    name, and renamed when everything in it runs, so that a stopped command leaves no half of one.
 
-    It is made under another name and renamed when everything in it runs, so that a stopped command leaves no half of one.
-
-    :param name: key of ``RECIPES``
-    :param folder: where to make it, by default :func:`environments_folder`
-    :param report: given a line of text before each step
     :return: the environment's folder
-    :raises ValueError: when there is no such name, or Python is too new
+    :raises ValueError: when there is no such name
     :raises OSError: when a step fails (no network, a full disk); the message is the last thing that it said
     """
     if name not in RECIPES:

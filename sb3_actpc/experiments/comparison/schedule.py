@@ -57,17 +57,11 @@ def run_comparison(
     display: Display,
     retry_failed: bool = False,
 ) -> Summary:
-    """Bring every run of a table to its end that is not there yet.
+    """Bring every run of a table to its end that is not there yet. Stopped at any moment and called again, it loses no
+    finished run, repeats none, and goes on with the others from their last checkpoint.
 
-    Stopped at any moment and called again, it loses no finished run, repeats none, and goes on with the others from their last
-    checkpoint.
-
-    :param runs: the table
-    :param folder: of the comparison; one process at a time works in it
     :param make_engine: makes what executes the runs; not called when there is nothing to do
-    :param display: shows how it goes on
     :param retry_failed: also try those again that failed before
-    :return: what became of the runs
     :raises FolderBusy: when another process works in the folder
     :raises OSError: when the folder cannot be written
     """

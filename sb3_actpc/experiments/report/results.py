@@ -78,12 +78,7 @@ def read_rows(path: Path) -> pd.DataFrame:
 
 
 def load_results(folder: Path) -> Results:
-    """
-    :param folder: of a comparison, or of an export
-    :return: its runs, begun and finished
-    :raises FileNotFoundError: when there is none
-    :raises OSError: when one cannot be read
-    """
+    """The runs, begun and finished, in the folder of a comparison or of an export; FileNotFoundError when there is none."""
     if (folder / CURVES).is_file():
         runs = pd.read_csv(folder / RUNS, index_col="run", dtype=dict.fromkeys(_TEXTS, str))  # else 12e4567890 is a number
         runs[_TEXTS] = runs[_TEXTS].fillna("")

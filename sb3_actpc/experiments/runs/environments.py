@@ -35,19 +35,11 @@ def make_eval_envs(env_id: str, env_kwargs: Mapping[str, Any], n_episodes: int) 
 def make_train_env(
     env_id: str, env_kwargs: Mapping[str, Any], n_envs: int, seed: int, normalize: Mapping[str, Any] | None = None
 ) -> VecEnv:
-    """The environment that an agent learns in: SB3's ``Monitor`` and ``DummyVecEnv``.
+    """The environment that an agent learns in: SB3's ``Monitor`` and ``DummyVecEnv``, and where asked for ``VecNormalize``.
+    The seed is the first's; the others have those that follow.
 
-    Several of robosuite's are put into processes of their own (``SubprocVecEnv``): a step there takes longer than an update,
-    one of a MuJoCo task less than the way to another process.
-
-    :param env_id: Gymnasium id
-    :param env_kwargs: its keywords
-    :param n_envs: how many side by side
-    :param seed: the first's; the others have those that follow
-    :param normalize: keywords of SB3's ``VecNormalize`` around it, or None for none
-    :return: the environment
-    :raises gymnasium.error.Error: when the id is unknown
-    :raises ValueError: when it does not take the keywords
+    Several of robosuite's are put into processes of their own (``SubprocVecEnv``): a step there takes longer than an
+    update, one of a MuJoCo task less than the way to another process.
     """
     from sb3_actpc.envs import ROBOSUITE_IDS
 

@@ -24,12 +24,7 @@ Handler = Callable[[Values, Arrays], tuple[Values, Arrays]]
 
 
 def pack(values: Values, arrays: Arrays) -> bytes:
-    """
-    :param values: what JSON can hold
-    :param arrays: of numbers
-    :return: the message
-    :raises ValueError: for arrays of objects
-    """
+    """What JSON can hold, and arrays of numbers, as one message; ValueError for arrays of objects."""
     for name, array in arrays.items():
         if array.dtype.hasobject:
             raise ValueError(f"array {name!r} has the type {array.dtype}, which no message holds")
@@ -39,11 +34,7 @@ def pack(values: Values, arrays: Arrays) -> bytes:
 
 
 def unpack(message: bytes) -> tuple[Values, Arrays]:
-    """
-    :param message: what :func:`pack` returned
-    :return: its values and arrays
-    :raises ValueError: when it is no such message
-    """
+    """Values and arrays of what :func:`pack` returned; ValueError when it is no such message."""
     try:
         with np.load(io.BytesIO(message), allow_pickle=False) as stored:
             arrays = dict(stored)
@@ -53,13 +44,9 @@ def unpack(message: bytes) -> tuple[Values, Arrays]:
 
 
 def serve(handlers: dict[str, Handler]) -> int:
-    """Answer the questions of the pipe whose number is the last argument of this program, until it is closed.
-
-    An exception is the answer ``{"error": ...}`` and ends the program.
-
-    :param handlers: what to do, by the ``ask`` of a question; given its values and arrays, returns those of the answer
-    :return: exit code
-    """
+    """Answer the questions of the pipe whose number is the last argument of this program, until it is closed: the exit
+    code. A handler, by the ``ask`` of a question, is given its values and arrays and returns those of the answer. An
+    exception is the answer ``{"error": ...}`` and ends the program."""
     channel = Connection(int(sys.argv[-1]))
     with suppress(EOFError, ConnectionError):  # the other side has ended
         while True:

@@ -11,12 +11,7 @@ from sb3_actpc.experiments.runs import Run
 
 @dataclass(frozen=True)
 class Event:
-    """News of a run: how far it is, or, where there is an outcome, that it has ended.
-
-    :param run_id: which
-    :param steps: environment steps done so far
-    :param outcome: what came of it
-    """
+    """News of a run: how many steps it has done, or, where there is an outcome, that it has ended."""
 
     run_id: str
     steps: int | None = None
