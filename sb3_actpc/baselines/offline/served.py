@@ -236,22 +236,25 @@ class ServedAlgorithm(OfflineAlgorithm):
 
 
 class BCQ(ServedAlgorithm):
-    """Batch-constrained Q-learning (Fujimoto et al., arXiv 1812.02900) by d3rlpy, as it is there; ``method_kwargs`` are
-    those of d3rlpy's ``BCQConfig``, and ``net_arch``, the hidden sizes of all networks."""
+    """Batch-constrained Q-learning (Fujimoto et al., arXiv 1812.02900) by d3rlpy, as it is there.
+
+    ``method_kwargs`` are those of d3rlpy's ``BCQConfig``, and ``net_arch``, the hidden sizes of all networks.
+    """
 
     package, method, rates = "d3rlpy", "bcq", D3RLPY_RATES
 
 
 class CQL(ServedAlgorithm):
-    """Conservative Q-learning (Kumar et al., arXiv 2006.04779) by d3rlpy, as it is there; ``method_kwargs`` are those of
-    d3rlpy's ``CQLConfig``, and ``net_arch``, the hidden sizes of all networks."""
+    """Conservative Q-learning (Kumar et al., arXiv 2006.04779) by d3rlpy, as it is there.
+
+    ``method_kwargs`` are those of d3rlpy's ``CQLConfig``, and ``net_arch``, the hidden sizes of all networks.
+    """
 
     package, method, rates = "d3rlpy", "cql", D3RLPY_RATES
 
 
 class HBC(ServedAlgorithm):
-    """Hierarchical behaviour cloning (Mandlekar et al., arXiv 2003.06085) by robomimic: a planner of subgoals, a recurrent
-    actor.
+    """Hierarchical behaviour cloning (Mandlekar et al., arXiv 2003.06085) by robomimic: subgoals, and an actor that follows.
 
     Difference from robomimic's runs: the observation is one key, not one for each of robosuite's parts. ``method_kwargs``
     are what is to change in the ``algo`` part of robomimic's config.
@@ -261,7 +264,9 @@ class HBC(ServedAlgorithm):
 
 
 class IRIS(ServedAlgorithm):
-    """Implicit reinforcement without interaction at scale (Mandlekar et al., arXiv 1911.05321) by robomimic: :class:`HBC`
-    with a value function (BCQ) that chooses among sampled subgoals."""
+    """Implicit reinforcement without interaction at scale (Mandlekar et al., arXiv 1911.05321) by robomimic.
+
+    :class:`HBC` with a value function (BCQ) that chooses among sampled subgoals.
+    """
 
     package, method, rates = "robomimic", "iris", ROBOMIMIC_RATES
