@@ -356,12 +356,24 @@ MUTANTS = [
     Mutant("the habit is not copied", AGENT, "_copy(self.policy.candidate, self.actor.habit)", "pass", f"{HABIT} -k predict"),
     Mutant("the learning actor acts", POLICIES, "self.circuit if self.habit is None", "self.circuit if True", HABIT),
     Mutant("one proof is enough", TRIALS, "elif n < N_PROOFS", "elif n < 1", HABIT),
-    Mutant("a tie is a proof", TRIALS, "gain >= max(SMALLEST_GAIN * unit, error)", "gain >= error", HABIT),
-    Mutant("chance is a proof", TRIALS, "gain >= max(SMALLEST_GAIN * unit, error)", "gain >= SMALLEST_GAIN * unit", HABIT),
+    Mutant("a tie is a proof", TRIALS, "gain >= max(SMALLEST_GAIN * unit, enough * error)", "gain >= enough * error", HABIT),
     Mutant(
-        "chance is held against a candidate", TRIALS, "gain + error < -GREAT_LOSS", "gain < -GREAT_LOSS", f"{HABIT} -k chance"
+        "chance is a proof", TRIALS, "gain >= max(SMALLEST_GAIN * unit, enough * error)", "gain >= SMALLEST_GAIN * unit", HABIT
     ),
-    Mutant("a candidate plays on for ever", TRIALS, " and not is_known", "", f"{HABIT} -k plays_on"),
+    Mutant(
+        "chance is held against a candidate",
+        TRIALS,
+        "gain + SURE * error < -GREAT_LOSS",
+        "gain < -GREAT_LOSS",
+        f"{HABIT} -k chance",
+    ),
+    Mutant(
+        "a candidate plays on for ever",
+        TRIALS,
+        "LIKELY if self.candidate_steps >= MOST_PROOF_STEPS else SURE",
+        "SURE",
+        f"{HABIT} -k plays_on",
+    ),
     Mutant("candidates before anything is learned", TRIALS, "not has_learned or len", "len", f"{HABIT} -k before"),
     Mutant(
         "the spread of the habit does not count",
@@ -532,9 +544,7 @@ MUTANTS = [
         "is_far = bool(self.data.qpos[0] > self.distance)",
         f"{TASKS} -k displacement",
     ),
-    Mutant(
-        "the HalfCheetah's threshold", SPARSE, '"HalfCheetah": 20.0', '"HalfCheetah": 19.0', f"{TASKS} -k displacement"
-    ),
+    Mutant("the HalfCheetah's threshold", SPARSE, '"HalfCheetah": 20.0', '"HalfCheetah": 19.0', f"{TASKS} -k displacement"),
     Mutant(
         "the Reacher's threshold",
         SPARSE,

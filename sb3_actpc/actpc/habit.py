@@ -13,12 +13,11 @@ from typing import Any, Literal
 Role = Literal["actor", "candidate", "habit"]
 Verdict = Literal["accepted", "tied", "rejected"]
 
-# episodes of a candidate before it is accepted, and until when it may be; environment steps, of which as many must have passed
-N_PROOFS, MOST_PROOFS = 2, 6
-PROOF_STEPS, MOST_PROOF_STEPS = 500, 2000
+N_PROOFS = 2  # episodes of a candidate at least, before it is accepted
+PROOF_STEPS, MOST_PROOF_STEPS = 500, 2000  # environment steps of a candidate before it is judged, and that it has for a proof
 ENOUGH_PROOFS = 10  # episodes after which a candidate is judged however short they were
 HABIT_PROOFS, KEPT_RETURNS = 5, 20  # episodes of the habit that are asked for between candidates, and kept
-STANDARD_ERRORS = 1.5  # that a gain must pass
+SURE, LIKELY = 1.5, 0.5  # standard errors that a gain must pass: at any time, and after ``MOST_PROOF_STEPS``
 # shares of the habit's mean return: what counts as a gain or a loss, and with what loss a candidate is rejected at once
 SMALLEST_GAIN, GREAT_LOSS = 0.01, 0.2
 
@@ -29,8 +28,8 @@ class Trials:
     Who plays which episode, and what follows from its return. Holds no circuits: the agent copies them as it is told.
 
     Episodes alternate: with exploration noise by the learning actor, without by the habit or a candidate. A gain must pass a
-    share of the habit's absolute mean return and ``STANDARD_ERRORS`` of its own, from the variance that candidate and habit
-    have in common; while it only passes the first, the candidate plays on.
+    share of the habit's absolute mean return and ``SURE`` of its own standard errors, from the variance that candidate and
+    habit have in common. While it only passes the first, the candidate plays on; when it has had its steps, ``LIKELY`` does.
 
     :param n_envs: environments, each with an episode of its own
     """
@@ -101,18 +100,18 @@ class Trials:
     def _judge(self) -> Verdict | None:
         own, n = self.candidate_returns, len(self.candidate_returns)
         gain, unit = fmean(own) - self.habit_return, abs(self.habit_return)
-        error = STANDARD_ERRORS * self._standard_error()
-        great_loss = gain + error < -GREAT_LOSS * unit
+        error = self._standard_error()
+        great_loss = gain + SURE * error < -GREAT_LOSS * unit
         is_tried = n >= ENOUGH_PROOFS or self.candidate_steps >= PROOF_STEPS
-        is_known = n >= MOST_PROOFS and self.candidate_steps >= MOST_PROOF_STEPS
+        enough = LIKELY if self.candidate_steps >= MOST_PROOF_STEPS else SURE
         if not is_tried and not (n >= N_PROOFS and great_loss):
             return None
         verdict: Verdict = "tied"
         if great_loss or (n >= N_PROOFS and gain < -SMALLEST_GAIN * unit):
             verdict = "rejected"
-        elif n < N_PROOFS or (error > gain >= SMALLEST_GAIN * unit and not is_known):
+        elif n < N_PROOFS or (enough == SURE and SURE * error > gain >= SMALLEST_GAIN * unit):
             return None
-        elif gain > 0.0 and gain >= max(SMALLEST_GAIN * unit, error):
+        elif gain > 0.0 and gain >= max(SMALLEST_GAIN * unit, enough * error):
             verdict, self.habit_returns = "accepted", own[-KEPT_RETURNS:]
         self.tests_habit = verdict != "accepted" and len(self.habit_returns) < HABIT_PROOFS
         self.candidate_returns, self.candidate_steps = [], 0

@@ -18,11 +18,11 @@ from sb3_actpc.actpc.habit import (
     ENOUGH_PROOFS,
     HABIT_PROOFS,
     KEPT_RETURNS,
+    LIKELY,
     MOST_PROOF_STEPS,
-    MOST_PROOFS,
     N_PROOFS,
     PROOF_STEPS,
-    STANDARD_ERRORS,
+    SURE,
     Trials,
 )
 from sb3_actpc.actpc.trust_region import RADIUS_FACTORS
@@ -133,8 +133,8 @@ def test_a_great_loss_that_may_be_chance_is_not_held_against_a_candidate_at_once
     [
         ([102.0, 122.0], [None, None]),  # a gain of 12, and 1.5 errors of 10
         ([106.0, 118.0], [None, "accepted"]),  # of 12, and 1.5 errors of 6
-        ([96.0, 120.0, 120.0, 120.0], [None, None, None, "accepted"]),  # 14, and 1.5 sqrt(432 / 4 * 3 / 4) = 13.5
-        ([110.0, 95.0, 105.0, 100.0, 105.0, 97.0], [None] * (MOST_PROOFS - 1) + ["tied"]),  # 2 in the end; 1.5 errors of 4.2
+        ([90.0, 120.0, 110.0, 110.0], [None, None, None, "accepted"]),  # 7.5, and half of sqrt(475 / 4 * 3 / 4) = 9.4
+        ([120.0, 85.0, 115.0, 90.0], [None, None, None, "tied"]),  # 2.5, and half of 13.2
     ],
 )
 def test_a_gain_must_pass_its_standard_error_and_the_candidate_plays_on_until_it_does(candidate, verdicts):
@@ -142,7 +142,8 @@ def test_a_gain_must_pass_its_standard_error_and_the_candidate_plays_on_until_it
     n = len(candidate)
     mean = sum(candidate) / n
     error = (sum((one - mean) ** 2 for one in candidate) / n * (1 / n + 1 / N_PROOFS)) ** 0.5
-    assert (mean - 100.0 > STANDARD_ERRORS * error) == (verdicts[-1] == "accepted")
+    enough = LIKELY if n * PROOF_STEPS >= MOST_PROOF_STEPS else SURE
+    assert (mean - 100.0 > enough * error) == (verdicts[-1] == "accepted")
     assert tried(100.0, candidate) == verdicts
 
 
@@ -450,7 +451,6 @@ def test_random_actions_prove_nothing():
 @pytest.mark.parametrize("n_envs", [1, 2])
 def test_a_run_stopped_between_verdicts_is_the_run_never_stopped(n_envs, tmp_path, monkeypatch):
     monkeypatch.setattr(habit_module, "PROOF_STEPS", 1)  # every few episodes a verdict
-    monkeypatch.setattr(habit_module, "MOST_PROOFS", 2)
     monkeypatch.setattr(habit_module, "MOST_PROOF_STEPS", 1)
 
     def make_agent():
