@@ -6,15 +6,17 @@ import pytest
 import torch as th
 from stable_baselines3.common.env_checker import check_env
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
-from sb3_actpc import ActPC, shipped_demonstrations
+from sb3_actpc import ActPC, preset, shipped_demonstrations
 from sb3_actpc.actpc.buffers import CombinedDictReplayBuffer, CombinedHerReplayBuffer
 from sb3_actpc.baselines import HER
 from sb3_actpc.baselines.prioritized import PrioritizedHerReplayBuffer, SumTree
-from sb3_actpc.demonstrations import fit_demonstrations
+from sb3_actpc.demonstrations import Demonstrations, fit_demonstrations
 from sb3_actpc.envs import GOAL_MUJOCO_IDS, sparse_env_id
 from sb3_actpc.experiments.runs import Run, train_run
+from sb3_actpc.experiments.runs.environments import make_env
 from tests.checkpoints.runs import assert_same, learn_in_two, learn_straight
 from tests.recordings import record
 
@@ -258,6 +260,24 @@ def test_actpc_and_her_run_on_fetch(tmp_path) -> None:
         options = {"settings": settings, "progress": False, "eval_episodes": 1, "output": str(tmp_path / algo)}
         result = train_run(Run(env="FetchReach-v4", algo=algo, n_timesteps=55, eval_freq=55, checkpoint_freq=0, **options))
         assert result["success_rate"] in (0.0, 1.0) and result["timesteps"] == 55
+
+
+@pytest.mark.slow
+def test_actpc_does_not_fall_below_what_a_slow_arm_shows_of_fetch_reach() -> None:
+    """A critic that has seen the arm's actions alone presses away from the goal."""
+    pytest.importorskip("gymnasium_robotics")
+    env = make_env("FetchReach-v4", {})
+
+    def slowly(observation: dict[str, np.ndarray]) -> np.ndarray:
+        return np.append(np.clip(8.0 * (observation["desired_goal"] - observation["achieved_goal"]), -1.0, 1.0), 0.0)
+
+    shown = Demonstrations.record(slowly, env, n_episodes=40, only_successes=True)
+    settings = {**preset("FetchReach-v4"), "demonstrations": shown, "actor_warm_start": 2000}
+    model = ActPC(env=env, **settings, seed=0, device="cpu").learn(4000)
+    habit, _ = evaluate_policy(model, model.get_env(), 20)
+    model.actor.habit.load_state_dict(model.actor.circuit.state_dict())
+    learning, _ = evaluate_policy(model, model.get_env(), 20)
+    assert min(habit, learning) > shown.episode_returns.mean() - 1.5
 
 
 @pytest.mark.slow

@@ -81,6 +81,7 @@ def test_every_entry_builds_its_agent_which_trains(
     settings = dict(FEWER[algo])
     if algo in ("her", "actpc") and demonstrations == "none":  # nothing to learn from but an episode of its own
         settings["learning_starts"], n_steps = 50, 52
+        settings.pop("actor_warm_start", None)
     run = resolve(Run(env=env_id, algo=algo, preset=preset, demonstrations=demonstrations, settings=settings))
     env = make_train_env(env_id, run.env_kwargs, run.n_envs, 0, run.normalize)
     try:
