@@ -1,5 +1,5 @@
-"""``sb3-actpc bench``: what one update costs, as ratios to SB3's TD3 and to the matrix products alone; with ``--robosuite``,
-the speed of the robosuite tasks as a ratio to robosuite's own loop."""
+"""``sb3-actpc bench``: what one update costs, as ratios to SB3's TD3 and to the matrix products alone; by choice also what a
+step of training or acting costs, and growth with sizes; with ``--robosuite``, robosuite tasks over robosuite's own loop."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ WIDTH = 256
 N_FILLED = 1000
 N_ENV_STEPS = 20
 LEARNED = {"feedback": "learned", "feedback_start": "mirrored"}
-UNITS = {"TD3": "SB3 TD3 train()", "the products": "matrix products of one settling"}
+TD3_UNIT = {"SB3 TD3 train()": "TD3"}  # the entry that others are divided by, and what their ratio is called then
+SETTLING_UNIT = {"matrix products of one settling": "the products"}
 
 
 def add_parser(subparsers: Any) -> None:
@@ -30,6 +31,8 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument("--threads", type=int, default=None, help="torch threads (default: torch's own choice)")
     parser.add_argument("--device", default="cpu", help="torch device")
     parser.add_argument("--compiled", action="store_true", help="also the compiled update (compiling takes minutes)")
+    parser.add_argument("--training", action="store_true", help="also steps of training, and acting (SBX's with sbx-rl)")
+    parser.add_argument("--growth", action="store_true", help="also growth with K, width, batch and number of environments")
     parser.add_argument("--output", type=Path, default=None, help="write the ratios to this JSON file")
     parser.add_argument("--table", type=Path, nargs="+", default=None, help="print written ratios as a Markdown table instead")
     parser.add_argument("--robosuite", action="store_true", help="time the robosuite tasks instead")
@@ -57,23 +60,50 @@ def run(args: argparse.Namespace) -> int:
     if args.robosuite:
         _bench_robosuite(args.rounds)
         return 0
-    entries: dict[str, Callable[[], object]] = {"SB3 TD3 train()": _stepper(_td3(args.device))}
-    for name, keywords in _settings().items():
-        entries[name] = _stepper(_actpc(keywords, args.device))
-    if args.compiled:
-        keywords = {**_settings()["shipped, learned sweep"], "compile": True}
-        entries["shipped, learned sweep, compiled"] = _stepper(_actpc(keywords, args.device))
-    entries |= _settling(args.device)
-    times = _interleave(entries, args.rounds, synchronize=th.cuda.synchronize if args.device != "cpu" else lambda: None)
-    ratios = _ratios(times)
+    ratios = _measured(args)
     print(f"batch {BATCH_SIZE}, hidden [{WIDTH}, {WIDTH}], {args.device}, {th.get_num_threads()} threads; medians of rounds")
     for name, (ratio, unit) in ratios.items():
-        print(f"{name:46s} {ratio:6.2f} x {unit}")
+        print(f"{name:56s} {ratio:6.2f} x {unit}")
     if args.output:
         about = {"device": args.device, "threads": th.get_num_threads(), "rounds": args.rounds, "torch": th.__version__}
         args.output.write_text(json.dumps({**about, "ratios": ratios}, indent=1) + "\n")
     print(f"replay memory over SB3's, per HalfCheetah transition: {_memory_ratio():.2f}")
     return 0
+
+
+def _measured(args: argparse.Namespace) -> dict[str, tuple[float, str]]:
+    """The ratios of all that was asked for; entries that share a unit take turns."""
+    import torch as th
+
+    from sb3_actpc.cli import bench_training
+
+    synchronize = th.cuda.synchronize if args.device != "cpu" else lambda: None
+    groups = [(_updates(args.device, args.compiled), TD3_UNIT), (_settling(args.device), SETTLING_UNIT)]
+    if args.training:
+        groups += [*bench_training.training(args.device), (bench_training.acting(), bench_training.ACTING_UNIT)]
+    if args.growth:
+        groups += bench_training.growth()
+    ratios = {}
+    for entries, units in groups:
+        ratios |= _ratios(_interleave(entries, args.rounds, synchronize), units)
+    return ratios
+
+
+def _updates(device: str, compiled: bool) -> dict[str, Callable[[], object]]:
+    """TD3's, those of :func:`_settings`, and the shipped one with products in bfloat16, where the processor has them."""
+    from sb3_actpc.experiments.runs.presets import with_changes
+    from sb3_actpc.ngc.products import has_bfloat16
+
+    settings, shipped = _settings(), "shipped, learned sweep"
+    low = {"policy_kwargs.circuit_kwargs.matmul_precision": "bfloat16"}
+    if has_bfloat16():
+        settings[f"{shipped}, bfloat16"] = with_changes(settings[shipped], low)
+        settings["paper preset, bfloat16"] = with_changes(settings["paper preset"], low)
+    for name in [name for name in settings if name.startswith(shipped) and compiled]:
+        settings[f"{name}, compiled"] = {**settings[name], "compile": True}
+    return {"SB3 TD3 train()": _stepper(_td3(device))} | {
+        name: _stepper(_actpc(keywords, device)) for name, keywords in settings.items()
+    }
 
 
 def _settings() -> dict[str, dict[str, Any]]:
@@ -158,12 +188,12 @@ def _interleave(
     return times
 
 
-def _ratios(times: dict[str, list[float]]) -> dict[str, tuple[float, str]]:
-    """Of every entry, the median ratio to its unit, round by round."""
-    ratios = {}
+def _ratios(times: dict[str, list[float]], units: dict[str, str]) -> dict[str, tuple[float, str]]:
+    """Of every entry, the median ratio, round by round, to the entry before it that is a unit."""
+    ratios, base, unit = {}, times[next(iter(units))], ""
     for name, own in times.items():
-        unit = "the products" if "settling" in name else "TD3"
-        base = times[UNITS[unit]]
+        if name in units:
+            base, unit = own, units[name]
         ratios[name] = round(statistics.median(a / b for a, b in zip(own, base, strict=True)), 2), unit
     return ratios
 

@@ -34,12 +34,15 @@ def _is_wide(a: th.Tensor, b: th.Tensor) -> bool:
     return min(*a.shape, b.shape[1]) >= NARROWEST
 
 
+def has_bfloat16() -> bool:
+    """Whether this machine multiplies such numbers, and does not emulate it (where torch is too old to tell: no)."""
+    names = "_is_avx512_bf16_supported", "_is_amx_tile_supported"
+    return th.cuda.is_available() or any(getattr(th.cpu, name, bool)() for name in names)
+
+
 def check_matmul_precision(chosen: str) -> None:
     """:raises ValueError: for "bfloat16" on a processor that only emulates its products, which takes longer than float32"""
-    if chosen == "float32" or th.cuda.is_available():
-        return
-    # older versions of torch cannot tell
-    if not any(getattr(th.cpu, name, bool)() for name in ("_is_avx512_bf16_supported", "_is_amx_tile_supported")):
+    if chosen != "float32" and not has_bfloat16():
         raise ValueError(
             f"matmul_precision={chosen!r} needs a processor with avx512_bf16 or AMX; found "
             f"{th.backends.cpu.get_cpu_capability()} with neither: leave it out, or use 'float32'"
