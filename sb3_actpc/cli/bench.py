@@ -75,14 +75,14 @@ def _measured(args: argparse.Namespace) -> dict[str, tuple[float, str]]:
     """The ratios of all that was asked for; entries that share a unit take turns."""
     import torch as th
 
-    from sb3_actpc.cli import bench_training
+    from sb3_actpc.experiments import timing
 
     synchronize = th.cuda.synchronize if args.device != "cpu" else lambda: None
     groups = [(_updates(args.device, args.compiled), TD3_UNIT), (_settling(args.device), SETTLING_UNIT)]
     if args.training:
-        groups += [*bench_training.training(args.device), (bench_training.acting(), bench_training.ACTING_UNIT)]
+        groups += [*timing.training(args.device), (timing.acting(), timing.ACTING_UNIT)]
     if args.growth:
-        groups += bench_training.growth()
+        groups += timing.growth()
     ratios = {}
     for entries, units in groups:
         ratios |= _ratios(_interleave(entries, args.rounds, synchronize), units)
@@ -176,15 +176,19 @@ def _settling(device: str) -> dict[str, Callable[[], object]]:
 def _interleave(
     entries: dict[str, Callable[[], object]], rounds: int, synchronize: Callable[[], object]
 ) -> dict[str, list[float]]:
+    """Seconds of every entry's rounds; with one thread the processor's, which other programs hardly change."""
+    import torch as th
+
+    clock = time.process_time if th.get_num_threads() == 1 and not th.cuda.is_initialized() else time.perf_counter
     times: dict[str, list[float]] = {name: [] for name in entries}
     for round_number in range(rounds + 3):
         for name, entry in entries.items():
             synchronize()
-            start = time.perf_counter()
+            start = clock()
             entry()
             synchronize()
             if round_number >= 3:  # the first ones warm up
-                times[name].append(time.perf_counter() - start)
+                times[name].append(clock() - start)
     return times
 
 

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 TASKS = ("SparseHopper-v5", "SparseHalfCheetah-v5")
 BATCH_SIZE, WIDTH, N_FILLED = 256, 256, 1000
-N_STEPS = 100  # environment steps of one measurement
+N_STEPS = 50  # environment steps of one measurement
 SWEEP = {"feedback": "learned", "feedback_start": "mirrored"}
 # the entry that others are divided by, and what their ratio is called then
 TRAINING_UNITS = {f"SB3 TD3, {task}": f"SB3 TD3's time for a step of {task}" for task in TASKS}
