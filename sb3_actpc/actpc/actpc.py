@@ -251,7 +251,8 @@ class ActPC(OffPolicyAlgorithm):
             support_multi_env=True,
         )
         self.settling = settling
-        self.demonstrations = demonstrations
+        # a Path of one system cannot be unpickled on another
+        self.demonstrations = str(demonstrations) if isinstance(demonstrations, Path) else demonstrations
         self.n_demonstrations = n_demonstrations
         self.n_demonstration_transitions = n_demonstration_transitions
         self.prior_updates = prior_updates
