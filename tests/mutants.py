@@ -88,13 +88,12 @@ MUTANTS = [
         f"{LEARNING} -k gamma_e",
     ),
     Mutant("biases decay", CIRCUIT, "if parameter.dim() > 1]", "if parameter.dim() > 0]", f"{LEARNING} -k spares_the_biases"),
-    Mutant("late errors count less", CIRCUIT, "else e / share for", "else e * share for", f"{SETTLING} -k arriv"),
     Mutant(
         "one step of settling too many",
         CIRCUIT,
         "in range(1, self.n_settling_steps + 1):",
         "in range(1, self.n_settling_steps + 2):",
-        f"{SETTLING} -k 'one_step or arriv'",
+        f"{SETTLING} -k one_step_is",
     ),
     Mutant(
         "projection without the last bias",
@@ -220,8 +219,8 @@ MUTANTS = [
     Mutant(
         "rates beyond the stable range",
         "ngc/stability.py",
-        "SAFETY * error_dynamics_limit(",
-        "2 * error_dynamics_limit(",
+        "1.0 / (1.0 + w * e)",
+        "4.0 / (1.0 + w * e)",
         CLOSED,
     ),
     # ------------------------------------------------------------------ agent

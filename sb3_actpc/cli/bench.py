@@ -157,7 +157,7 @@ def _settling(device: str) -> dict[str, Callable[[], object]]:
 
     from sb3_actpc.ngc import NGCCircuit
 
-    circuit = NGCCircuit(23, 17, (WIDTH, WIDTH), feedback="tied", dynamics="error").to(device)
+    circuit = NGCCircuit(23, 17, (WIDTH, WIDTH), feedback="tied", dynamics="state").to(device)
     x, target = th.randn(BATCH_SIZE, 23, device=device), th.randn(BATCH_SIZE, 17, device=device)
     hidden, output = th.randn(BATCH_SIZE, WIDTH, device=device), th.randn(BATCH_SIZE, 17, device=device)
     wide, narrow = circuit.weights[1], circuit.weights[2]

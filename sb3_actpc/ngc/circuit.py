@@ -13,7 +13,7 @@ from sb3_actpc.ngc.dynamics import DYNAMICS, ChainSettings, SettledState, Settli
 from sb3_actpc.ngc.krylov import settle_krylov
 from sb3_actpc.ngc.plasticity import SYNAPTIC_SCALINGS, HebbianChanges, bound_columns_, hebbian_changes, mirrored, soft_bound_
 from sb3_actpc.ngc.products import MATMUL_PRECISIONS, check_matmul_precision
-from sb3_actpc.ngc.stability import arrival_fractions, power_iteration_, settling_rates
+from sb3_actpc.ngc.stability import power_iteration_, settling_rates
 from sb3_actpc.ngc.synapses import Synapses, predict
 
 SETTLINGS = ("iterative", "scheduled")
@@ -43,12 +43,8 @@ class NGCCircuit(nn.Module):
     :param n_settling_steps: K (paper: 10 to 25); with ``dynamics="krylov"`` the most steps
     :param settling_tolerance: "krylov" stops when this share of the output's equation is left (the others take all K steps)
     :param dynamics: how iterative settling comes to rest: "krylov" (minimal residuals, two to four steps:
-        :mod:`~sb3_actpc.ngc.krylov`), "error" (error neurons integrate, states follow their predictions) or "state" (eq. 1 to
-        the letter); same fixed points, "krylov" to first order: see :class:`~sb3_actpc.ngc.dynamics.SettlingChain`
+        :mod:`~sb3_actpc.ngc.krylov`; to first order) or "state" (eq. 1 to the letter)
     :param settling_rate: β, a number in (0, 1], or "auto": kept inside the stable range as the synapses grow
-    :param compensate_arrival: divide every layer's error by the share of the output's error that K steps had time to
-        bring there (:func:`~sb3_actpc.ngc.stability.arrival_fractions`; 1 for large K). Without it the first layers' changes
-        shrink by orders of magnitude as the rates follow the growing synapses, faster than an adaptive optimiser forgets
     :param leak: γ of eq. 1; 0 by default
     :param feedback: "tied" (``feedback_scale`` W^T) or "learned" (own error synapses E: the paper's)
     :param feedback_scale: λ_e of tied error synapses
@@ -88,7 +84,6 @@ class NGCCircuit(nn.Module):
         settling_tolerance: float = 0.3,
         dynamics: str = "krylov",
         settling_rate: float | str = "auto",
-        compensate_arrival: bool = True,
         leak: float = 0.0,
         feedback: str = "tied",  # the paper's is "learned"; see above
         feedback_scale: float = 1.0,
@@ -130,10 +125,10 @@ class NGCCircuit(nn.Module):
             memory_weight=memory_weight,
         )
         _check_rate(settling_rate)
-        _check_flags(compensate_arrival=compensate_arrival, derivative_free=derivative_free)
+        _check_flags(derivative_free=derivative_free)
         if settling == "iterative" and dynamics == "krylov" and (leak or settling_rate != "auto"):
             given = f"leak={leak!r}" if leak else f"settling_rate={settling_rate!r}"
-            raise ValueError(f"{given} needs dynamics='error' or 'state': 'krylov' knows neither leak nor rates")
+            raise ValueError(f"{given} needs dynamics='state': 'krylov' knows neither leak nor rates")
         if settling == "scheduled":
             _check_scheduled(
                 feedback_scale=feedback_scale,
@@ -146,7 +141,6 @@ class NGCCircuit(nn.Module):
         self.output_activation = get_activation(output_activation)
         self.settling, self.n_settling_steps, self.dynamics = settling, n_settling_steps, dynamics
         self.settling_tolerance = settling_tolerance
-        self.compensate_arrival = compensate_arrival
         self.settling_rate, self.leak, self.derivative_free = settling_rate, leak, derivative_free
         self.feedback, self.feedback_scale, self.feedback_rate = feedback, feedback_scale, feedback_rate
         self.synaptic_scaling, self.weight_bound, self.weight_decay = synaptic_scaling, weight_bound, weight_decay
@@ -253,7 +247,6 @@ class NGCCircuit(nn.Module):
             chain.n_steps = settle_krylov(chain, self.n_settling_steps, self.settling_tolerance)
             return chain.state()
         rates = self.rates.tolist()[: self.n_hidden]
-        chain.arrived = arrival_fractions(tuple(rates), self.n_settling_steps)
         for chain.n_steps in range(1, self.n_settling_steps + 1):
             chain.integrate(rates)
             chain.predict()
@@ -302,10 +295,7 @@ class NGCCircuit(nn.Module):
 
         For the error synapses see :attr:`HebbianChanges.feedback`. Nothing is changed yet: :meth:`apply_changes` does that.
         """
-        errors = state.postsynaptic
-        if self.compensate_arrival:
-            errors = [e if share == 1.0 else e / share for e, share in zip(errors, state.arrived, strict=True)]
-        return hebbian_changes(errors, state.activations, state.memory, self.memory_weight, self.bfloat16)
+        return hebbian_changes(state.postsynaptic, state.activations, state.memory, self.memory_weight, self.bfloat16)
 
     def parameter_groups(self, learning_rate: float) -> list[dict[str, Any]]:
         """
@@ -377,7 +367,7 @@ class NGCCircuit(nn.Module):
         norms = th.stack([power_iteration_(m, getattr(self, name), n_iterations) for name, m in self._coupling_matrices()])
         forward = norms[: self.n_hidden].tolist()
         feedback = norms[self.n_hidden :].tolist() or [self.feedback_scale * norm for norm in forward]
-        self.rates.copy_(th.tensor(settling_rates(self.dynamics, forward, feedback)))
+        self.rates.copy_(th.tensor(settling_rates(forward, feedback)))
 
 
 def _uniform(n_out: int, n_in: int, fan_in: int) -> nn.Parameter:

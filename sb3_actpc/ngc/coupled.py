@@ -7,9 +7,6 @@ import torch as th
 from sb3_actpc.ngc.circuit import NGCCircuit
 from sb3_actpc.ngc.dynamics import SettledState, SettlingChain
 from sb3_actpc.ngc.plasticity import HebbianChanges
-from sb3_actpc.ngc.stability import arrival_fractions
-
-COUPLED_RATE = 0.5  # "error" dynamics under a clamped output error have no loop: any rate up to 1 is stable
 
 
 @dataclass
@@ -36,15 +33,14 @@ def settle_coupled(
 
     The clamped error is applied as ``nudge`` / A and the actor's errors are divided by ``nudge`` afterwards: the smaller the
     nudge, the closer the actor's change comes to the deterministic policy gradient (tied feedback). The paper's is 1. In the
-    limit the states stand still and only the error neurons settle: ``dynamics="krylov"`` is at rest after one sweep,
-    ``dynamics="error"`` gets there in steps; ``dynamics="state"`` cannot, as a small nudge drowns in the rounding of z - z̄.
+    limit the states stand still and only the error neurons settle: ``dynamics="krylov"`` is at rest after one sweep;
+    ``dynamics="state"`` cannot be, as a small nudge drowns in the rounding of z - z̄.
 
     :param actor: observation (and memory) -> action
     :param critic: [observation, action] -> action-values; its last A inputs are the action
     :param x: observations, (B, n_observation)
     :param memory: the actor's m_t, (B, n_memory), or None
-    :param nudge: scale of the perturbation, in (0, 1]; None for an infinitesimal one, or 1 where the dynamics do not allow it
-        (``dynamics="state"``, or a leak)
+    :param nudge: scale of the perturbation, in (0, 1]; None for an infinitesimal one, or 1 with ``dynamics="state"``
     :return: the actor's state, the actions and their values
     :raises ValueError: when the critic's error synapses do not reach the actor's outputs, or the schedules differ
     """
@@ -59,15 +55,12 @@ def settle_coupled(
             raise ValueError(f"actor {name}={getattr(actor, name)!r} and critic {name}={getattr(critic, name)!r} must agree")
     motor = actor.chain(x, memory)
     value = critic.chain(th.cat([x, motor.output], dim=1))
-    infinitesimal = nudge is None and all(c.dynamics != "state" and not c.leak for c in (actor, critic))
     scale = 1.0 if nudge is None or actor.settling == "scheduled" else nudge
     value.clamp_output_drive(_damped(value, th.full_like(value.output, scale / value.output.shape[1])))
-    if actor.settling == "scheduled":
-        _sweep_both(motor, value, critic.input_feedback())
-    elif actor.dynamics == "krylov" and infinitesimal:
+    if actor.settling == "scheduled" or (actor.dynamics == "krylov" and nudge is None):
         _sweep_both(motor, value, critic.input_feedback())
     else:
-        _settle_both(actor, critic, motor, value, states_move=not infinitesimal)
+        _settle_both(actor, critic, motor, value)
         for error in [*motor.errors, motor.output_error]:
             error.div_(scale)
         if motor.drive is not motor.output_error:
@@ -95,22 +88,20 @@ def _sweep_both(motor: SettlingChain, value: SettlingChain, to_action: th.Tensor
     motor.sweep(exact)
 
 
-def _settle_both(actor: NGCCircuit, critic: NGCCircuit, motor: SettlingChain, value: SettlingChain, states_move: bool) -> None:
+def _settle_both(actor: NGCCircuit, critic: NGCCircuit, motor: SettlingChain, value: SettlingChain) -> None:
     value.start_settling()
     motor.start_settling()
     if actor.dynamics == "krylov":
         return _sweep_repeatedly(actor, critic, motor, value)
-    value_rates, motor_rates = _coupled_rates(critic), _coupled_rates(actor)
-    to_action, n_steps = critic.input_feedback(), critic.n_settling_steps
-    motor.arrived = arrival_fractions((*motor_rates, *value_rates), n_steps)[: motor.n_hidden + 1]
-    for step in range(n_steps):
+    value_rates, motor_rates = (circuit.rates.tolist()[: circuit.n_hidden] for circuit in (critic, actor))
+    to_action = critic.input_feedback()
+    for step in range(critic.n_settling_steps):
         if step >= value.n_hidden:  # only now has the critic's first layer an error to pass on
             _clamp_actor(motor, value, to_action)
             motor.integrate(motor_rates)
         value.integrate(value_rates)
-        if states_move:
-            motor.predict(output=False)
-            value.predict(output=False)
+        motor.predict(output=False)
+        value.predict(output=False)
     _clamp_actor(motor, value, to_action)
 
 
@@ -126,13 +117,6 @@ def _sweep_repeatedly(actor: NGCCircuit, critic: NGCCircuit, motor: SettlingChai
         for chain in (motor, value):
             chain.lowest_reached = 1
             chain.predict(output=False)
-
-
-def _coupled_rates(circuit: NGCCircuit) -> list[float]:
-    """The circuit's own rates; with "error" dynamics, where the pair has no loop to keep stable, a larger one."""
-    if circuit.dynamics == "error" and circuit.settling_rate == "auto":
-        return [COUPLED_RATE] * circuit.n_hidden
-    return circuit.rates.tolist()[: circuit.n_hidden]
 
 
 def _clamp_actor(motor: SettlingChain, value: SettlingChain, to_action: th.Tensor) -> None:

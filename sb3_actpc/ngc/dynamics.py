@@ -9,7 +9,7 @@ from sb3_actpc.ngc.activations import Activation
 from sb3_actpc.ngc.products import add_product, multiply
 from sb3_actpc.ngc.synapses import Synapses, predict
 
-DYNAMICS = ("krylov", "error", "state")
+DYNAMICS = ("krylov", "state")
 
 
 @dataclass
@@ -23,7 +23,6 @@ class SettledState:
     :param errors: e = z - z̄, L tensors; ``errors[l]`` belongs to the layer that ``weights[l]`` predicts
     :param output_drive: the output's error times g', what reaches the synapses and the layer above (B, n_outputs)
     :param memory: the working memory m_t, (B, n_memory), or None
-    :param arrived: the share of the output's error that has had time to reach each layer, L numbers in (0, 1]
     :param n_steps: settling steps taken; 0 for a sweep
     """
 
@@ -32,7 +31,6 @@ class SettledState:
     errors: list[th.Tensor]
     output_drive: th.Tensor
     memory: th.Tensor | None
-    arrived: tuple[float, ...]
     n_steps: int = 0
 
     @property
@@ -62,11 +60,9 @@ class SettlingChain:
     """
     The live latents and errors of one circuit, advanced step by step without any allocation.
 
-    A step has two halves. :meth:`integrate` moves the hidden layers by eq. 1 of the paper, all from the same instant;
-    :meth:`predict` brings predictions and errors up to date. ``dynamics="state"`` is eq. 1 to the letter (states integrate,
-    errors follow); ``dynamics="error"`` lets the error neurons integrate the same right-hand side while the states ride
-    on their predictions (z = z̄ + e). Both rest where the right-hand side vanishes, so they have the same fixed points.
-    "krylov" goes there in a few steps: see :mod:`~sb3_actpc.ngc.krylov`.
+    ``dynamics="state"`` is eq. 1 of the paper to the letter. A step has two halves: :meth:`integrate` moves the hidden layers,
+    all from the same instant; :meth:`predict` brings predictions and errors up to date. "krylov" goes where that rests in a
+    few steps (:mod:`~sb3_actpc.ngc.krylov`): its error neurons are solved for, and the states ride on them (z = z̄ + e).
 
     Layers that no error has reached yet stand still and cost nothing.
 
@@ -92,7 +88,6 @@ class SettlingChain:
         self.n_hidden = len(self.latents) - 1
         self.lowest_reached = self.n_hidden + 1
         self.target: th.Tensor | None = None
-        self.arrived = (1.0,) * (self.n_hidden + 1)
         self.n_steps = 0
         self.drive = self.output_prediction  # replaced as soon as the output is clamped
         self.errors: list[th.Tensor] = []
@@ -149,7 +144,7 @@ class SettlingChain:
             signal, error, rate = self.feedback_to(layer), self.errors[layer - 1], rates[layer - 1]
             if settings.leak:
                 signal.sub_(self.latents[layer], alpha=settings.leak)
-            if settings.dynamics != "state" or layer == 1:  # the first layer's prediction is constant: both are the same
+            if layer == 1:  # its prediction is constant: the error moves as the state does
                 error.lerp_(signal, rate)
             else:
                 self.latents[layer].add_(signal.sub_(error), alpha=rate)
@@ -211,6 +206,5 @@ class SettlingChain:
             errors=[*self.errors, self.output_error],
             output_drive=self.drive,
             memory=self.memory,
-            arrived=self.arrived,
             n_steps=self.n_steps,
         )

@@ -75,7 +75,7 @@ VALUES = st.recursive(
     ),
     max_leaves=4,
 )
-CIRCUIT_VALUES = st.one_of(SCALARS, st.sampled_from(["learned", "tied", "error", "state", "column_norm", "iterative", "relu"]))
+CIRCUIT_VALUES = st.one_of(SCALARS, st.sampled_from(["learned", "tied", "krylov", "state", "column_norm", "iterative"]))
 OF_ONE_CIRCUIT = sorted({*CIRCUIT_KEYWORDS, "net_arch", "learning_rate", "batch_size", "n_inputs", "hiden"})
 OF_THE_POLICY = sorted({*inspect.signature(ActPCPolicy.__init__).parameters, "activation_fn"} - {"self"})
 ARCHITECTURES = st.one_of(

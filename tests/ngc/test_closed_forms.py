@@ -39,5 +39,5 @@ def test_the_total_discrepancy_is_half_the_summed_squared_errors():
 @pytest.mark.parametrize("norm", [1.0, 5.0, 20.0])
 def test_the_automatic_rate_is_stable_where_every_unit_is_active(norm):
     """One hidden layer: e <- e - β (1 + ||W|| ||E||) e + const settles while β (1 + ||W|| ||E||) < 2."""
-    rate = settling_rates("error", [norm], [norm])[0]
+    rate = settling_rates([norm], [norm])[0]
     assert 0.0 < rate * (1.0 + norm**2) < 2.0

@@ -47,10 +47,9 @@ def energies_while_settling(circuit, x, target):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("dynamics", ["error", "state"])
-def test_energy_still_falls_after_20k_updates_on_unnormalised_transitions(transitions, dynamics):
+def test_energy_still_falls_after_20k_updates_on_unnormalised_transitions(transitions):
     """A fixed rate of 0.1, fine at the start, blows up here (checked at the end)."""
-    circuit = NGCCircuit(23, 17, dynamics=dynamics)
+    circuit = NGCCircuit(23, 17, dynamics="state")
     circuit.optimizer = th.optim.Adam(circuit.parameter_groups(4e-4), **ADAM)
     for update in range(N_UPDATES + 1):
         o, a, _, n = batch_of(transitions)

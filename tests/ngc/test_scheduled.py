@@ -58,8 +58,8 @@ def test_the_coupled_pair_under_scheduled_is_the_policy_gradient(hidden):
 
 
 def test_the_coupled_pair_tends_to_the_policy_gradient_as_it_settles_and_the_nudge_shrinks():
-    actor, critic, x = (m.double() for m in make_pair(n_settling_steps=200, dynamics="error"))
-    changes = actor.hebbian_update(settle_coupled(actor, critic, x, nudge=1e-7).actor)
+    actor, critic, x = (m.double() for m in make_pair(n_settling_steps=1000, dynamics="state", settling_rate=0.1))
+    changes = actor.hebbian_update(settle_coupled(actor, critic, x, nudge=1e-6).actor)
     for change, gradient in zip(changes.tensors(), gradient_by_autograd(actor, critic, x), strict=True):
         assert th.allclose(change, gradient, rtol=1e-4, atol=1e-8)
 
@@ -69,9 +69,10 @@ def test_a_nudged_pair_rests_where_eq_1_does(feedback):
     """With a nudge of 1 the states move: sweeps that follow them end where the error neurons come to rest."""
     actor, critic, x = (m.double() for m in make_pair((16, 12), activation="tanh", feedback=feedback))
     states = []
-    for dynamics, steps in (("krylov", 50), ("error", 400)):
+    for dynamics, steps in (("krylov", 50), ("state", 2000)):
         for circuit in (actor, critic):
             circuit.dynamics, circuit.n_settling_steps, circuit.settling_tolerance = dynamics, steps, 1e-9
+            circuit.rates.fill_(0.1)
         states.append(settle_coupled(actor, critic, x, nudge=1.0).actor)
     assert 1 < states[0].n_steps < 50
     for mine, rest in zip(states[0].postsynaptic, states[1].postsynaptic, strict=True):
@@ -119,7 +120,8 @@ LEARNED = {"settling": "scheduled", "feedback": "learned", "activation": "tanh"}
 def test_the_learned_sweep_is_where_error_neurons_rest_under_an_infinitesimal_error(hidden):
     circuit = NGCCircuit(6, 3, hidden, output_activation="tanh", **LEARNED).double()
     x, error = th.randn(32, 6, dtype=th.float64), 1e-8 * th.randn(32, 3, dtype=th.float64)
-    swept, settled = circuit.chain(x), circuit.chain(x)
+    swept, circuit.dynamics = circuit.chain(x), "state"
+    settled = circuit.chain(x)
     swept.clamp_output_drive(error)
     swept.sweep()
     settled.clamp_output_drive(error)
@@ -135,10 +137,11 @@ def test_the_coupled_learned_sweep_is_where_the_pair_rests_under_an_infinitesima
     actor, critic, x = (m.double() for m in make_pair((16, 12), **LEARNED))
     swept = settle_coupled(actor, critic, x).actor
     for circuit in (actor, critic):
-        circuit.settling, circuit.n_settling_steps, circuit.dynamics = "iterative", 400, "error"
-    settled = settle_coupled(actor, critic, x).actor
+        circuit.settling, circuit.n_settling_steps, circuit.dynamics = "iterative", 400, "state"
+        circuit.rates.fill_(0.3)
+    settled = settle_coupled(actor, critic, x, nudge=1e-6).actor
     for mine, rest in zip(swept.postsynaptic, settled.postsynaptic, strict=True):
-        assert mine.abs().max() > 1e-5 and th.allclose(mine, rest, rtol=1e-6, atol=1e-12)
+        assert mine.abs().max() > 1e-5 and th.allclose(mine, rest, rtol=1e-4, atol=1e-9)
 
 
 def test_the_learned_sweep_is_its_equation_with_the_error_synapses():
