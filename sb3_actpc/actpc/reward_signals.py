@@ -94,6 +94,9 @@ class RunningQuantile:
         return np.minimum(raw / max(self.estimate, 1e-12), 1.0)
 
 
+Normalizer = RunningMaximum | Saturating | RunningQuantile
+
+
 class InternalSignals:
     """
     What both signals are made of, and what their normalisers have seen.
@@ -114,8 +117,8 @@ class InternalSignals:
         instrumental_form: Literal["penalty", "unit"] = "penalty",
         errors: Literal["all", "output"] = "all",
     ) -> None:
-        kind = {"max": RunningMaximum, "saturating": Saturating, "quantile": RunningQuantile}[normalizer]
-        self.epistemic, self.instrumental = kind(), kind()
+        kinds: dict[str, type[Normalizer]] = {"max": RunningMaximum, "saturating": Saturating, "quantile": RunningQuantile}
+        self.epistemic, self.instrumental = kinds[normalizer](), kinds[normalizer]()
         self.normalization, self.instrumental_form, self.errors = normalization, instrumental_form, errors
 
     def score(
