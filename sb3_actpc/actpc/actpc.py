@@ -146,7 +146,7 @@ class ActPC(OffPolicyAlgorithm):
         :mod:`~sb3_actpc.actpc.compiled`): True, False or "auto", where the run is long enough to earn it
     :param policy_kwargs: keywords of :class:`~sb3_actpc.actpc.policies.ActPCPolicy`: ``net_arch``, ``n_critics``, ``habit``,
         ``trust_radius``, ``nudge``, ``memory_history`` (the working memory), ``circuit_kwargs`` (of every
-        :class:`~sb3_actpc.ngc.NGCCircuit`: ``n_settling_steps``, ``feedback``, ``dynamics``, ``activation``,
+        :class:`~sb3_actpc.ngc.NGCCircuit`: ``n_settling_steps``, ``feedback``, ``dynamics``, ``matmul_precision``,
         ``synaptic_scaling``, ...), ``actor_kwargs``, ``critic_kwargs``, ``generator_kwargs`` and ``prior_kwargs`` (of one, and
         its ``net_arch``, ``learning_rate`` and ``batch_size``)
     :param stats_window_size: as in SB3
