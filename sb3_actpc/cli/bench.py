@@ -83,7 +83,7 @@ def _measured(args: argparse.Namespace) -> dict[str, tuple[float, str]]:
         groups += [*timing.training(args.device), (timing.acting(), timing.ACTING_UNIT)]
     if args.growth:
         groups += timing.growth()
-    ratios = {}
+    ratios: dict[str, tuple[float, str]] = {}
     for entries, units in groups:
         ratios |= _ratios(_interleave(entries, args.rounds, synchronize), units)
     return ratios

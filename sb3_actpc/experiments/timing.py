@@ -40,10 +40,10 @@ def _learners(task: str, device: str) -> Entries:
     from sb3_actpc.experiments.runs import preset
 
     shared: dict[str, Any] = {"learning_starts": 100, "batch_size": BATCH_SIZE, "buffer_size": 100 * N_FILLED, "seed": 0}
-    same = {"train_freq": 1, "gradient_steps": 1, **shared}
+    same: dict[str, Any] = {"train_freq": 1, "gradient_steps": 1, **shared}
     quick = {"prior_updates": 1, "actor_warm_start": 0, "critic_warmup": 0}
-    bare = {"policy_kwargs": {"circuit_kwargs": SWEEP}}
-    sizes = {"policy_kwargs": {"net_arch": [WIDTH, WIDTH]}}
+    bare: dict[str, Any] = {"policy_kwargs": {"circuit_kwargs": SWEEP}}
+    sizes: dict[str, Any] = {"policy_kwargs": {"net_arch": [WIDTH, WIDTH]}}
     models: dict[str, OffPolicyAlgorithm] = {
         f"SB3 TD3, {task}": TD3("MlpPolicy", task, device=device, **sizes, **same),
         f"bare, learned sweep, {task}": ActPC("MlpPolicy", task, device=device, compile=False, **bare, **same),

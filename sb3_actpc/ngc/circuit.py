@@ -144,7 +144,7 @@ class NGCCircuit(nn.Module):
         self.settling_rate, self.leak, self.derivative_free = settling_rate, leak, derivative_free
         self.feedback, self.feedback_scale, self.feedback_rate = feedback, feedback_scale, feedback_rate
         self.synaptic_scaling, self.weight_bound, self.weight_decay = synaptic_scaling, weight_bound, weight_decay
-        self.bfloat16 = matmul_precision == "bfloat16"
+        self.in_bfloat16 = matmul_precision == "bfloat16"
         self.n_memory, self.memory_weight = n_memory, memory_weight
         self.n_feedback_inputs = n_feedback_inputs
         self._create_synapses()
@@ -221,7 +221,7 @@ class NGCCircuit(nn.Module):
         """
         biases = self.synapses.layer_biases(memory, self.memory_weight)
         for weights, bias in zip(self.synapses.weights[:-1], biases[:-1], strict=True):
-            latents = predict(x, weights, bias, self.bfloat16)
+            latents = predict(x, weights, bias, self.in_bfloat16)
             x = self.activation.apply(latents, latents)
         output = predict(x, self.synapses.weights[-1], biases[-1])
         return self.output_activation.apply(output, output)
@@ -262,7 +262,7 @@ class NGCCircuit(nn.Module):
             self.derivative_free,
             self.feedback_scale,
             self.memory_weight,
-            self.bfloat16,
+            self.in_bfloat16,
         )
         return SettlingChain(self.synapses, settings, x, memory)
 
@@ -295,7 +295,7 @@ class NGCCircuit(nn.Module):
 
         For the error synapses see :attr:`HebbianChanges.feedback`. Nothing is changed yet: :meth:`apply_changes` does that.
         """
-        return hebbian_changes(state.postsynaptic, state.activations, state.memory, self.memory_weight, self.bfloat16)
+        return hebbian_changes(state.postsynaptic, state.activations, state.memory, self.memory_weight, self.in_bfloat16)
 
     def parameter_groups(self, learning_rate: float) -> list[dict[str, Any]]:
         """

@@ -43,7 +43,7 @@ def test_changes_are_those_of_float32(kind, feedback):
     x = th.randn(256, 20)
     target = 3 + 3 * th.sin(x[:, :6])
     changes, output = circuit.hebbian_update(circuit.settle(x, target)), circuit.project(x)
-    circuit.bfloat16 = False
+    circuit.in_bfloat16 = False
     exact = circuit.hebbian_update(circuit.settle(x, target))
     assert 0.0 < (output - circuit.project(x)).norm() < ROUNDING * output.norm()
     assert all(change.dtype == th.float32 for change in changes.tensors())
@@ -56,7 +56,7 @@ def test_the_coupled_pair_asks_for_the_change_of_float32():
     actor = NGCCircuit(20, 6, (128, 128), output_activation="tanh", **shared)
     critic, x = NGCCircuit(26, 6, (128, 128), n_feedback_inputs=6, **shared), th.randn(256, 20)
     changes = actor.hebbian_update(settle_coupled(actor, critic, x).actor)
-    actor.bfloat16 = critic.bfloat16 = False
+    actor.in_bfloat16 = critic.in_bfloat16 = False
     exact = actor.hebbian_update(settle_coupled(actor, critic, x).actor)
     check_directions(changes, exact)
 
