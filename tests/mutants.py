@@ -383,7 +383,11 @@ MUTANTS = [
     ),
     Mutant("all dimensions spread alike", REGION, "residuals.square().mean(0)", "residuals.square().mean()", REGIONS),
     Mutant(
-        "the deviation has no unit", REGION, "(actions - habit_actions) / self.spread", "(actions - habit_actions)", REGIONS
+        "the deviation has no unit",
+        REGION,
+        "(actions - habit_actions) / spread.clamp_max(1.0)",
+        "(actions - habit_actions)",
+        REGIONS,
     ),
     Mutant(
         "the pressure grows outside",
@@ -400,8 +404,8 @@ MUTANTS = [
     Mutant(
         "the noise forgets the spread",
         AGENT,
-        "region.spread.clamp_max(self.exploration_noise)",
-        "self.exploration_noise + 0.0 * region.spread",
+        "self.policy.spread.clamp_max(self.exploration_noise)",
+        "th.full_like(self.policy.spread, self.exploration_noise)",
         f"{HABIT} -k noise",
     ),
     Mutant("the warm start's rate stands", AGENT, "* (last / first) ** progress", "", f"{HABIT} -k rates"),

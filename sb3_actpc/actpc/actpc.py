@@ -47,6 +47,7 @@ from sb3_actpc.actpc.habit import Trials
 from sb3_actpc.actpc.policies import POLICIES, ActPCActor, ActPCPolicy, Critics, check_policy, check_policy_kwargs
 from sb3_actpc.actpc.reward_signals import InternalSignals, summed_squared_errors
 from sb3_actpc.actpc.self_imitation import Episodes, Observations, map_observations, sample_union
+from sb3_actpc.actpc.trust_region import spread_of
 from sb3_actpc.checkpoints import Restored, between_updates, load_checkpoint, load_weights, save_weights
 from sb3_actpc.demonstrations import fit_demonstrations
 from sb3_actpc.demonstrations.dataset import Demonstrations
@@ -251,7 +252,6 @@ class ActPC(OffPolicyAlgorithm):
             support_multi_env=True,
         )
         self.settling = settling
-        # a Path of one system cannot be unpickled on another
         self.demonstrations = str(demonstrations) if isinstance(demonstrations, Path) else demonstrations
         self.n_demonstrations = n_demonstrations
         self.n_demonstration_transitions = n_demonstration_transitions
@@ -384,6 +384,8 @@ class ActPC(OffPolicyAlgorithm):
 
         :raises ValueError: when they do not fit, or are not there
         """
+        if isinstance(self.demonstrations, Path):  # which one system could not unpickle from another
+            self.demonstrations = str(self.demonstrations)
         now = self.demonstrations, self.n_demonstrations, self.n_demonstration_transitions
         if self.expert is None or any(mine is not other for mine, other in zip(now, self._followed, strict=True)):
             self._setup_demonstrations()
@@ -489,8 +491,8 @@ class ActPC(OffPolicyAlgorithm):
         if self.actor_warm_start:
             self.actor.circuit.optimizer.state.clear()  # its moments are those of other learning rates
         _copy(self.actor.circuit, self.actor_target, self.actor.habit, self.policy.actor_average)
-        if self.policy.trust_region is not None and self.actor_warm_start:
-            self.policy.trust_region.fit(self._imitation_residuals())
+        if self.actor_warm_start:
+            self.policy.spread.copy_(spread_of(self._imitation_residuals()))
         self.pretrained = True
 
     def _warm_up_actor(self, progress: float) -> None:
@@ -536,11 +538,8 @@ class ActPC(OffPolicyAlgorithm):
 
     def _exploration(self, shape: tuple[int, ...]) -> np.ndarray:
         """Gaussian noise, no wider in any dimension than the demonstrations spread around the warm-started actor."""
-        noise = np.random.normal(size=shape).astype(np.float32)
-        region = self.policy.trust_region
-        if region is None:
-            return noise * np.float32(self.exploration_noise)
-        return noise * region.spread.clamp_max(self.exploration_noise).cpu().numpy().reshape(shape[1:])
+        scale = self.policy.spread.clamp_max(self.exploration_noise).cpu().numpy().reshape(shape[1:])
+        return np.random.normal(size=shape).astype(np.float32) * scale
 
     def _imitation_residuals(self) -> th.Tensor:
         """Demonstrated actions minus the actor's, (N, A), of 4096 at most."""
@@ -726,7 +725,7 @@ class ActPC(OffPolicyAlgorithm):
         weight: float | th.Tensor = self.actor_pressure
         if self.policy.trust_region is not None and self.actor.habit is not None:
             habit_actions = self.actor.habit.project(batch.features, batch.memory)
-            weight = weight * self.policy.trust_region.regulate(coupled.actions, habit_actions)
+            weight = weight * self.policy.trust_region.regulate(coupled.actions, habit_actions, self.policy.spread)
         return weight / coupled.action_values.abs().mean().clamp_min(SMALLEST_VALUE_SCALE) if self.scale_pressure else weight
 
     def _update_critic(self, batch: Batch) -> None:
@@ -838,12 +837,20 @@ class ActPC(OffPolicyAlgorithm):
 
         :raises ValueError: for a file of a version whose classes are not here
         """
+        of_another_version = f"{path} is of another version of sb3_actpc ({{}}): load it with that one"
         try:
-            return super().load(path, *args, **kwargs)  # type: ignore[arg-type]
+            model = super().load(path, *args, **kwargs)  # type: ignore[arg-type]
         except ModuleNotFoundError as error:
             if not (error.name or "").startswith("sb3_actpc"):
                 raise
-            raise ValueError(f"{path} is of another version of sb3_actpc ({error}): load it with that one") from error
+            raise ValueError(of_another_version.format(error)) from error
+        except RuntimeError as error:
+            if "in state_dict" not in str(error):
+                raise
+            raise ValueError(of_another_version.format("its policy has other parts")) from error
+        if hasattr(model, "signal_normalizer"):
+            raise ValueError(of_another_version.format("before signal_kwargs"))
+        return model
 
     def checkpoint_state(self) -> dict[str, Any]:
         """What a checkpoint (:mod:`sb3_actpc.checkpoints`) keeps beside SB3's state: plain values and arrays."""

@@ -113,6 +113,8 @@ class Trials:
             return None
         elif gain > 0.0 and gain >= max(SMALLEST_GAIN * unit, enough * error):
             verdict, self.habit_returns = "accepted", own[-KEPT_RETURNS:]
+            # what the old habit has begun elsewhere is no return of the new one
+            self.roles = ["actor" if role == "habit" else role for role in self.roles]
         self.tests_habit = verdict != "accepted" and len(self.habit_returns) < HABIT_PROOFS
         self.candidate_returns, self.candidate_steps = [], 0
         self.generation += 1

@@ -271,6 +271,7 @@ class ActPCPolicy(BasePolicy):
 
     actor: ActPCActor
     action_space: spaces.Box
+    spread: th.Tensor
 
     @checked
     def __init__(
@@ -344,10 +345,12 @@ class ActPCPolicy(BasePolicy):
         self.prior = self._circuit("prior", n_features, n_features, n_memory=n_memory)
         self.actor_target = copy.deepcopy(self.actor.circuit)
         self.critic_target = copy.deepcopy(self.critic)
+        # of the demonstrated actions around their clone; unknown before there is one
+        self.register_buffer("spread", th.full((n_actions,), th.inf))
         # the slow average of the learning actor, and a frozen copy of it that has to prove itself
         self.actor_average = copy.deepcopy(self.actor.circuit) if self.habit else None
         self.candidate = copy.deepcopy(self.actor.circuit) if self.habit else None
-        self.trust_region = TrustRegion(n_actions, self.trust_radius) if self.habit and self.trust_radius else None
+        self.trust_region = TrustRegion(self.trust_radius) if self.habit and self.trust_radius else None
         for name, circuit in self.named_circuits():
             circuit.optimizer = self._optimizer(name.partition(".")[0], circuit)
 

@@ -12,6 +12,14 @@ RADII = 0.1, 1000.0  # below a third of a standard deviation nothing is learned
 RADIUS_FACTORS = {"accepted": 1.25, "tied": 2.0, "rejected": 0.7}
 
 
+def spread_of(residuals: th.Tensor) -> th.Tensor:
+    """
+    :param residuals: demonstrated actions minus the clone's, (N, A)
+    :return: their standard deviations, ``SMALLEST_SPREAD`` at least, (A,)
+    """
+    return residuals.square().mean(0).sqrt().clamp_min(SMALLEST_SPREAD)
+
+
 class TrustRegion(nn.Module):
     """
     The critic's pressure as the multiplier of a trust region, regulated as SAC regulates its temperature.
@@ -22,33 +30,27 @@ class TrustRegion(nn.Module):
     one that holds many allows much; and the radius follows outcomes: it widens with candidates that hold their own, and
     shrinks with those that do not.
 
-    :param n_actions: A
     :param radius: at first
     """
 
-    spread: th.Tensor
     radius: th.Tensor
     deviation: th.Tensor
     multiplier: th.Tensor
 
-    def __init__(self, n_actions: int, radius: float) -> None:
+    def __init__(self, radius: float) -> None:
         super().__init__()
-        self.register_buffer("spread", th.ones(n_actions))  # standard deviations, (A,)
-        self.register_buffer("radius", th.tensor(radius))
+        self.register_buffer("radius", th.tensor(float(radius)))
         self.register_buffer("deviation", th.tensor(0.0))
         self.register_buffer("multiplier", th.tensor(1.0))
 
-    def fit(self, residuals: th.Tensor) -> None:
-        """:param residuals: demonstrated actions minus the clone's, (N, A)"""
-        self.spread.copy_(residuals.square().mean(0).sqrt().clamp_min(SMALLEST_SPREAD))
-
-    def regulate(self, actions: th.Tensor, habit_actions: th.Tensor) -> th.Tensor:
+    def regulate(self, actions: th.Tensor, habit_actions: th.Tensor, spread: th.Tensor) -> th.Tensor:
         """
         :param actions: of the learning actor, (B, A)
         :param habit_actions: of the habit in the same states, (B, A)
+        :param spread: standard deviations of the demonstrated actions, (A,); 1 where they are unknown
         :return: the multiplier, 0-d
         """
-        deviation = ((actions - habit_actions) / self.spread).square().mean()
+        deviation = ((actions - habit_actions) / spread.clamp_max(1.0)).square().mean()
         self.deviation.lerp_(deviation, DEVIATION_RATE)
         unused = (1.0 - self.deviation / self.radius).clamp_min(-1.0)
         self.multiplier.mul_((MULTIPLIER_RATE * unused).exp()).clamp_(*MULTIPLIERS)

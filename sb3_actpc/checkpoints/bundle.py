@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 FORMAT = "sb3_actpc checkpoint"
-VERSION = 3
+VERSION = 4
 MANIFEST = "manifest.json"
 PIECE = 2**18  # bytes read at a time
 _NAME = re.compile(r"(\d{6,})_step_(\d+)")
@@ -147,8 +147,9 @@ def write_bundle(folder: Path, num_timesteps: int, keep: int, manifest: Mapping[
         shutil.rmtree(temporary, ignore_errors=True)
         raise
     for _, old in _list(folder)[:-keep]:  # renamed first: a bundle never has its name while half of it is gone
-        os.replace(old, temporary)
-        shutil.rmtree(temporary, ignore_errors=True)
+        doomed = folder / f"{_TEMPORARY}{uuid.uuid4().hex[:12]}"
+        os.replace(old, doomed)
+        shutil.rmtree(doomed, ignore_errors=True)
 
 
 def list_bundles(folder: str | os.PathLike[str]) -> list[Path]:

@@ -242,6 +242,16 @@ def test_a_candidate_that_still_plays_when_it_is_judged_does_not_keep_the_next_o
     assert trials.roles == ["candidate", "candidate"] and not trials.needs_candidate()
 
 
+def test_what_the_old_habit_has_begun_elsewhere_is_no_return_of_the_new_one():
+    trials = Trials(2, habit_returns=[100.0, 100.0], roles=["candidate", "habit"], generations=[0, 0])
+    trials.begin_all()
+    trials.roles = ["candidate", "habit"]
+    trials.candidate_returns, trials.candidate_steps = [200.0], PROOF_STEPS
+    assert play(trials, 200.0, env=0) == ("candidate", "accepted")
+    play(trials, 50.0, env=1)
+    assert trials.habit_returns == [200.0, 200.0]
+
+
 def test_a_reset_of_the_environments_forgets_running_episodes_and_nothing_else():
     trials = Trials(2)
     play_quiet(trials, 100.0)
@@ -420,6 +430,20 @@ def test_save_and_load_keep_the_habit_and_what_is_known_of_it(tmp_path):
     assert len(loaded.trials.roles) == 2 and loaded.trials.habit_returns == model.trials.habit_returns
 
 
+def test_a_file_of_0_2_says_so(tmp_path):
+    """Its signals were keywords of the agent, and its policy had no spread."""
+    model = imitating()
+    model.signal_normalizer = "max"
+    model.save(tmp_path / "agent")
+    with pytest.raises(ValueError, match=r"agent is of another version of sb3_actpc \(before signal_kwargs\)"):
+        ActPC.load(tmp_path / "agent")
+    model = imitating()
+    del model.policy._buffers["spread"]
+    model.save(tmp_path / "agent")
+    with pytest.raises(ValueError, match=r"another version of sb3_actpc \(its policy has other parts\)"):
+        ActPC.load(tmp_path / "agent")
+
+
 def test_a_file_of_another_version_says_so(tmp_path, monkeypatch):
     """Its classes had other places."""
     gone = types.ModuleType("sb3_actpc.gone")
@@ -478,7 +502,7 @@ def test_noise_is_no_wider_than_the_demonstrations_around_the_warm_started_actor
         data = dataclasses.replace(demonstrations(), actions=2.0 * signs * sizes)  # of a box from -2 to 2
         model = ActPC("MlpPolicy", CountingEnv(), demonstrations=data, **QUICK, exploration_noise=0.1)
         model.pretrain()
-        assert model.policy.trust_region.spread.tolist() == pytest.approx(np.maximum(sizes, 0.02), rel=1e-4)
+        assert model.policy.spread.tolist() == pytest.approx(np.maximum(sizes, 0.02), rel=1e-4)
         assert model._exploration((20_000, 2)).std(0) == pytest.approx(np.array(expected), rel=0.05)
 
 

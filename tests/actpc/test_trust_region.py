@@ -12,40 +12,43 @@ from sb3_actpc.actpc.trust_region import (
     RADII,
     SMALLEST_SPREAD,
     TrustRegion,
+    spread_of,
 )
 
 ZEROS = th.zeros(4, 2)
 
 
-def region_with(spread, radius=1.0):
-    region = TrustRegion(len(spread), radius)
-    region.spread.copy_(th.tensor(spread))
-    return region
+ONES = th.ones(2)
 
 
 def test_the_spread_is_the_residuals_root_mean_square_in_every_dimension_and_has_a_least():
-    region = TrustRegion(2, 1.0)
-    region.fit(th.tensor([[0.3, 0.001], [-0.4, 0.001]]))
-    assert region.spread.tolist() == pytest.approx([math.sqrt(0.125), SMALLEST_SPREAD])
+    residuals = th.tensor([[0.3, 0.001], [-0.4, 0.001]])
+    assert spread_of(residuals).tolist() == pytest.approx([math.sqrt(0.125), SMALLEST_SPREAD])
 
 
 def test_the_deviation_is_counted_in_variances_of_each_dimension():
     """One standard deviation in every dimension is a deviation of 1, whatever its spread; the start is forgotten."""
-    region = region_with([0.1, 0.5])
-    region.regulate(th.tensor([[0.1, -0.5]] * 4), ZEROS)
+    region, spread = TrustRegion(1), th.tensor([0.1, 0.5])
+    region.regulate(th.tensor([[0.1, -0.5]] * 4), ZEROS, spread)
     assert float(region.deviation) == pytest.approx(DEVIATION_RATE)
     for _ in range(1000):
-        region.regulate(th.tensor([[0.1, -0.5]] * 4), ZEROS)
+        region.regulate(th.tensor([[0.1, -0.5]] * 4), ZEROS, spread)
     assert float(region.deviation) == pytest.approx(1.0, abs=1e-4)
+
+
+def test_an_unknown_spread_counts_as_one():
+    region = TrustRegion(1)
+    region.regulate(th.full((4, 2), 0.5), ZEROS, th.full((2,), th.inf))
+    assert float(region.deviation) == pytest.approx(0.25 * DEVIATION_RATE)
 
 
 def test_the_multiplier_grows_inside_falls_outside_and_rests_on_the_border():
     rates = []
     for deviation in (0.0, 0.5, 1.0, 1.5, 2.0, 9.0):
-        region = region_with([1.0, 1.0], radius=1.0)
+        region = TrustRegion(1.0)
         region.deviation.fill_(deviation)
         before = float(region.multiplier)
-        after = float(region.regulate(th.full((4, 2), math.sqrt(deviation)), ZEROS))
+        after = float(region.regulate(th.full((4, 2), math.sqrt(deviation)), ZEROS, ONES))
         rates.append(math.log(after / before) / MULTIPLIER_RATE)
     assert rates == pytest.approx([1.0, 0.5, 0.0, -0.5, -1.0, -1.0], abs=1e-3)
 
@@ -53,17 +56,17 @@ def test_the_multiplier_grows_inside_falls_outside_and_rests_on_the_border():
 def test_a_wider_radius_is_reached_by_an_actor_that_follows_the_pressure():
     """A play in which the deviation is the multiplier squared: it settles where the deviation is the radius."""
     for radius in (0.25, 4.0):
-        region = region_with([1.0, 1.0], radius=radius)
+        region = TrustRegion(radius)
         for _ in range(3000):
-            region.regulate(region.multiplier.expand(4, 2), ZEROS)
+            region.regulate(region.multiplier.expand(4, 2), ZEROS, ONES)
         assert float(region.multiplier) == pytest.approx(math.sqrt(radius), rel=0.01)
 
 
 def test_multiplier_and_radius_stay_within_bounds():
     for verdict, actions, bound in (("tied", ZEROS, 1), ("rejected", ZEROS + 1e6, 0)):
-        region = region_with([1.0, 1.0])
+        region = TrustRegion(1)
         for _ in range(1000):
-            region.regulate(actions, ZEROS)
+            region.regulate(actions, ZEROS, ONES)
             region.resize(verdict)
         assert float(region.radius) == pytest.approx(RADII[bound])
         assert float(region.multiplier) == pytest.approx(MULTIPLIERS[bound])
@@ -71,14 +74,14 @@ def test_multiplier_and_radius_stay_within_bounds():
 
 def test_holding_its_own_widens_the_radius_and_losing_shrinks_it():
     for verdict, grows in (("accepted", True), ("tied", True), ("rejected", False)):
-        region = region_with([1.0])
+        region = TrustRegion(1)
         region.resize(verdict)
         assert (float(region.radius) > 1.0) == grows
 
 
 def test_what_is_returned_does_not_change_with_the_next_update():
-    region = region_with([1.0, 1.0])
-    first = region.regulate(ZEROS, ZEROS)
+    region = TrustRegion(1)
+    first = region.regulate(ZEROS, ZEROS, ONES)
     kept = float(first)
-    region.regulate(ZEROS, ZEROS)
+    region.regulate(ZEROS, ZEROS, ONES)
     assert float(first) == kept < float(region.multiplier)

@@ -7,6 +7,7 @@ import subprocess
 import tempfile
 from collections.abc import Sequence
 from multiprocessing import Pipe
+from threading import Timer
 from typing import Any
 
 from sb3_actpc.baselines.offline.servers.frames import Arrays, Values, pack, unpack
@@ -46,6 +47,8 @@ class ServerProcess:
                 start_new_session=True,  # Ctrl-C is for the parent, who then closes the pipe
             )
         except OSError as error:
+            self._channel.close()
+            self._log.close()
             raise ServerFailed(f"{name} cannot be started: {error}") from error
         finally:
             theirs.close()
@@ -62,8 +65,11 @@ class ServerProcess:
         if self._channel.closed:
             raise ServerFailed(f"{self.name} has ended before: close() the agent, which starts it again as it was last saved")
         is_answered = False
+        deadline = Timer(self.timeout, self._process.kill)  # sending blocks while the other takes nothing in
         try:
+            deadline.start()
             self._channel.send_bytes(pack({"ask": what, **values}, arrays or {}))
+            deadline.cancel()
             if not self._channel.poll(self.timeout):
                 raise TimeoutError
             answer, answered = unpack(self._channel.recv_bytes(MAX_ANSWER))
@@ -75,6 +81,7 @@ class ServerProcess:
         except (OSError, ValueError) as error:
             raise ServerFailed(f"{self.name} said what is no answer to {what!r}: {error}") from None
         finally:
+            deadline.cancel()
             if not is_answered:  # also when interrupted: the next answer would not fit its question
                 self.close()
         if "error" in answer:
