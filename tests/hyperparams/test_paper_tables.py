@@ -36,6 +36,8 @@ RUNGS = {
     "n_demonstration_transitions",
     "actor_warm_start",
     "refresh_weight",
+    "policy_kwargs.habit",
+    "policy_kwargs.trust_radius",
 }
 
 
