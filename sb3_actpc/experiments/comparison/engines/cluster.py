@@ -44,8 +44,9 @@ class RayEngine:
         self._is_mine = not self.ray.is_initialized()
         if self._is_mine:
             _check_address(address)
-            options = {"include_dashboard": False} if address is None else {}
-            self.ray.init(address=address, log_to_driver=False, **options)
+            # None might find the file of a cluster that has died, and wait for it
+            options = {"address": "local", "include_dashboard": False} if address is None else {"address": address}
+            self.ray.init(log_to_driver=False, **options)
         self._task = self.ray.remote(num_cpus=threads, max_retries=0)(_execute)
         self._board = self._start_board()
         self._tasks: dict[Any, Run] = {}  # by Ray's reference to the answer
