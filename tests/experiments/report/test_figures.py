@@ -114,7 +114,7 @@ def test_every_line_is_named_and_no_legend_lies_on_an_axis(tmp_path: Path, drawn
     every_figure(load_results(tmp_path), tmp_path / "none.png")
     assert len(drawn) == 4
     for figure in drawn:
-        figure.canvas.draw()
+        figure.draw_without_rendering()
         legends = [*figure.legends, *(one for axes in figure.axes if (one := axes.get_legend()))]
         boxes = [axes.get_window_extent() for axes in figure.axes]
         assert legends and not any(one.get_window_extent().overlaps(box) for one in legends for box in boxes)
