@@ -179,15 +179,15 @@ def ngclearn() -> Callable[[], object]:
 def main() -> None:
     """Parse, time, print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("library", choices=["ours", "ngclearn", "pcx"])
+    parser.add_argument("package", choices=["ours", "ngclearn", "pcx"])
     parser.add_argument("--rounds", type=int, default=50)
     args = parser.parse_args()
-    update, times = {"ours": ours, "ngclearn": ngclearn, "pcx": pcx}[args.library](), []
+    update, times = {"ours": ours, "ngclearn": ngclearn, "pcx": pcx}[args.package](), []
     for _ in range(args.rounds + 3):
         start = time.process_time()
         update()
         times.append(time.process_time() - start)
-    print(f"{args.library}: {1000 * statistics.median(times[3:]):.1f} ms, at least {1000 * min(times[3:]):.1f}")
+    print(f"{args.package}: {1000 * statistics.median(times[3:]):.1f} ms, at least {1000 * min(times[3:]):.1f}")
 
 
 if __name__ == "__main__":
