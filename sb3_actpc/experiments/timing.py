@@ -1,76 +1,194 @@
-"""What ``sb3-actpc bench`` measures beside the update: steps of training, acting, and growth with sizes."""
+"""What ``sb3-actpc bench`` measures, as ratios: updates, a settling, steps of training, acting, growth with sizes, memory."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import json
+import statistics
+import time
+from collections.abc import Callable, Iterable, Iterator
 from importlib.util import find_spec
-from typing import TYPE_CHECKING, Any, NamedTuple
+from pathlib import Path
+from typing import Any
 
-if TYPE_CHECKING:
-    from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+import gymnasium as gym
+import numpy as np
+import pandas as pd
+import torch as th
+from gymnasium import spaces
+from stable_baselines3 import TD3
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.logger import configure
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-    from sb3_actpc import ActPC
-    from sb3_actpc.ngc import NGCCircuit
+from sb3_actpc.actpc import ActPC
+from sb3_actpc.actpc.buffers import CombinedReplayBuffer
+from sb3_actpc.envs.robosuite_layouts import ROBOSUITE_TASKS
+from sb3_actpc.experiments.report.tables import markdown
+from sb3_actpc.experiments.runs.presets import preset, with_changes
+from sb3_actpc.ngc import NGCCircuit
+from sb3_actpc.ngc.products import has_bfloat16
 
 TASKS = ("SparseHopper-v5", "SparseHalfCheetah-v5")
+TASK = TASKS[1]
 BATCH_SIZE, WIDTH, N_FILLED = 256, 256, 1000
-N_STEPS = 50  # environment steps of one measurement
+N_STEPS = 50  # environment steps of one measurement of training
+N_ENV_STEPS = 20  # of one measurement of robosuite
+N_WARM_UP = 3  # rounds that do not count
 SWEEP = {"feedback": "learned", "feedback_start": "mirrored"}
-# the entry that others are divided by, and what their ratio is called then
-TRAINING_UNITS = {f"SB3 TD3, {task}": f"SB3 TD3's time for a step of {task}" for task in TASKS}
-ACTING_UNIT = {"NumPy, one observation": "NumPy's time"}
+QUICK = {"prior_updates": 1, "actor_warm_start": 0, "critic_warmup": 0}
+TD3_SIZES: dict[str, Any] = {"policy_kwargs": {"net_arch": [WIDTH, WIDTH]}, "batch_size": BATCH_SIZE}
 
 Entries = dict[str, Callable[[], object]]
+# what is timed in turns, and which of it the others (that follow) are divided by -> what their ratio is called then
+Group = tuple[Entries, dict[str, str]]
+Ratios = dict[str, tuple[float, str]]
 
 
-def training(device: str) -> list[tuple[Entries, dict[str, str]]]:
-    """
-    Every task's learners, one update for each environment step, batch and layers alike; SBX's where ``sbx-rl`` is installed.
+def measure(groups: Iterable[Group], rounds: int, device: str) -> Ratios:
+    """The ratios of all that is in the groups; entries of one group take turns."""
+    found: Ratios = {}
+    for entries, units in groups:
+        found |= ratios(_interleave(entries, rounds, th.cuda.synchronize if device != "cpu" else lambda: None), units)
+    return found
 
-    :param device: torch device
-    :return: for every task what is timed, and by what it is divided
-    """
-    return [(_learners(task, device), {base: unit}) for (base, unit), task in zip(TRAINING_UNITS.items(), TASKS, strict=True)]
+
+def _interleave(entries: Entries, rounds: int, synchronize: Callable[[], object]) -> dict[str, list[float]]:
+    """Seconds of every entry's rounds; with one thread the processor's, which other programs hardly change."""
+    clock = time.process_time if th.get_num_threads() == 1 and not th.cuda.is_initialized() else time.perf_counter
+    times: dict[str, list[float]] = {name: [] for name in entries}
+    for _ in range(rounds + N_WARM_UP):
+        for name, entry in entries.items():
+            synchronize()
+            start = clock()
+            entry()
+            synchronize()
+            times[name].append(clock() - start)
+    return {name: seconds[N_WARM_UP:] for name, seconds in times.items()}
+
+
+def ratios(times: dict[str, list[float]], units: dict[str, str]) -> Ratios:
+    """Of every entry, the median ratio, round by round, to the entry before it that is a unit."""
+    found, base, unit = {}, times[next(iter(units))], ""
+    for name, own in times.items():
+        if name in units:
+            base, unit = own, units[name]
+        found[name] = round(statistics.median(a / b for a, b in zip(own, base, strict=True)), 2), unit
+    return found
+
+
+def table(files: list[Path]) -> str:
+    """A Markdown table of what ``--output`` wrote, such as one file for each number of threads: a column for each file."""
+    measured = [json.loads(file.read_text()) for file in files]
+    heads = ["update, over its unit", *(f"{about['device']}, {about['threads']} threads" for about in measured)]
+    rows = []
+    for name, (_, unit) in measured[0]["ratios"].items():
+        cells = [f"{about['ratios'][name][0]:.2f}" if name in about["ratios"] else "" for about in measured]
+        rows.append([f"{name} / {unit}", *cells])
+    return markdown(pd.DataFrame(rows, columns=heads))
+
+
+# ---------------------------------------------------------------------- one update
+
+
+def updates(device: str, compiled: bool) -> Group:
+    """TD3's; the bare agent's and the shipped one's with every kind of settling, the paper's preset, and both presets with
+    products in bfloat16 where the processor has them."""
+    kinds: dict[str, tuple[str, dict[str, Any]]] = {
+        "tied sweep": ("scheduled", {"feedback": "tied"}),
+        "learned sweep": ("scheduled", SWEEP),
+        "iterative, default tolerance": ("iterative", SWEEP),
+    }
+    shipped, paper = "shipped, learned sweep", "paper preset"
+    settings = {
+        f"{name}, {kind}": with_changes(keywords, {"settling": settling, "policy_kwargs.circuit_kwargs": circuits})
+        for name, keywords in {"bare": {}, "shipped": preset(TASK, "actpc")}.items()
+        for kind, (settling, circuits) in kinds.items()
+    }
+    settings[paper] = preset(TASK, "actpc_paper")
+    if has_bfloat16():
+        low = {"policy_kwargs.circuit_kwargs.matmul_precision": "bfloat16"}
+        settings |= {f"{name}, bfloat16": with_changes(settings[name], low) for name in (shipped, paper)}
+    if compiled:
+        settings |= {f"{name}, compiled": {**settings[name], "compile": True} for name in settings if name.startswith(shipped)}
+    shared = {"learning_starts": 10 * N_FILLED, "buffer_size": 10 * N_FILLED, "device": device, "seed": 0}
+    entries = {"SB3 TD3 train()": _updater(TD3("MlpPolicy", TASK, **TD3_SIZES, **shared))}
+    for name, keywords in settings.items():
+        own = {"policy": "MlpPolicy", **keywords, **QUICK, "batch_size": BATCH_SIZE, **shared}
+        entries[name] = _updater(ActPC(env=TASK, **own))
+    return entries, {"SB3 TD3 train()": "TD3"}
+
+
+def _updater(model: OffPolicyAlgorithm) -> Callable[[], object]:
+    """Fill the buffer with random actions; one call is then two updates (TD3 moves its actor every other time)."""
+    model.set_logger(configure(None, []))
+    model.learn(N_FILLED)
+    return lambda: model.train(gradient_steps=2, batch_size=BATCH_SIZE)
+
+
+def settling(device: str) -> Group:
+    """One K = 10 settling of a tied circuit, and its matrix products alone."""
+    circuit = NGCCircuit(23, 17, (WIDTH, WIDTH), feedback="tied", dynamics="state").to(device)
+    x, target = th.randn(BATCH_SIZE, 23, device=device), th.randn(BATCH_SIZE, 17, device=device)
+    alone = "matrix products of one settling"
+    entries = {alone: _products(circuit, BATCH_SIZE), "one settling, K = 10": lambda: circuit.settle(x, target)}
+    return entries, {alone: "the products"}
+
+
+def _products(circuit: NGCCircuit, batch: int, of_update: bool = False) -> Callable[[], object]:
+    """The matrix products alone of a circuit of two hidden layers: of its settling, or of a whole update."""
+    wide, narrow = circuit.weights[1:]
+    hidden, output = (th.randn(batch, len(weights), device=weights.device) for weights in (wide, narrow))
+    up, down, change = th.empty_like(hidden), th.empty_like(output), th.empty_like(wide)
+
+    def products() -> None:
+        for _ in range(circuit.n_settling_steps):
+            th.mm(hidden, wide.t(), out=up)
+            th.mm(hidden, narrow.t(), out=down)
+            th.mm(output, narrow, out=up)
+            th.mm(hidden, wide, out=up)
+        if of_update:
+            th.mm(hidden, wide.t(), out=up)  # the projection before
+            th.mm(hidden.t(), hidden, out=change)  # the changes after
+
+    return products
+
+
+# ---------------------------------------------------------------------- training and acting
+
+
+def training(device: str) -> list[Group]:
+    """Every task's learners, one update for each environment step, batch and layers alike; SBX's where ``sbx-rl`` is
+    installed."""
+    return [(_learners(task, device), {f"SB3 TD3, {task}": f"SB3 TD3's time for a step of {task}"}) for task in TASKS]
 
 
 def _learners(task: str, device: str) -> Entries:
-    from stable_baselines3 import TD3
-
-    from sb3_actpc import ActPC
-    from sb3_actpc.experiments.runs import preset
-
-    shared: dict[str, Any] = {"learning_starts": 100, "batch_size": BATCH_SIZE, "buffer_size": 100 * N_FILLED, "seed": 0}
+    shared: dict[str, Any] = {"learning_starts": 100, "buffer_size": 100 * N_FILLED, "seed": 0}
     same: dict[str, Any] = {"train_freq": 1, "gradient_steps": 1, **shared}
-    quick = {"prior_updates": 1, "actor_warm_start": 0, "critic_warmup": 0}
-    bare: dict[str, Any] = {"policy_kwargs": {"circuit_kwargs": SWEEP}}
-    sizes: dict[str, Any] = {"policy_kwargs": {"net_arch": [WIDTH, WIDTH]}}
+    bare: dict[str, Any] = {"policy_kwargs": {"circuit_kwargs": SWEEP}, "batch_size": BATCH_SIZE, **same}
+    shipped = {**preset(task, "actpc"), **QUICK, "batch_size": BATCH_SIZE, **shared}
     models: dict[str, OffPolicyAlgorithm] = {
-        f"SB3 TD3, {task}": TD3("MlpPolicy", task, device=device, **sizes, **same),
-        f"bare, learned sweep, {task}": ActPC("MlpPolicy", task, device=device, compile=False, **bare, **same),
-        f"shipped, {task}": ActPC(env=task, device=device, compile=False, **{**preset(task, "actpc"), **quick, **shared}),
+        f"SB3 TD3, {task}": TD3("MlpPolicy", task, device=device, **TD3_SIZES, **same),
+        f"bare, learned sweep, {task}": ActPC("MlpPolicy", task, device=device, compile=False, **bare),
+        f"shipped, {task}": ActPC(env=task, device=device, compile=False, **shipped),
     }
     if find_spec("sbx"):
         import sbx
 
-        models[f"SBX TD3, {task}"] = sbx.TD3("MlpPolicy", task, **sizes, **same)
+        models[f"SBX TD3, {task}"] = sbx.TD3("MlpPolicy", task, **TD3_SIZES, **same)
     return {name: _learner(model) for name, model in models.items()}
 
 
 def _learner(model: OffPolicyAlgorithm, n_envs: int = 1) -> Callable[[], object]:
-    from stable_baselines3.common.logger import configure
-
     model.set_logger(configure(None, []))
     model.learn(2 * N_STEPS * n_envs)
     return lambda: model.learn(N_STEPS * n_envs, reset_num_timesteps=False)
 
 
-def acting() -> Entries:
+def acting() -> Group:
     """One observation through a net of two hidden layers: NumPy's products, and ours on the way that collecting takes."""
-    import numpy as np
-
-    from sb3_actpc import ActPC
-
-    agent: ActPC = ActPC("MlpPolicy", TASKS[1], device="cpu", seed=0)
+    agent: ActPC = ActPC("MlpPolicy", TASK, device="cpu", seed=0)
     layers = [(w.numpy(), b.numpy()) for w, b in zip(agent.actor.circuit.weights, agent.actor.circuit.biases, strict=True)]
     observation = np.zeros((1, 17), dtype=np.float32)
 
@@ -81,79 +199,83 @@ def acting() -> Entries:
         return np.tanh(h @ layers[-1][0].T + layers[-1][1])
 
     circuits = [agent.actor.circuit]
-    return {
+    entries: Entries = {
         "NumPy, one observation": by_numpy,
         "the circuit, one observation": lambda: agent.actor.circuit.project(agent.inputs.tensor(observation)),
         "collecting, one observation": lambda: agent.actor.roll_out(observation, None, None, circuits),
         "predict(), one observation": lambda: agent.predict(observation),
     }
+    return entries, {"NumPy, one observation": "NumPy's time"}
 
 
 # ---------------------------------------------------------------------- growth
 
 
-def growth() -> list[tuple[Entries, dict[str, str]]]:
-    """
-    What grows with K, width, batch and number of environments, over the smallest of its kind, and its matrix products.
-
-    :return: for every kind what is timed, and by what it is divided
-    """
-    kinds = {
-        "K": [(steps, _Size(steps=steps)) for steps in (5, 10, 20, 40)],
-        "width": [(width, _Size(width=width)) for width in (128, 256, 512, 1024)],
-        "batch": [(batch, _Size(batch=batch)) for batch in (64, 256, 1024)],
-    }
-    groups = []
-    for kind, sizes in kinds.items():
-        updates: Entries = {f"one update of eq. 1, {kind} = {value}": size.update() for value, size in sizes}
-        products: Entries = {f"its products, {kind} = {value}": size.products() for value, size in sizes}
-        unit = f"{kind} = {sizes[0][0]}"
-        groups.append((updates | products, {next(iter(entries)): unit for entries in (updates, products)}))
-    environments: Entries = {f"{N_STEPS} updates and steps, {n} environments": _environments(n) for n in (1, 4, 16)}
-    return [*groups, (environments, {next(iter(environments)): "one environment"})]
+def growth() -> list[Group]:
+    """What grows with K, width, batch and number of environments, over the smallest of its kind, and its matrix products."""
+    groups: list[Group] = []
+    for kind, values in {"K": (5, 10, 20, 40), "width": (128, 256, 512, 1024), "batch": (64, 256, 1024)}.items():
+        whole: Entries = {}
+        alone: Entries = {}
+        for value in values:
+            size = {"K": 10, "width": WIDTH, "batch": BATCH_SIZE, kind: value}
+            circuit = NGCCircuit(24, 6, (size["width"],) * 2, dynamics="state", n_settling_steps=size["K"])
+            whole[f"one update of eq. 1, {kind} = {value}"] = _circuit_update(circuit, size["batch"])
+            alone[f"its products, {kind} = {value}"] = _products(circuit, size["batch"], of_update=True)
+        groups.append((whole | alone, {next(iter(entries)): f"{kind} = {values[0]}" for entries in (whole, alone)}))
+    several: Entries = {f"{N_STEPS} updates and steps, {n} environments": _environments(n) for n in (1, 4, 16)}
+    return [*groups, (several, {next(iter(several)): "one environment"})]
 
 
-class _Size(NamedTuple):
-    steps: int = 10
-    width: int = 256
-    batch: int = 256
-
-    def circuit(self) -> NGCCircuit:
-        from sb3_actpc.ngc import NGCCircuit
-
-        return NGCCircuit(24, 6, (self.width, self.width), dynamics="state", n_settling_steps=self.steps)
-
-    def update(self) -> Callable[[], object]:
-        import torch as th
-
-        circuit, x, target = self.circuit(), th.randn(self.batch, 24), th.randn(self.batch, 6)
-        circuit.optimizer = th.optim.Adam(circuit.parameter_groups(1e-4), fused=True)
-        return lambda: circuit.apply_changes(circuit.hebbian_update(circuit.settle(x, target)))
-
-    def products(self) -> Callable[[], object]:
-        import torch as th
-
-        wide, narrow = self.circuit().weights[1:]
-        hidden, output = th.randn(self.batch, self.width), th.randn(self.batch, 6)
-        up, down, change = th.empty_like(hidden), th.empty_like(output), th.empty_like(wide)
-
-        def products() -> None:
-            for _ in range(self.steps):
-                th.mm(hidden, wide.t(), out=up)
-                th.mm(hidden, narrow.t(), out=down)
-                th.mm(output, narrow, out=up)
-                th.mm(hidden, wide, out=up)
-            th.mm(hidden, wide.t(), out=up)  # the projection before
-            th.mm(hidden.t(), hidden, out=change)  # the changes after
-
-        return products
+def _circuit_update(circuit: NGCCircuit, batch: int) -> Callable[[], object]:
+    x, target = th.randn(batch, 24), th.randn(batch, 6)
+    circuit.optimizer = th.optim.Adam(circuit.parameter_groups(1e-4), fused=True)
+    return lambda: circuit.apply_changes(circuit.hebbian_update(circuit.settle(x, target)))
 
 
 def _environments(n: int) -> Callable[[], object]:
-    from stable_baselines3.common.env_util import make_vec_env
-
-    from sb3_actpc import ActPC
-
     keywords: dict[str, Any] = {"batch_size": BATCH_SIZE, "buffer_size": 100 * N_FILLED, "compile": False, "seed": 0}
-    model: ActPC = ActPC("MlpPolicy", make_vec_env(TASKS[1], n), device="cpu", gradient_steps=1, **keywords)
-    return _learner(model, n)
+    return _learner(ActPC("MlpPolicy", make_vec_env(TASK, n), device="cpu", gradient_steps=1, **keywords), n)
+
+
+def memory_ratio() -> float:
+    """Bytes of a HalfCheetah transition in our replay buffer over those in SB3's."""
+    pair = spaces.Box(-np.inf, np.inf, (17,), np.float64), spaces.Box(-1.0, 1.0, (6,), np.float32)
+    ours, theirs = (
+        sum(value.nbytes for value in vars(kind(N_FILLED, *pair, device="cpu")).values() if isinstance(value, np.ndarray))
+        for kind in (CombinedReplayBuffer, ReplayBuffer)
+    )
+    return ours / theirs
+
+
+# ---------------------------------------------------------------------- robosuite
+
+
+def robosuite(rounds: int) -> Iterator[str]:
+    """A line for each task: steps and resets, interleaved with those of robosuite's own environment at its defaults.
+
+    :raises ImportError: when robosuite is not installed
+    """
+    for env_id, task in ROBOSUITE_TASKS.items():
+        times = _interleave(_robosuite_entries(env_id, task.name), rounds, lambda: None)
+        medians = {name: statistics.median(seconds) for name, seconds in times.items()}
+        both = {name: times[name] for name in ("our steps", "robosuite's steps")}
+        ratio, _ = ratios(both, {"our steps": ""})["robosuite's steps"]
+        yield (
+            f"{env_id}: {N_ENV_STEPS / medians['our steps']:.0f} steps/s, {ratio:.2f} x robosuite's own; "
+            f"a reset takes {1000 * medians['our reset']:.1f} ms, robosuite's {1000 * medians['robosuite reset']:.0f} ms"
+        )
+
+
+def _robosuite_entries(env_id: str, name: str) -> Entries:
+    from sb3_actpc.envs.robosuite_tasks import make_simulation
+
+    env, theirs = gym.make(env_id, horizon=10**9), make_simulation(name, use_object_obs=True, hard_reset=True)
+    env.reset(seed=0)
+    actions = np.random.default_rng(0).uniform(-0.3, 0.3, (N_ENV_STEPS, 7))
+    return {
+        "our steps": lambda: [env.step(action) for action in actions],
+        "robosuite's steps": lambda: [theirs.step(action) for action in actions],
+        "our reset": env.reset,
+        "robosuite reset": theirs.reset,
+    }

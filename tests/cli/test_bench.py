@@ -2,7 +2,8 @@
 
 import json
 
-from sb3_actpc.cli.bench import _ratios, table
+from sb3_actpc.experiments.timing import ratios as ratios_of
+from sb3_actpc.experiments.timing import table
 
 
 def test_ratios_are_medians_of_the_rounds_own():
@@ -12,7 +13,7 @@ def test_ratios_are_medians_of_the_rounds_own():
         "products": [0.5, 0.5, 0.5],
         "one settling": [1.0, 0.5, 3.0],  # ratios 2, 1, 6
     }
-    ratios = _ratios(times, {"SB3 TD3 train()": "TD3", "products": "the products"})
+    ratios = ratios_of(times, {"SB3 TD3 train()": "TD3", "products": "the products"})
     assert ratios["bare"] == (2.0, "TD3") and ratios["one settling"] == (2.0, "the products")
     assert ratios["products"] == (1.0, "the products")
 
