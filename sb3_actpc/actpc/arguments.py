@@ -1,5 +1,4 @@
-"""
-What the constructors of ActPC and of its policy take. The kind and the range of a keyword stand in the constructor's
+"""What the constructors of ActPC and of its policy take. The kind and the range of a keyword stand in the constructor's
 signature, where type checkers see them too; :func:`checked` holds the values to it before anything is made of them.
 """
 
@@ -58,8 +57,7 @@ _KINDS: dict[Any, str] = {
 
 
 def checked(init: Callable[Parameters, None]) -> Callable[Parameters, None]:
-    """
-    A constructor that refuses values which its annotations do not allow.
+    """A constructor that refuses values which its annotations do not allow.
 
     :param init: an ``__init__``; a function (name, value) in an ``Annotated`` raises ValueError for a bad value
     :return: the same, checked
@@ -140,8 +138,7 @@ def check_computes(name: str, device: Any) -> None:
 
 
 def check_actions(space: gym.spaces.Box, noise: ActionNoise | None) -> None:
-    """
-    :param space: of the environment's actions
+    """:param space: of the environment's actions
     :param noise: of exploration; its shape is known for SB3's kinds
     :raises ValueError: when a dimension has no finite extent, or the noise another shape
     """

@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import torch as th
@@ -11,10 +11,12 @@ from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer
 from stable_baselines3.common.vec_env import VecNormalize
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
+from sb3_actpc.actpc.arguments import Between, Share, Size, checked
 from sb3_actpc.actpc.reward_signals import STORED, Normalize
 from sb3_actpc.actpc.self_imitation import Observations, SelfImitationMemory, TensorObservations, map_observations
-from sb3_actpc.utils.checks import LARGEST_SIZE, check_kinds, check_range
+from sb3_actpc.utils.checks import LARGEST_SIZE
 
+Length = Annotated[int, Between(0, LARGEST_SIZE)]
 # (observations, actions, next observations, the working memory's past and which of it there was) of n_envs new transitions ->
 # their epistemic and instrumental signals, (n_envs,) each
 Score = Callable[
@@ -23,8 +25,7 @@ Score = Callable[
 
 
 class SignalReplaySamples(NamedTuple):
-    """
-    SB3's replay samples with what ActPC keeps beside them. B transitions, the newest of every environment first.
+    """SB3's replay samples with what ActPC keeps beside them. B transitions, the newest of every environment first.
 
     :param observations: (B, *obs_shape), or a dict of such
     :param actions: (B, A), scaled to [-1, 1]
@@ -59,8 +60,7 @@ class SignalReplaySamples(NamedTuple):
 
 
 class SignalReplay(ReplayBuffer):
-    """
-    What all ActPC buffers add to SB3's; combine it with one of them.
+    """What all ActPC buffers add to SB3's; combine it with one of them.
 
     * Combined experience replay (Zhang & Sutton, 2017): the newest transition of every environment is always in the batch.
     * The epistemic and the instrumental signal of every transition, stored apart from the task's reward.
@@ -76,22 +76,17 @@ class SignalReplay(ReplayBuffer):
     :raises ValueError: naming a value that is not allowed, or two that do not go together
     """
 
+    @checked
     def __init__(
         self,
         *args: Any,
         combined: bool = True,
-        self_imitation_size: int = 100_000,
-        history: int = 0,
-        n_steps: int = 1,
-        gamma: float = 0.99,
+        self_imitation_size: Length = 100_000,
+        history: Length = 0,
+        n_steps: Size = 1,
+        gamma: Share = 0.99,
         **kwargs: Any,
     ) -> None:
-        given: dict[str, Any] = {"combined": combined, "self_imitation_size": self_imitation_size, "history": history}
-        given |= {"n_steps": n_steps, "gamma": gamma}
-        check_kinds(given, whole="history self_imitation_size n_steps", numbers="gamma", flags="combined")
-        check_range(given, "history self_imitation_size", 0, LARGEST_SIZE)
-        check_range(given, "n_steps", 1, LARGEST_SIZE)
-        check_range(given, "gamma", 0, 1)
         super().__init__(*args, **kwargs)
         if n_steps > 1 and self.optimize_memory_usage:
             raise ValueError(f"n_steps={n_steps} does not work with optimize_memory_usage=True; use n_steps=1 or leave it out")
@@ -113,8 +108,7 @@ class SignalReplay(ReplayBuffer):
         infos: list[dict[str, Any]],
         score: Score | None = None,
     ) -> None:
-        """
-        Store a transition of every environment, with its signals.
+        """Store a transition of every environment, with its signals.
 
         :param obs: (n_envs, *obs_shape), or a dict of such
         :param next_obs: likewise
@@ -189,8 +183,7 @@ class SignalReplay(ReplayBuffer):
     def sample(  # type: ignore[override]
         self, batch_size: int, env: VecNormalize | None = None, rewards_of: tuple[Normalize, Normalize] | None = STORED
     ) -> SignalReplaySamples:
-        """
-        :param batch_size: B
+        """:param batch_size: B
         :param env: VecNormalize whose statistics normalise observations and the task's rewards
         :param rewards_of: what stored epistemic and instrumental signals pay, element by element; themselves by default. None
             where nobody asks: the signals are 0, and with n-step returns nothing is gathered one step on
@@ -267,8 +260,7 @@ class SignalReplay(ReplayBuffer):
     def _past_at(
         self, rows: np.ndarray, envs: np.ndarray, including: bool = False
     ) -> tuple[Observations | None, np.ndarray | None]:
-        """
-        The ``history`` observations before each row in its episode, (B, H, *obs_shape), oldest first, and which of them
+        """The ``history`` observations before each row in its episode, (B, H, *obs_shape), oldest first, and which of them
         exist, (B, H); None and None without a history.
 
         :param including: those before the row's *next* observation: its own is the last of them
@@ -332,8 +324,7 @@ class CombinedDictReplayBuffer(SignalReplay, DictReplayBuffer):  # type: ignore[
 
 
 class CombinedHerReplayBuffer(SignalReplay, HerReplayBuffer):  # type: ignore[misc]
-    """
-    Hindsight experience replay with ActPC's signals: relabelling touches the task's reward and the goals alone.
+    """Hindsight experience replay with ActPC's signals: relabelling touches the task's reward and the goals alone.
 
     The newest transitions are real ones; of the rest SB3's ``her_ratio`` is relabelled.
     """
@@ -388,10 +379,7 @@ _BY_NAME = {kind.__name__: kind for kind in _COUNTERPARTS}
 
 
 def relabels(given: Any) -> bool:
-    """
-    :param given: the class the user asked for, or its name, or None
-    :return: whether it is one of hindsight
-    """
+    """Whether the class the user asked for, or its name, or None, is one of hindsight."""
     kind = _BY_NAME.get(given) if isinstance(given, str) else given
     return isinstance(kind, type) and issubclass(kind, HerReplayBuffer)
 
@@ -399,13 +387,8 @@ def relabels(given: Any) -> bool:
 def combined_buffer_class(
     given: type[ReplayBuffer] | str | None, observation_space: spaces.Space, n_steps: int = 1
 ) -> type[SignalReplay]:
-    """
-    :param given: the class the user asked for, or its name, or None
-    :param observation_space: Dict or not
-    :param n_steps: length of n-step returns
-    :return: the ActPC buffer that does what ``given`` does
-    :raises ValueError: for a class that does not keep ActPC's signals
-    """
+    """The ActPC buffer that does what the class the user asked for does, or its name, or None; ValueError for one that does
+    not keep ActPC's signals."""
     if isinstance(given, str):
         if given not in _BY_NAME:
             raise ValueError(f"replay_buffer_class={given!r} is unknown; choose one of {list(_BY_NAME)}")

@@ -9,15 +9,15 @@ from gymnasium import spaces
 
 from sb3_actpc.actpc.features import Batch, CircuitInputs
 from sb3_actpc.actpc.reward_signals import Normalize
-from sb3_actpc.actpc.self_imitation import Episodes, split_observations
+from sb3_actpc.actpc.self_imitation import Episodes
 from sb3_actpc.demonstrations.dataset import Demonstrations
+from sb3_actpc.demonstrations.rows import split_observations
 
 RawSignals = Callable[[th.Tensor, th.Tensor, th.Tensor, th.Tensor | None], tuple[np.ndarray, np.ndarray]]
 
 
 class DemonstrationReplay:
-    """
-    :param demonstrations: N transitions that fit the environment
+    """:param demonstrations: N transitions that fit the environment
     :param observation_space: the environment's
     :param action_space: the environment's
     :param history: H observations in the working memory; 0 for none
@@ -54,8 +54,7 @@ class DemonstrationReplay:
     def batch(
         self, rows: np.ndarray, inputs: CircuitInputs, weights: tuple[float, float, float], gamma: float, n_steps: int = 1
     ) -> Batch:
-        """
-        :param rows: (B,) which transitions
+        """:param rows: (B,) which transitions
         :param inputs: turns observations into features
         :param weights: (α_ext, α_ep, α_in)
         :param gamma: discount
@@ -100,8 +99,7 @@ class DemonstrationReplay:
     def refresh_signals(
         self, raw_signals: RawSignals, inputs: CircuitInputs, epistemic: Normalize, instrumental: Normalize
     ) -> None:
-        """
-        Signals of all transitions under the present generator and prior.
+        """Signals of all transitions under the present generator and prior.
 
         :param raw_signals: summed squared errors of both circuits from (features, actions, next features, memory)
         :param inputs: turns observations into features

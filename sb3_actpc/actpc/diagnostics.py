@@ -11,8 +11,7 @@ INTERVAL = 100  # updates between two measurements, or the next multiple of the 
 
 
 class Diagnostics:
-    """
-    Collects energies, settling residuals, action-values and signals; checks the synapses for NaN and infinity.
+    """Collects energies, settling residuals, action-values and signals; checks the synapses for NaN and infinity.
 
     :param policy: whose circuits are watched
     """
@@ -23,8 +22,7 @@ class Diagnostics:
         self.values: dict[str, float] = {}
 
     def begin_update(self, n_updates: int, step: int, delay: int = 1) -> None:
-        """
-        Decide whether this update is measured, and if so check all synapses.
+        """Decide whether this update is measured, and if so check all synapses.
 
         :param n_updates: number of the update, from 1 on
         :param step: environment step to name

@@ -12,8 +12,7 @@ from sb3_actpc.actpc.self_imitation import Observations, TensorObservations, map
 
 
 class Batch(NamedTuple):
-    """
-    Transitions as the circuits see them, B rows, the newest first, demonstrations (if mixed in) last.
+    """Transitions as the circuits see them, B rows, the newest first, demonstrations (if mixed in) last.
 
     :param features: normalised observations, (B, n_features)
     :param actions: (B, A), in [-1, 1]
@@ -56,8 +55,7 @@ class Batch(NamedTuple):
 
 
 class CircuitInputs:
-    """
-    :param actor: its extractor, normaliser and working memory are every circuit's
+    """:param actor: its extractor, normaliser and working memory are every circuit's
     :param vec_normalize: the VecNormalize wrapper of the training environment, or None
     """
 
@@ -69,8 +67,7 @@ class CircuitInputs:
         return th.as_tensor(array, dtype=th.float32, device=self.actor.normalizer.mean.device)
 
     def observations(self, observations: Any, batch_dims: int = 1) -> TensorObservations:
-        """
-        :param observations: numpy, as the environment gave them, with ``batch_dims`` leading dimensions; or a dict of such
+        """:param observations: numpy, as the environment gave them, with ``batch_dims`` leading dimensions; or a dict of such
         :return: tensors, normalised as the replay buffer's are
         """
         if self.vec_normalize is not None:
@@ -84,11 +81,8 @@ class CircuitInputs:
     def past(
         self, history: Observations | None, mask: np.ndarray | None
     ) -> tuple[TensorObservations | None, th.Tensor | None]:
-        """
-        :param history: numpy, (B, H, *obs_shape), as the environment gave them, or a dict of such; or None
-        :param mask: (B, H) or None
-        :return: both as :meth:`memory` takes them
-        """
+        """Both as :meth:`memory` takes them, from numpy: (B, H, *obs_shape) as the environment gave them, or a dict of such,
+        and (B, H); or None."""
         if history is None or mask is None:
             return None, None
         return self.observations(history, batch_dims=2), self.tensor(mask)
@@ -98,8 +92,7 @@ class CircuitInputs:
         return self.actor.features(observations)
 
     def past_features(self, history: TensorObservations | None, mask: th.Tensor | None) -> th.Tensor | None:
-        """
-        :param history: (B, H, *obs_shape), the observations before each row, oldest first; or None
+        """:param history: (B, H, *obs_shape), the observations before each row, oldest first; or None
         :param mask: (B, H), 1 where there was one in the same episode; or None
         :return: (B, H, n_features), zero before the episode's start; None without a history
         """
@@ -109,11 +102,7 @@ class CircuitInputs:
         return self.features(flat).view(*mask.shape, -1) * mask[:, :, None]
 
     def memory(self, history: TensorObservations | None, mask: th.Tensor | None) -> th.Tensor | None:
-        """
-        :param history: as for :meth:`past_features`
-        :param mask: likewise
-        :return: m_t, (B, n_memory), or None without a working memory
-        """
+        """m_t, (B, n_memory), or None without a working memory; for the parameters see :meth:`past_features`."""
         past = self.past_features(history, mask)
         return None if past is None or self.actor.memory is None else self.actor.memory(past)
 
@@ -125,13 +114,11 @@ class CircuitInputs:
         next_history: TensorObservations | None = None,
         next_mask: th.Tensor | None = None,
     ) -> tuple[th.Tensor | None, th.Tensor | None]:
-        """
-        :param history: as for :meth:`past_features`
-        :param mask: likewise
+        """m_t and m_{t+1} (or m_{t+n}), (B, n_memory) each, or None and None without a working memory.
+
+        :param history: as for :meth:`past_features`, like the three other parts of a past
         :param features: (B, n_features) of the present observations, the newest of the past one step on
         :param next_history: with returns of several steps, the past of the observation n steps on
-        :param next_mask: likewise
-        :return: m_t and m_{t+1} (or m_{t+n}), (B, n_memory) each, or None and None without a working memory
         """
         past = self.past_features(history, mask)
         if past is None or self.actor.memory is None:
@@ -142,12 +129,8 @@ class CircuitInputs:
         return self.actor.memory(past), self.actor.memory(following)
 
     def replayed(self, samples: SignalReplaySamples, weights: tuple[float, float, float], gamma: float) -> Batch:
-        """
-        :param samples: what the replay buffer drew
-        :param weights: (α_ext, α_ep, α_in)
-        :param gamma: discount of one step
-        :return: the transitions as the circuits see them
-        """
+        """The transitions that the replay buffer drew, as the circuits see them; ``weights`` are (α_ext, α_ep, α_in),
+        ``gamma`` discounts one step."""
         features = self.features(samples.observations)
         pasts = samples.history, samples.history_mask, features, samples.next_history, samples.next_history_mask
         memory, next_memory = self.memories(*pasts)

@@ -14,8 +14,7 @@ STORED: tuple[Normalize, Normalize] = (np.asarray, np.asarray)  # both signals p
 
 
 def summed_squared_errors(state: SettledState, which: str = "all") -> th.Tensor:
-    """
-    r̂ = Σ_l ||e^l||^2, the sum that both signals start from (paper, eqs. for r̂^ep and r̂^in).
+    """r̂ = Σ_l ||e^l||^2, the sum that both signals start from (paper, eqs. for r̂^ep and r̂^in).
 
     :param state: a settled circuit (under "scheduled", the errors as they first arrive)
     :param which: "all" layers, or the "output" layer's error only
@@ -26,8 +25,7 @@ def summed_squared_errors(state: SettledState, which: str = "all") -> th.Tensor:
 
 
 def instrumental_reward(normalized: np.ndarray, form: str = "penalty") -> np.ndarray:
-    """
-    What the prior's normalised errors are worth.
+    """What the prior's normalised errors are worth.
 
     :param normalized: (n,) in [0, 1], 0 where the step was as demonstrated
     :param form: "penalty", -r in [-1, 0] (the paper's equation; never positive, so that the shortest episode is the best where
@@ -44,8 +42,7 @@ class RunningMaximum:
         self.maximum = 1.0
 
     def __call__(self, raw: np.ndarray) -> np.ndarray:
-        """
-        :param raw: (n_envs,) new values r̂ >= 0; the maximum follows them
+        """:param raw: (n_envs,) new values r̂ >= 0; the maximum follows them
         :return: (n_envs,) in [0, 1]
         """
         self.maximum = max(self.maximum, float(raw.max()))
@@ -68,8 +65,7 @@ class Saturating:
 
 
 class RunningQuantile:
-    """
-    r = min(1, r̂ / q), where q follows the 0.9 quantile of r̂ by stochastic approximation on the log scale.
+    """r = min(1, r̂ / q), where q follows the 0.9 quantile of r̂ by stochastic approximation on the log scale.
 
     A single outlier moves q by a step, where it would hold down the running maximum for ever.
     """
@@ -78,8 +74,7 @@ class RunningQuantile:
         self.quantile, self.step, self.estimate = quantile, step, 0.0
 
     def __call__(self, raw: np.ndarray) -> np.ndarray:
-        """
-        :param raw: (n_envs,) new values r̂ >= 0; the quantile follows them
+        """:param raw: (n_envs,) new values r̂ >= 0; the quantile follows them
         :return: (n_envs,) in [0, 1]
         """
         for value in raw:
@@ -98,8 +93,7 @@ Normalizer = RunningMaximum | Saturating | RunningQuantile
 
 
 class InternalSignals:
-    """
-    What both signals are made of, and what their normalisers have seen.
+    """What both signals are made of, and what their normalisers have seen.
 
     :param normalizer: "max" (running maximum, the paper), "saturating" (r / (r + 1)) or "quantile"
     :param normalization: "stored" (once, when a transition is seen, the paper) or "sampled" (whenever it is replayed, by what
@@ -124,8 +118,7 @@ class InternalSignals:
     def score(
         self, epistemic: np.ndarray, instrumental: np.ndarray, alpha_ep: float, alpha_in: float
     ) -> tuple[np.ndarray, np.ndarray]:
-        """
-        :param epistemic: summed squared errors r̂ of the generator, (n_envs,); the normalisers follow them
+        """:param epistemic: summed squared errors r̂ of the generator, (n_envs,); the normalisers follow them
         :param instrumental: those of the prior
         :param alpha_ep: a signal without weight stays as it is
         :param alpha_in: likewise

@@ -9,7 +9,8 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 
-from sb3_actpc.demonstrations.dataset import Demonstrations
+from sb3_actpc.demonstrations import Demonstrations, scaled_actions
+from sb3_actpc.demonstrations.rows import split_observations
 
 Observations = np.ndarray | dict[str, np.ndarray]
 TensorObservations = th.Tensor | dict[str, th.Tensor]
@@ -17,8 +18,7 @@ PATIENCE = 20  # episodes, all with a negative return, after which the memory wa
 
 
 class ImitationSamples(NamedTuple):
-    """
-    Observations and actions worth imitating, B rows of successful episodes.
+    """Observations and actions worth imitating, B rows of successful episodes.
 
     :param observations: (B, *obs_shape) numpy, unnormalised, or a dict of such
     :param actions: (B, A), scaled to [-1, 1]
@@ -39,32 +39,9 @@ def map_observations(function: Callable[[Any], Any], observations: Any) -> Any:
     return function(observations)
 
 
-def split_observations(space: spaces.Space, rows: np.ndarray) -> Observations:
-    """
-    Undo ``gymnasium.spaces.utils.flatten`` for many rows at once.
-
-    :param space: a Box, or a Dict of Boxes
-    :param rows: (N, flat size)
-    :return: (N, *shape), or a dict of such
-    :raises ValueError: for other spaces
-    """
-    parts_of = space.spaces.values() if isinstance(space, spaces.Dict) else [space]
-    if not all(isinstance(part, spaces.Box) for part in parts_of):
-        raise ValueError(f"demonstrations need Box observations or a Dict of Boxes, found {space}")
-    if not isinstance(space, spaces.Dict):
-        return rows.reshape(len(rows), *(space.shape or ()))
-    parts, start = {}, 0
-    for key, part in space.spaces.items():
-        size = int(np.prod(part.shape or ()))
-        parts[key] = rows[:, start : start + size].reshape(len(rows), *(part.shape or ()))
-        start += size
-    return parts
-
-
 @dataclass
 class Episodes:
-    """
-    Episodes laid end to end.
+    """Episodes laid end to end.
 
     :param observations: (N, *obs_shape), or a dict of such
     :param actions: (N, A), scaled to [-1, 1]
@@ -83,21 +60,15 @@ class Episodes:
         cls, demonstrations: Demonstrations, observation_space: spaces.Space, action_space: spaces.Box
     ) -> "Episodes":
         """The demonstrations with actions scaled to [-1, 1]."""
-        low, high = action_space.low, action_space.high
-        actions = np.clip(2.0 * (demonstrations.actions - low.ravel()) / (high - low).ravel() - 1.0, -1.0, 1.0)
         bounds = demonstrations.episode_bounds
         return cls(
             observations=split_observations(observation_space, demonstrations.observations),
-            actions=actions.astype(np.float32),
+            actions=scaled_actions(demonstrations, action_space),
             starts=np.repeat(bounds[:, 0], bounds[:, 1] - bounds[:, 0]),
         )
 
     def take(self, indices: np.ndarray, history: int = 0) -> ImitationSamples:
-        """
-        :param indices: (B,) rows
-        :param history: H, how many preceding observations of the same episode come with each row
-        :return: the rows
-        """
+        """(B,) rows, each with ``history`` preceding observations of the same episode."""
         past, mask = self.past(indices, history)
         return ImitationSamples(
             map_observations(lambda array: array[indices], self.observations), self.actions[indices], past, mask
@@ -106,8 +77,7 @@ class Episodes:
     def past(
         self, indices: np.ndarray, history: int, including: bool = False
     ) -> tuple[Observations | None, np.ndarray | None]:
-        """
-        :param indices: (B,) rows
+        """:param indices: (B,) rows
         :param history: H
         :param including: the past of the step after each row, the row itself its newest part
         :return: (B, H, *obs_shape), the observations before each row, oldest first, and (B, H), 1 where there is one in the
@@ -121,8 +91,7 @@ class Episodes:
 
 
 class SelfImitationMemory:
-    """
-    The actor's memory of its own goal-reaching episodes (paper: M^actor, Algorithm 1, line 29), laid end to end.
+    """The actor's memory of its own goal-reaching episodes (paper: M^actor, Algorithm 1, line 29), laid end to end.
 
     An episode enters when its sparse return is positive and at least the best return now stored; the oldest leave when the
     capacity is passed. A task that pays negative rewards alone never gets one in: the memory warns of it, once.
@@ -146,11 +115,7 @@ class SelfImitationMemory:
         return max(self.returns, default=0.0)
 
     def takes(self, length: int, episode_return: float) -> bool:
-        """
-        :param length: transitions of an episode that has ended
-        :param episode_return: its sparse return
-        :return: whether it is good enough, and short enough
-        """
+        """Whether an episode of so many transitions, which has ended with this sparse return, is good and short enough."""
         self._n_ended, self._best_ended = self._n_ended + 1, max(self._best_ended, episode_return)
         if self._n_ended == PATIENCE and self._best_ended < 0.0:
             warnings.warn(
@@ -162,11 +127,7 @@ class SelfImitationMemory:
         return episode_return > 0.0 and episode_return >= self.best_return and length <= self.capacity
 
     def store(self, observations: Observations, actions: np.ndarray, episode_return: float) -> None:
-        """
-        :param observations: (T, *obs_shape) of one whole episode, or a dict of such
-        :param actions: (T, A)
-        :param episode_return: its sparse return
-        """
+        """One whole episode: observations (T, *obs_shape) or a dict of such, actions (T, A), and its sparse return."""
         self.lengths.append(len(actions))
         self.returns.append(episode_return)
         n_gone = 0

@@ -8,7 +8,6 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv
 from torch import nn
 
 from sb3_actpc.baselines.bc_policies import BCPolicy, BCRNNPolicy, CloningPolicy
@@ -18,36 +17,25 @@ from sb3_actpc.utils.checks import check_kinds, check_range
 
 
 class BC(OfflineAlgorithm):
-    """
-    Behaviour cloning: the mean squared error between the demonstrated actions (scaled to [-1, 1]) and the network's.
+    """Behaviour cloning: the mean squared error between the demonstrated actions (scaled to [-1, 1]) and the network's.
 
     A step of ``learn`` is one gradient step. Observations are normalised by the demonstrations' mean and standard deviation.
 
-    :param policy: "MlpPolicy"
-    :param env: a task with Box observations and actions; for its spaces and for evaluations
+    :param args: policy and env of :class:`~sb3_actpc.baselines.offline_algorithm.OfflineAlgorithm`
     :param weight_decay: decoupled from the gradient (AdamW)
     :param input_noise: standard deviation of Gaussian noise on the normalised observations of each batch
-    :param options: keywords of :class:`~sb3_actpc.baselines.offline_algorithm.OfflineAlgorithm`; ``policy_kwargs`` takes
-        ``net_arch``
+    :param options: further keywords as there; ``policy_kwargs`` takes ``net_arch``
     :raises ValueError: as there
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": BCPolicy}
     policy: CloningPolicy
 
-    def __init__(
-        self,
-        policy: str | type[CloningPolicy],
-        env: GymEnv | str | None,
-        *,
-        weight_decay: float = 0.0,
-        input_noise: float = 0.0,
-        **options: Any,
-    ) -> None:
+    def __init__(self, *args: Any, weight_decay: float = 0.0, input_noise: float = 0.0, **options: Any) -> None:
         check_kinds(locals(), numbers="weight_decay input_noise")
         check_range(locals(), "weight_decay input_noise", 0)
         self.weight_decay, self.input_noise = weight_decay, input_noise
-        super().__init__(policy, env, **options)
+        super().__init__(*args, **options)
 
     # ------------------------------------------------------------------ setting up
 
@@ -108,8 +96,7 @@ class BC(OfflineAlgorithm):
 
 
 class BCRNN(BC):
-    """
-    Behaviour cloning with a recurrent network, in the way of robomimic's BC-RNN (Mandlekar et al., arXiv 2108.03298).
+    """Behaviour cloning with a recurrent network, in the way of robomimic's BC-RNN (Mandlekar et al., arXiv 2108.03298).
 
     It learns from sequences that begin anywhere in an episode, with an empty state, and end with it at the latest. When it
     plays, the state begins anew after as many steps, as in robomimic.
@@ -119,8 +106,7 @@ class BCRNN(BC):
     1. Mean squared error of the actions, not the likelihood of a Gaussian mixture.
     2. What would lie behind an episode's end is left out of the error, not filled up with its last transition.
 
-    :param policy: "MlpPolicy"
-    :param env: as :class:`BC`'s
+    :param args: as :class:`BC`'s
     :param sequence_length: L
     :param carry_state: when it plays, keep the state beyond L steps, through the whole episode
     :param options: further keywords of :class:`BC`; ``policy_kwargs`` are those of
@@ -130,19 +116,11 @@ class BCRNN(BC):
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": BCRNNPolicy}
 
-    def __init__(
-        self,
-        policy: str | type[CloningPolicy],
-        env: GymEnv | str | None,
-        *,
-        sequence_length: int = 10,
-        carry_state: bool = False,
-        **options: Any,
-    ) -> None:
+    def __init__(self, *args: Any, sequence_length: int = 10, carry_state: bool = False, **options: Any) -> None:
         check_kinds(locals(), whole="sequence_length", flags="carry_state")
         check_range(locals(), "sequence_length", 1)
         self.sequence_length, self.carry_state = sequence_length, carry_state
-        super().__init__(policy, env, **options)
+        super().__init__(*args, **options)
 
     def _network_kwargs(self) -> dict[str, Any]:
         return {"restart_every": None if self.carry_state else self.sequence_length}

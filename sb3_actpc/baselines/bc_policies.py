@@ -21,8 +21,7 @@ LARGEST_INPUT = 10.0  # as in SB3's VecNormalize
 
 
 class CloningPolicy(BasePolicy):
-    """
-    What both policies share: the normalisation of observations, the optimiser, and actions cut to [-1, 1] before they are
+    """What both policies share: the normalisation of observations, the optimiser, and actions cut to [-1, 1] before they are
     given the environment's units.
 
     :param observation_space: a Box
@@ -102,8 +101,7 @@ class BCPolicy(CloningPolicy):
 
 
 class BCRNNPolicy(CloningPolicy):
-    """
-    A recurrent network.
+    """A recurrent network.
 
     Its state is a tuple of arrays, as in sb3-contrib's RecurrentPPO: (n_layers, n, hidden_size) of the cells (two for an
     LSTM), and last the steps since it began, (n,).
@@ -141,8 +139,7 @@ class BCRNNPolicy(CloningPolicy):
     def forward(
         self, inputs: th.Tensor, hidden: tuple[th.Tensor, ...] | None = None
     ) -> tuple[th.Tensor, tuple[th.Tensor, ...]]:
-        """
-        :param inputs: normalised observations, (B, T, obs_dim)
+        """:param inputs: normalised observations, (B, T, obs_dim)
         :param hidden: of the cells, each (n_layers, B, hidden_size); None for zeros
         :return: actions, (B, T, A), not cut to [-1, 1], and the hidden state after the last
         """
@@ -165,8 +162,7 @@ class BCRNNPolicy(CloningPolicy):
         episode_start: np.ndarray | None = None,
         deterministic: bool = False,
     ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
-        """
-        :param observation: of one environment, or of n
+        """:param observation: of one environment, or of n
         :param state: what the call before returned; None at the beginning
         :param episode_start: (n,), true where an episode begins, and so the state
         :param deterministic: has no effect

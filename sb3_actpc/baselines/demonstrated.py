@@ -22,8 +22,7 @@ from sb3_actpc.utils.checks import check_range
 
 
 class LearnsFromDemonstrations(BaseAlgorithm):
-    """
-    The demonstrations of an algorithm: what the user asked for, and what of it fits the environment.
+    """The demonstrations of an algorithm: what the user asked for, and what of it fits the environment.
 
     :param policy: as SB3's
     :param env: as SB3's
@@ -59,25 +58,21 @@ class LearnsFromDemonstrations(BaseAlgorithm):
 
 
 class DemonstratedAlgorithm(LearnsFromDemonstrations, OffPolicyAlgorithm):
-    """
-    An off-policy algorithm whose replay buffer is one of :mod:`sb3_actpc.baselines.demonstration_buffers`.
+    """An off-policy algorithm whose replay buffer is one of :mod:`sb3_actpc.baselines.demonstration_buffers`.
 
     An agent that is loaded without an environment, to be played, gets a buffer of one transition and does not look for its
     demonstrations; :meth:`set_env` makes the whole buffer.
 
-    :param policy: as SB3's
-    :param env: as SB3's
+    :param args: policy and env, as SB3's
     :param demonstration_fraction: share of each batch that comes from the demonstrations; without them it has no effect
     :param options: keywords of :class:`LearnsFromDemonstrations` and of the algorithm
     :raises ValueError: as there, and for a share out of range
     """
 
-    def __init__(
-        self, policy: Any, env: GymEnv | str | None, *, demonstration_fraction: float = 0.5, **options: Any
-    ) -> None:
+    def __init__(self, *args: Any, demonstration_fraction: float = 0.5, **options: Any) -> None:
         check_range(locals(), "demonstration_fraction", 0, 1)
         self.demonstration_fraction = demonstration_fraction
-        super().__init__(policy, env, **options)
+        super().__init__(*args, **options)
 
     def _setup_model(self) -> None:
         asked = self.replay_buffer_class

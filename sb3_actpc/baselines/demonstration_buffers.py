@@ -41,8 +41,7 @@ def fill_with_demonstrations(
 
 
 class WithDemonstrations(ReplayBuffer):
-    """
-    What the buffers of this module add to SB3's; combine it with one of them.
+    """What the buffers of this module add to SB3's; combine it with one of them.
 
     The demonstrations stay in a buffer of their own, of the SB3 class, so that whatever that class does to its transitions
     (n-step returns, hindsight relabelling, normalisation) is done to them too. They come last in the batch.

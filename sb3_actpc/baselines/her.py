@@ -7,9 +7,7 @@ from typing import Any
 import numpy as np
 import torch as th
 from stable_baselines3.common.noise import ActionNoise
-from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
-from stable_baselines3.td3.policies import TD3Policy
 
 from sb3_actpc.baselines.demonstration_buffers import DemonstrationHerReplayBuffer, WithDemonstrations
 from sb3_actpc.baselines.prioritized import DemonstrationPrioritizedHerReplayBuffer, PrioritizedHerReplayBuffer
@@ -18,8 +16,7 @@ from sb3_actpc.utils.checks import check_range
 
 
 class HER(DDPGDemo):
-    """
-    DDPG with hindsight experience replay (Andrychowicz et al., arXiv 1707.01495) and demonstrations, on goal tasks.
+    """DDPG with hindsight experience replay (Andrychowicz et al., arXiv 1707.01495) and demonstrations, on goal tasks.
 
     Relabelling is SB3's ``HerReplayBuffer``. The defaults are the paper's baseline (arXiv 2209.09174): a random action with
     probability ε, ε = max(0.32, 0.9999^steps); every transition twice, with its own goal and with the last one achieved in
@@ -33,8 +30,8 @@ class HER(DDPGDemo):
        its HER used them.
     3. ε decays once per environment step; the paper does not say what its 0.9999 is applied to.
 
-    :param policy: "MultiInputPolicy"
-    :param env: a goal task: Dict observations with ``observation``, ``achieved_goal`` and ``desired_goal``
+    :param args: policy, "MultiInputPolicy", and env, a goal task: Dict observations with ``observation``, ``achieved_goal``
+        and ``desired_goal``
     :param prioritized: draw the agent's transitions by priority; ``replay_buffer_kwargs`` then takes ``alpha``, ``beta``,
         ``beta_increment`` and ``epsilon`` (see :class:`~sb3_actpc.baselines.prioritized.PrioritizedHerReplayBuffer`)
     :param random_action_start: ε at the start
@@ -48,9 +45,7 @@ class HER(DDPGDemo):
 
     def __init__(
         self,
-        policy: str | type[TD3Policy],
-        env: GymEnv | str | None,
-        *,
+        *args: Any,
         prioritized: bool = True,
         random_action_start: float = 1.0,
         random_action_decay: float = 0.9999,
@@ -65,7 +60,7 @@ class HER(DDPGDemo):
         self._has_episode = False
         buffer = {"n_sampled_goal": 1, "goal_selection_strategy": "final", **(replay_buffer_kwargs or {})}
         options = {"cloning_weight": 0.0, "demonstration_fraction": 0.5, **options, "replay_buffer_kwargs": buffer}
-        super().__init__(policy, env, **options)
+        super().__init__(*args, **options)
 
     def _replay_class(self) -> type[WithDemonstrations]:
         keys = set(getattr(self.observation_space, "spaces", {}))

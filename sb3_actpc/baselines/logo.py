@@ -13,7 +13,6 @@ from gymnasium import spaces
 from sb3_contrib import TRPO
 from sb3_contrib.common.utils import conjugate_gradient_solver
 from stable_baselines3.common.distributions import kl_divergence
-from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import create_mlp
 from stable_baselines3.common.type_aliases import GymEnv
 from torch import nn
@@ -26,8 +25,7 @@ _NETS = ("discriminator", "guidance_value", "discriminator_optimizer", "guidance
 
 
 class Guidance(NamedTuple):
-    """
-    What the guidance step needs of one iteration: N = n_steps x n_envs transitions, those of the first environment first.
+    """What the guidance step needs of one iteration: N = n_steps x n_envs transitions, those of the first environment first.
 
     :param observations: (N, *obs_shape)
     :param actions: (N, A)
@@ -44,8 +42,7 @@ class Guidance(NamedTuple):
 
 
 class LOGO(LearnsFromDemonstrations, TRPO):
-    """
-    Learning online with guidance offline (Rengarajan et al., arXiv 2202.04628), on sb3-contrib's TRPO.
+    """Learning online with guidance offline (Rengarajan et al., arXiv 2202.04628), on sb3-contrib's TRPO.
 
     Each iteration is TRPO's on the task's reward (policy improvement), then a trust-region step of size δ on the reward
     -log D(s, a) of a discriminator D that tells the agent's transitions (1) from the demonstrations (0): policy guidance. It
@@ -62,8 +59,7 @@ class LOGO(LearnsFromDemonstrations, TRPO):
     3. float32, not float64; observations are not normalised by running statistics.
     4. Where a time limit cuts an episode, the task's return bootstraps (SB3's), that of the guidance does not.
 
-    :param policy: "MlpPolicy"
-    :param env: a task with Box observations and actions
+    :param args: policy, "MlpPolicy", and env, a task with Box observations and actions
     :param guidance_delta: δ at the start, mean Kullback-Leibler divergence of the guidance step
     :param guidance_iterations: iterations before δ can shrink
     :param guidance_decay: what δ is then multiplied by
@@ -82,9 +78,7 @@ class LOGO(LearnsFromDemonstrations, TRPO):
 
     def __init__(
         self,
-        policy: str | type[ActorCriticPolicy],
-        env: GymEnv | str | None,
-        *,
+        *args: Any,
         guidance_delta: float = 0.01,
         guidance_iterations: int = 50,
         guidance_decay: float = 0.95,
@@ -107,7 +101,7 @@ class LOGO(LearnsFromDemonstrations, TRPO):
         self.delta = guidance_delta
         self._iteration_returns: list[float] = []
         self._past_returns: deque[float] = deque(maxlen=10)
-        super().__init__(policy, env, **{"cg_max_steps": 10, "line_search_shrinking_factor": 0.5, **options})
+        super().__init__(*args, **{"cg_max_steps": 10, "line_search_shrinking_factor": 0.5, **options})
 
     # ------------------------------------------------------------------ setting up
 

@@ -20,8 +20,7 @@ SelfOffline = TypeVar("SelfOffline", bound="OfflineAlgorithm")
 
 
 class OfflineAlgorithm(LearnsFromDemonstrations):
-    """
-    An algorithm that learns from demonstrations alone.
+    """An algorithm that learns from demonstrations alone.
 
     A step of ``learn`` is one gradient step on a batch of demonstrations: nothing is done in the environment, which gives the
     spaces and the demonstrations' task. Callbacks are called after each, so that evaluations at intervals work as for any
@@ -85,13 +84,6 @@ class OfflineAlgorithm(LearnsFromDemonstrations):
         self.batch_size = batch_size
         if _init_setup_model:
             self._setup_model()
-
-    @classmethod
-    def check_installed(cls) -> None:
-        """:raises ImportError: when something that the method needs is not installed; the message says how to install it"""
-
-    def close(self) -> None:
-        """Let go of what the agent holds beside its memory; here nothing."""
 
     @abstractmethod
     def train(self) -> None:

@@ -8,7 +8,7 @@ import torch as th
 from stable_baselines3 import SAC
 from stable_baselines3.common.policies import BasePolicy, ContinuousCritic
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor, create_mlp
-from stable_baselines3.common.type_aliases import GymEnv, Schedule
+from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.sac.policies import SACPolicy
 from torch import nn
 
@@ -37,8 +37,7 @@ class LayerNormCritic(ContinuousCritic):
 
 
 class LayerNormSACPolicy(SACPolicy):
-    """
-    SB3's SAC policy with :class:`LayerNormCritic`.
+    """SB3's SAC policy with :class:`LayerNormCritic`.
 
     :param args: as SB3's
     :param n_critics: how many critics
@@ -74,8 +73,7 @@ class LayerNormMultiInputPolicy(LayerNormSACPolicy):
 
 
 class RLPD(DemonstratedAlgorithm, SAC):
-    """
-    SAC in the way of RLPD (Ball et al., arXiv 2302.02948): half of every batch from the demonstrations, layer-normalised
+    """SAC in the way of RLPD (Ball et al., arXiv 2302.02948): half of every batch from the demonstrations, layer-normalised
     critics, an ensemble of which two bootstrap, several updates a step. The learning itself is Stable-Baselines3's SAC.
 
     Defaults are those published (10 critics, 20 updates a step, 5000 random steps before learning).
@@ -85,10 +83,8 @@ class RLPD(DemonstratedAlgorithm, SAC):
     1. The actor and the temperature are updated with every update of the critic; there once for all 20.
     2. The actor climbs the smallest of all critics' values, as in SB3; there their mean.
 
-    :param policy: "MlpPolicy" or "MultiInputPolicy"; ``policy_kwargs`` takes ``n_critics`` and ``n_target_critics``
-    :param env: as SB3's
-    :param learning_starts: as SB3's
-    :param gradient_steps: as SB3's
+    :param args: policy, "MlpPolicy" or "MultiInputPolicy", and env; ``policy_kwargs`` takes ``n_critics`` and
+        ``n_target_critics``
     :param options: keywords of :class:`~sb3_actpc.baselines.demonstrated.DemonstratedAlgorithm` and of SB3's SAC
     :raises ValueError: for a keyword with a value that is not allowed, for demonstrations that do not fit the environment
     """
@@ -98,13 +94,5 @@ class RLPD(DemonstratedAlgorithm, SAC):
         "MultiInputPolicy": LayerNormMultiInputPolicy,
     }
 
-    def __init__(
-        self,
-        policy: str | type[SACPolicy],
-        env: GymEnv | str | None,
-        *,
-        learning_starts: int = 5000,
-        gradient_steps: int = 20,
-        **options: Any,
-    ) -> None:
-        super().__init__(policy, env, learning_starts=learning_starts, gradient_steps=gradient_steps, **options)
+    def __init__(self, *args: Any, learning_starts: int = 5000, gradient_steps: int = 20, **options: Any) -> None:
+        super().__init__(*args, learning_starts=learning_starts, gradient_steps=gradient_steps, **options)

@@ -10,9 +10,7 @@ import numpy as np
 import torch as th
 from stable_baselines3 import TD3
 from stable_baselines3.common.policies import BaseModel
-from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.utils import polyak_update
-from stable_baselines3.td3.policies import TD3Policy
 
 from sb3_actpc.actpc.self_imitation import map_observations
 from sb3_actpc.baselines.demonstrated import DemonstratedAlgorithm
@@ -23,13 +21,11 @@ NETWORK_KEYWORDS = ("learning_rate", "optimizer", "optimizer_kwargs", "tau")
 
 
 class TD3Demo(DemonstratedAlgorithm, TD3):
-    """
-    Stable-Baselines3's TD3 (Fujimoto et al., arXiv 1802.09477) with a share of demonstrations in every batch.
+    """Stable-Baselines3's TD3 (Fujimoto et al., arXiv 1802.09477) with a share of demonstrations in every batch.
 
     Without demonstrations and without ``actor_kwargs`` and ``critic_kwargs`` it is SB3's TD3, number by number.
 
-    :param policy: as SB3's
-    :param env: as SB3's
+    :param args: policy and env, as SB3's
     :param actor_kwargs: of the actor alone: ``learning_rate`` (a number; it follows the schedule of the algorithm's),
         ``optimizer`` ("adam" or "adamw"), ``optimizer_kwargs`` and ``tau``
     :param critic_kwargs: the same for the critic
@@ -39,16 +35,14 @@ class TD3Demo(DemonstratedAlgorithm, TD3):
 
     def __init__(
         self,
-        policy: str | type[TD3Policy],
-        env: GymEnv | str | None,
-        *,
+        *args: Any,
         actor_kwargs: dict[str, Any] | None = None,
         critic_kwargs: dict[str, Any] | None = None,
         **options: Any,
     ) -> None:
         check_kinds(locals(), mappings="actor_kwargs critic_kwargs")
         self.actor_kwargs, self.critic_kwargs = actor_kwargs, critic_kwargs
-        super().__init__(policy, env, **options)
+        super().__init__(*args, **options)
 
     def _setup_model(self) -> None:
         super()._setup_model()
@@ -155,8 +149,7 @@ class TD3Demo(DemonstratedAlgorithm, TD3):
 
 
 class DDPGDemo(TD3Demo):
-    """
-    DDPG with demonstrations (the paper's DDPG-Demo), after Nair et al., arXiv 1709.10089.
+    """DDPG with demonstrations (the paper's DDPG-Demo), after Nair et al., arXiv 1709.10089.
 
     From there: demonstrations in every batch, a cloning loss on them, the Q-filter (only demonstrated actions that the critic
     values above the actor's are cloned) and both weights (λ1 = 0.001 of the policy gradient, λ2 = 1 / 128 of the cloning loss
@@ -170,8 +163,7 @@ class DDPGDemo(TD3Demo):
     3. Returns are one-step unless ``n_steps`` says otherwise.
     4. No L2 penalty on weights; ``actor_kwargs`` can ask for AdamW's decay.
 
-    :param policy: as SB3's
-    :param env: as SB3's
+    :param args: policy and env, as SB3's
     :param policy_gradient_weight: λ1, of minus the mean action-value; 1 where nothing is cloned
     :param cloning_weight: of the mean over the batch's demonstrations of the squared distance between action and
         demonstrated action (scaled to [-1, 1], summed over its dimensions); 0 for none
@@ -183,9 +175,7 @@ class DDPGDemo(TD3Demo):
 
     def __init__(
         self,
-        policy: str | type[TD3Policy],
-        env: GymEnv | str | None,
-        *,
+        *args: Any,
         policy_gradient_weight: float = 0.001,
         cloning_weight: float = 1.0,
         q_filter: bool = True,
@@ -199,7 +189,7 @@ class DDPGDemo(TD3Demo):
         # SB3's DDPG
         options = {"policy_delay": 1, "target_policy_noise": 0.1, "target_noise_clip": 0.0, **options}
         policy_kwargs = {"n_critics": 1, **(policy_kwargs or {})}
-        super().__init__(policy, env, demonstration_fraction=demonstration_fraction, policy_kwargs=policy_kwargs, **options)
+        super().__init__(*args, demonstration_fraction=demonstration_fraction, policy_kwargs=policy_kwargs, **options)
 
     def _actor_loss(self, batch: Any, actions: th.Tensor) -> th.Tensor:
         loss = super()._actor_loss(batch, actions)

@@ -76,8 +76,7 @@ def _hash_file(path: Path) -> str:
 
 
 class Bundle:
-    """
-    A checkpoint on the disk.
+    """A checkpoint on the disk.
 
     :param path: its folder
     :raises DamagedCheckpoint: when the manifest is missing or not whole
@@ -116,8 +115,7 @@ class Bundle:
 
 @contextmanager
 def write_bundle(folder: Path, num_timesteps: int, keep: int, manifest: Mapping[str, Any]) -> Iterator[BundleWriter]:
-    """
-    Write a checkpoint; it appears in ``folder`` only when the block and everything after it has worked.
+    """Write a checkpoint; it appears in ``folder`` only when the block and everything after it has worked.
 
     :param folder: of all checkpoints of a run
     :param num_timesteps: environment steps so far
@@ -158,8 +156,7 @@ def list_bundles(folder: str | os.PathLike[str]) -> list[Path]:
 
 
 def find_bundle(path: str | os.PathLike[str], report: Report = warn) -> Bundle:
-    """
-    The checkpoint at ``path``, or the newest whole one of those in it; damaged ones are named and skipped.
+    """The checkpoint at ``path``, or the newest whole one of those in it; damaged ones are named and skipped.
 
     :param path: one checkpoint, or the folder of a run's checkpoints
     :param report: given a line for every damaged one

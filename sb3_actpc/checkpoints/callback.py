@@ -74,8 +74,7 @@ class CheckpointCallback(BaseCallback):
         self.signals.restore()
 
     def save(self) -> Path:
-        """
-        Write a checkpoint now.
+        """Write a checkpoint now.
 
         :return: its folder
         :raises ValueError: when a weight is not finite
@@ -161,8 +160,7 @@ def why_no_checkpoints(algorithm: type[BaseAlgorithm]) -> str:
 
 
 def between_updates(callback: BaseCallback) -> Callable[[], None]:
-    """
-    For algorithms that learn before their first rollout, in ``_setup_learn``, where SB3 calls no callback.
+    """For algorithms that learn before their first rollout, in ``_setup_learn``, where SB3 calls no callback.
 
     :param callback: of this ``learn``, as SB3's ``_setup_learn`` returns it
     :return: to be called before each of those updates: goes on from a checkpoint taken there, and saves and stops on a signal
@@ -196,8 +194,7 @@ def restore(model: BaseAlgorithm, path: str | os.PathLike[str], report: Report =
 
 
 def continue_learning(restored: Restored, callback: MaybeCallback = None, **options: Any) -> BaseAlgorithm:
-    """
-    Learn until the step that the stopped run was to reach.
+    """Learn until the step that the stopped run was to reach.
 
     :param restored: what :func:`restore` or ``load_checkpoint`` returned
     :param callback: those of the stopped run, made anew, a :class:`CheckpointCallback` among them

@@ -7,6 +7,7 @@ import random
 import types
 from collections import OrderedDict, defaultdict, deque
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from enum import Enum
 from typing import Any
 
@@ -79,6 +80,14 @@ class Encoder:
         if isinstance(value, (list, tuple, deque, set, dict)):
             return self._container(value, where)
         return self._object(value, where)
+
+    def encode_some(self, values: Mapping[str, Any], where: str) -> dict[str, Any]:
+        """JSON of those values that can be stored, by name; the others are for their owner to make anew."""
+        stored = {}
+        for name, value in values.items():
+            with suppress(OpaqueValue):
+                stored[name] = self.encode(value, f"{where}.{name}")
+        return stored
 
     def _array(self, value: np.ndarray | np.generic | th.Tensor, where: str) -> dict[str, Any]:
         if isinstance(value, th.Tensor):

@@ -24,8 +24,7 @@ class TrainingStopped(SystemExit):
 
 
 class StopSignals:
-    """
-    Handlers that note the first signal; a second one goes to the handlers that were there before.
+    """Handlers that note the first signal; a second one goes to the handlers that were there before.
 
     Only the main thread can have handlers: elsewhere nothing is installed.
     """

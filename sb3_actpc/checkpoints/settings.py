@@ -40,8 +40,7 @@ _ATTRIBUTE_OF = {"stats_window_size": "_stats_window_size"}
 
 
 def constructor_settings(model: BaseAlgorithm) -> dict[str, Any]:
-    """
-    :param model: an SB3 algorithm
+    """:param model: an SB3 algorithm
     :return: JSON: its constructor's keywords by name, the policy's name among them; a value that cannot be named is left
         out and its keyword listed under ``"unnamed"``
     """

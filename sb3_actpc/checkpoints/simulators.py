@@ -55,8 +55,9 @@ def capture_vec_env(env: VecEnv, encoder: Encoder, where: str) -> dict[str, Any]
     # what the next reset will be given
     record["seeds"] = encoder.encode([innermost._seeds, innermost._options], f"{where}.seeds")
     for index, wrapper in enumerate(wrappers):
-        name = f"{where}.{type(wrapper).__qualname__}{index}"
-        record["wrappers"].append(_capture_wrapper(wrapper, encoder, name))
+        kind, kept = type(wrapper).__qualname__, {name: one for name, one in vars(wrapper).items() if name not in _SKIPPED}
+        # these hold settings besides what is known to change
+        record["wrappers"].append({"class": kind, "attributes": encoder.encode_some(kept, f"{where}.{kind}{index}")})
     if not isinstance(innermost, DummyVecEnv):
         reason = f"the environments of a {type(innermost).__qualname__} run in other processes"
         record["envs"] = [{"reason": reason} for _ in range(env.num_envs)]
@@ -89,7 +90,7 @@ def restore_vec_env(env: VecEnv, record: dict[str, Any], decoder: Decoder) -> li
             lost.append((index, reason))
     for wrapper, entry in zip(wrappers, record["wrappers"], strict=True):
         for name, node in entry["attributes"].items():
-            _set_attribute(wrapper, name, node, decoder)
+            set_attribute(wrapper, name, node, decoder)
     innermost._seeds, innermost._options = decoder.decode(record["seeds"])
     return lost
 
@@ -147,28 +148,15 @@ def restore_env(env: gym.Env[Any, Any], entry: dict[str, Any], decoder: Decoder,
                 data = getattr(layer, name)
                 restore_physics(data.model, data, decoder.decode(node["physics"]))
             else:
-                _set_attribute(layer, name, node, decoder)
+                set_attribute(layer, name, node, decoder)
 
 
-def _set_attribute(layer: Any, name: str, node: Any, decoder: Decoder) -> None:
-    existing = vars(layer).get(name)
-    if isinstance(node, dict) and "left" in node:
-        return
+def set_attribute(owner: Any, name: str, node: Any, decoder: Decoder) -> None:
+    """Put a stored attribute back; what can be changed in place is."""
+    existing = vars(owner).get(name)
     value = decoder.decode(node, existing)
     if value is not existing:
-        setattr(layer, name, value)
-
-
-def _capture_wrapper(wrapper: VecEnv, encoder: Encoder, where: str) -> dict[str, Any]:
-    attributes = {}
-    for name, value in vars(wrapper).items():
-        if name in _SKIPPED:
-            continue
-        try:
-            attributes[name] = encoder.encode(value, f"{where}.{name}")
-        except OpaqueValue:  # wrappers of vectorised environments hold settings besides what is known to change
-            continue
-    return {"class": type(wrapper).__qualname__, "attributes": attributes}
+        setattr(owner, name, value)
 
 
 # ------------------------------------------------------------------ MuJoCo

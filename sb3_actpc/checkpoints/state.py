@@ -24,8 +24,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_actpc.checkpoints.bundle import Bundle, BundleWriter, Report
-from sb3_actpc.checkpoints.encoding import Decoder, Encoder, OpaqueValue
-from sb3_actpc.checkpoints.simulators import capture_vec_env, env_name, restore_vec_env, vec_env_layers
+from sb3_actpc.checkpoints.encoding import Decoder, Encoder
+from sb3_actpc.checkpoints.simulators import capture_vec_env, env_name, restore_vec_env, set_attribute, vec_env_layers
 from sb3_actpc.utils.versions import installed_version
 
 _COUNTERS = (
@@ -253,18 +253,13 @@ def _cut_running_episodes(buffer: ReplayBuffer) -> None:
 def _capture_callback(callback: BaseCallback, encoder: Encoder, where: str) -> dict[str, Any]:
     if hasattr(callback, "checkpoint_state"):
         return {"own": encoder.encode(own_state(callback), where)}
-    attributes, envs = {}, {}
-    chosen = inspect.signature(type(callback).__init__).parameters.keys() | _CALLBACK_SKIPPED
-    for name, value in vars(callback).items():
-        if isinstance(value, VecEnv):
-            envs[name] = capture_vec_env(value, encoder, f"{where}.{name}")
-        if isinstance(value, VecEnv) or name in chosen:
-            continue
-        try:
-            attributes[name] = encoder.encode(value, f"{where}.{name}")
-        except OpaqueValue:  # bars, figures, open files: the new callback has its own
-            continue
-    return {"attributes": attributes, "envs": envs}
+    envs = {name: value for name, value in vars(callback).items() if isinstance(value, VecEnv)}
+    left_out = inspect.signature(type(callback).__init__).parameters.keys() | _CALLBACK_SKIPPED | envs.keys()
+    kept = {name: value for name, value in vars(callback).items() if name not in left_out}
+    return {
+        "attributes": encoder.encode_some(kept, where),  # of bars, figures and open files the new callback has its own
+        "envs": {name: capture_vec_env(env, encoder, f"{where}.{name}") for name, env in envs.items()},
+    }
 
 
 def _restore_callback(callback: BaseCallback, record: dict[str, Any], decoder: Decoder) -> None:
@@ -272,8 +267,7 @@ def _restore_callback(callback: BaseCallback, record: dict[str, Any], decoder: D
         callback.restore_checkpoint_state(decoder.decode(record["own"]))  # type: ignore[attr-defined]
         return
     for name, node in record["attributes"].items():
-        if not (isinstance(node, dict) and "left" in node):
-            setattr(callback, name, decoder.decode(node, vars(callback).get(name)))
+        set_attribute(callback, name, node, decoder)
     for name, env_record in record["envs"].items():
         restore_vec_env(vars(callback)[name], env_record, decoder)
 
@@ -285,14 +279,8 @@ def _csv_formats(model: BaseAlgorithm) -> list[CSVOutputFormat]:
 def _capture_logger(model: BaseAlgorithm, encoder: Encoder) -> dict[str, Any] | None:
     if not hasattr(model, "_logger"):
         return None
-    values: dict[str, Any] = {}
-    for name in _LOGGER_VALUES:
-        values[name] = {}
-        for key, value in getattr(model.logger, name).items():
-            try:
-                values[name][key] = encoder.encode(value, f"logger.{key}")
-            except OpaqueValue:  # figures and videos belong to the next dump only
-                continue
+    # figures and videos, which cannot be stored, belong to the next dump only
+    values = {name: encoder.encode_some(getattr(model.logger, name), "logger") for name in _LOGGER_VALUES}
     texts = []
     for output in _csv_formats(model):
         output.file.flush()

@@ -35,8 +35,7 @@ def load_checkpoint(
     report: Report = warn,
     **overrides: Any,
 ) -> Restored:
-    """
-    Make an agent with the settings of a checkpoint and put everything back into it; no code is run from the file.
+    """Make an agent with the settings of a checkpoint and put everything back into it; no code is run from the file.
 
     :param algorithm: the class
     :param path: a checkpoint, or the folder of several: the newest whole one is taken
@@ -102,8 +101,7 @@ def load_weights(
     without: tuple[str, ...] = (),
     **overrides: Any,
 ) -> SelfAlgorithm:
-    """
-    Make an agent from a file of :func:`save_weights`. Nothing in the file is run: it holds numbers and names.
+    """Make an agent from a file of :func:`save_weights`. Nothing in the file is run: it holds numbers and names.
 
     :param algorithm: the class
     :param path: the file; ``.safetensors`` may be left out

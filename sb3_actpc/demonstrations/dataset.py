@@ -131,8 +131,7 @@ class Demonstrations:
         metadata: Mapping[str, Any] | None = None,
         source: str = "",
     ) -> Demonstrations:
-        """
-        :param episodes: columns of each episode, by the names of ``COLUMNS``; dense rewards count where all have them
+        """:param episodes: columns of each episode, by the names of ``COLUMNS``; dense rewards count where all have them
         :param env_id: Gymnasium id of the environment that was recorded
         :param metadata: JSON values
         :param source: where they come from, for error messages

@@ -60,8 +60,7 @@ def fit_demonstrations(
     n_episodes: int | None = None,
     n_transitions: int | None = None,
 ) -> Demonstrations:
-    """
-    The demonstrations as an environment would have shown them: of its task, in its spaces, paid as it pays.
+    """The demonstrations as an environment would have shown them: of its task, in its spaces, paid as it pays.
 
     Those of the dense base task of a sparse one (such as Minari's ``mujoco/hopper/expert-v0``) fit too.
 

@@ -27,8 +27,7 @@ _REACHER_DIFFERENCE = slice(8, 10)  # fingertip minus target; -v4 has its height
 
 
 class GoalTask(gym.Wrapper[Any, np.ndarray, Any, np.ndarray]):
-    """
-    A sparse task as a goal task: the same physics, time limits and ``info``.
+    """A sparse task as a goal task: the same physics, time limits and ``info``.
 
     :param env: the sparse task
     :param n_own: size of ``observation``
@@ -64,8 +63,7 @@ class GoalTask(gym.Wrapper[Any, np.ndarray, Any, np.ndarray]):
         return demonstrations.rewards
 
     def goal_demonstrations(self, demonstrations: Demonstrations) -> Demonstrations:
-        """
-        Recorded transitions of the sparse task as transitions of this one.
+        """Recorded transitions of the sparse task as transitions of this one.
 
         :param demonstrations: N transitions of the sparse task; those of this one are returned as they are
         :return: the same transitions, each observation the flattened dictionary, paid by :meth:`compute_reward`
@@ -95,8 +93,7 @@ class GoalTask(gym.Wrapper[Any, np.ndarray, Any, np.ndarray]):
 
 
 class GoalReacher(GoalTask):
-    """
-    Goals are positions of the fingertip in the plane, in metres, (2,).
+    """Goals are positions of the fingertip in the plane, in metres, (2,).
 
     :param env: a sparse Reacher; its threshold and ``miss_reward`` count
     """
@@ -123,8 +120,7 @@ class GoalReacher(GoalTask):
 
 
 class GoalLocomotion(GoalTask):
-    """
-    A goal is a distance from the start along x, in metres, (1,): reached, and paid, at or beyond it.
+    """A goal is a distance from the start along x, in metres, (1,): reached, and paid, at or beyond it.
 
     :param env: a sparse locomotion task with the ``"displacement"`` condition; its threshold is the goal
     :raises ValueError: for another condition

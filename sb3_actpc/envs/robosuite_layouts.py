@@ -29,8 +29,7 @@ ACTION_DIM = 7
 
 @dataclass(frozen=True)
 class RobosuiteTask:
-    """
-    :param env_id: Gymnasium id
+    """:param env_id: Gymnasium id
     :param name: robosuite's name
     :param object_parts: the parts of the object's state, in order, and their sizes
     """

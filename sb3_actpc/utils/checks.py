@@ -60,8 +60,7 @@ _KINDS: dict[str, tuple[Callable[[Any], bool], str]] = {
 
 
 def check_kinds(given: Mapping[str, Any], **names: str) -> None:
-    """
-    :param given: keyword -> value
+    """:param given: keyword -> value
     :param names: keywords (separated by spaces) that must be ``numbers`` (finite), ``whole`` numbers, ``optional`` (a number
         or None), ``optional_whole``, ``flags``, ``paths`` or ``mappings`` (the last two may be None)
     :raises ValueError: naming the first value of another kind
@@ -75,8 +74,7 @@ def check_kinds(given: Mapping[str, Any], **names: str) -> None:
 
 @contextmanager
 def named_in_errors(what: str, *passed_on: type[Exception]) -> Iterator[None]:
-    """
-    What a class of another package does not take becomes an error that says where the user gave it.
+    """What a class of another package does not take becomes an error that says where the user gave it.
 
     :param what: the keywords with their values
     :param passed_on: errors that are clear already

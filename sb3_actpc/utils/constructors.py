@@ -4,8 +4,7 @@ import inspect
 
 
 def constructor_keywords(kind: type) -> list[str]:
-    """
-    :param kind: a class
+    """:param kind: a class
     :return: names of all keywords of its constructor: its own and, where it ends in ``**options``, those of the next class
         in the order of inheritance that has a constructor, and so on; names that begin with an underscore are left out
     """

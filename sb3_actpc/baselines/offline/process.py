@@ -20,8 +20,7 @@ class ServerFailed(OSError):
 
 
 class ServerProcess:
-    """
-    A child process that answers questions; it ends with its parent, whose death closes the pipe.
+    """A child process that answers questions; it ends with its parent, whose death closes the pipe.
 
     :param command: its program and arguments
     :param name: for messages
@@ -54,8 +53,7 @@ class ServerProcess:
             theirs.close()
 
     def ask(self, what: str, arrays: Arrays | None = None, **values: Any) -> tuple[Values, Arrays]:
-        """
-        :param what: the question's name
+        """:param what: the question's name
         :param arrays: its arrays
         :param values: its plain values
         :return: values and arrays of the answer

@@ -15,7 +15,7 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, Schedule
+from stable_baselines3.common.type_aliases import Schedule
 
 from sb3_actpc.baselines.bc_policies import LARGEST_INPUT, SMALLEST_SPREAD
 from sb3_actpc.baselines.offline.installation import environment_python
@@ -60,20 +60,17 @@ class ServedPolicy(BasePolicy):
 
 
 class ServedAlgorithm(OfflineAlgorithm):
-    """
-    What the four have in common.
+    """What the four have in common.
 
     Observations are normalised by the demonstrations' mean and standard deviation, actions scaled to [-1, 1], before the other
     process gets them. It is started when it is first needed, computes on the CPU, and holds the networks; they are fetched to
     be saved. It ends with :meth:`close`, or when the agent is collected.
 
-    :param policy: "MlpPolicy"
-    :param env: a task with Box observations and actions; for its spaces and for evaluations
+    :param args: policy and env of :class:`~sb3_actpc.baselines.offline_algorithm.OfflineAlgorithm`
     :param batch_size: B
     :param method_kwargs: the method's own settings, by the names that its package gives them
     :param timeout: seconds that one gradient step, or the start, may take
-    :param options: further keywords of :class:`~sb3_actpc.baselines.offline_algorithm.OfflineAlgorithm`; the learning
-        rates are among ``method_kwargs``
+    :param options: further keywords as there; the learning rates are among ``method_kwargs``
     :raises ValueError: as there
     :raises ImportError: when the package's environment has not been made; the message names the command that does it
     """
@@ -86,9 +83,7 @@ class ServedAlgorithm(OfflineAlgorithm):
 
     def __init__(
         self,
-        policy: str | type[BasePolicy],
-        env: GymEnv | str | None,
-        *,
+        *args: Any,
         batch_size: int = 100,
         method_kwargs: dict[str, Any] | None = None,
         timeout: float = 300.0,
@@ -108,7 +103,7 @@ class ServedAlgorithm(OfflineAlgorithm):
         self.timeout = timeout
         self._process: ServerProcess | None = None
         self._state_names: list[str] = []
-        super().__init__(policy, env, batch_size=batch_size, **options)
+        super().__init__(*args, batch_size=batch_size, **options)
 
     # ------------------------------------------------------------------ setting up
 

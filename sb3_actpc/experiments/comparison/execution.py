@@ -30,8 +30,7 @@ REPORT_INTERVAL = 1.0  # seconds between two reports of the steps done
 
 @dataclass(frozen=True)
 class Outcome:
-    """
-    :param status: ``"finished"``, ``"failed"``, ``"stopped"`` (by a signal, saved), ``"lost"`` (the process ended without a
+    """:param status: ``"finished"``, ``"failed"``, ``"stopped"`` (by a signal, saved), ``"lost"`` (the process ended without a
         word) or ``"disk full"``
     :param message: what went wrong, one line
     """

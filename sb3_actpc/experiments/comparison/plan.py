@@ -34,8 +34,7 @@ class Comparison(Schema):
 
 
 def read_comparison(given: Mapping[str, Any]) -> Comparison:
-    """
-    :param given: ``envs`` (ids, or mappings with ``env`` and other keys of a :class:`~sb3_actpc.experiments.runs.Run`),
+    """:param given: ``envs`` (ids, or mappings with ``env`` and other keys of a :class:`~sb3_actpc.experiments.runs.Run`),
         ``algos`` (names, or mappings: see :func:`~sb3_actpc.experiments.comparison.variants.parse_variant`), ``ablate`` (true
         adds the ablations), ``seeds``, ``output``, and keys of a run that hold for all. Values of None count as not given
     :return: the comparison

@@ -8,23 +8,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from sb3_actpc.checkpoints import StopSignals
+from sb3_actpc.experiments.comparison import execution
 from sb3_actpc.experiments.comparison.display import Display
 from sb3_actpc.experiments.comparison.engines import Engine, Event
-from sb3_actpc.experiments.comparison.execution import (
-    DISK_FULL,
-    ERROR,
-    FAILED,
-    FINISHED,
-    LOST,
-    STOPPED,
-    Outcome,
-    folder_lock,
-    is_disk_full,
-    read_error,
-    repair_result,
-    run_status,
-    write_error,
-)
+from sb3_actpc.experiments.comparison.execution import FAILED, FINISHED, Outcome, folder_lock, is_disk_full, run_status
 from sb3_actpc.experiments.runs import Run
 
 MAX_LOSSES = 3  # times that the process of one run may die before the run counts as failed
@@ -67,7 +54,7 @@ def run_comparison(
     """
     with folder_lock(folder, LOCK_WAIT, display.line):
         for run in runs:
-            repair_result(run.folder, display.line)
+            execution.repair_result(run.folder, display.line)
         left_alone = (FINISHED,) if retry_failed else (FINISHED, FAILED)
         to_do = [run for run in runs if run_status(run.folder) not in left_alone]
         display.begin(to_do, sum(run_status(run.folder) == FINISHED for run in runs))
@@ -79,7 +66,7 @@ def run_comparison(
             if status == FINISHED:
                 summary.finished.append(run)
             elif status == FAILED:
-                summary.failed.append((run, read_error(run.folder)))
+                summary.failed.append((run, execution.read_error(run.folder)))
             else:
                 summary.unfinished.append(run)
         return summary
@@ -111,13 +98,13 @@ class _Scheduler:
     def _start_some(self) -> None:
         while self.summary.stopped_by is None and self.waiting and len(self.under_way) < self.engine.capacity():
             run = self.waiting.popleft()
-            (run.folder / ERROR).unlink(missing_ok=True)
+            (run.folder / execution.ERROR).unlink(missing_ok=True)
             try:
                 self.engine.start(run)
             except OSError as error:
                 if not is_disk_full(error):
                     raise
-                self._stop(DISK_FULL, str(error))
+                self._stop(execution.DISK_FULL, str(error))
                 return
             self.under_way[run.id] = run
             self.display.started(run)
@@ -131,9 +118,9 @@ class _Scheduler:
             return
         del self.under_way[run.id]
         self.display.ended(run, event.outcome)
-        if event.outcome.status == DISK_FULL:
-            self._stop(DISK_FULL, event.outcome.message)
-        elif event.outcome.status in (LOST, STOPPED) and self.summary.stopped_by is None:
+        if event.outcome.status == execution.DISK_FULL:
+            self._stop(execution.DISK_FULL, event.outcome.message)
+        elif event.outcome.status in (execution.LOST, execution.STOPPED) and self.summary.stopped_by is None:
             self._try_again(run, event.outcome)
 
     def _try_again(self, run: Run, outcome: Outcome) -> None:
@@ -142,7 +129,7 @@ class _Scheduler:
         if self.losses[run.id] < MAX_LOSSES:
             self.waiting.appendleft(run)
         else:
-            write_error(run.folder, f"given up after {MAX_LOSSES} times: {outcome.message}")
+            execution.write_error(run.folder, f"given up after {MAX_LOSSES} times: {outcome.message}")
 
     def _stop(self, reason: str, message: str = "") -> None:
         if self.summary.stopped_by is None:

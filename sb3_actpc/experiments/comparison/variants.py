@@ -27,8 +27,7 @@ def find_variant(name: str) -> Run:
 
 
 def parse_variant(entry: Any) -> Run:
-    """
-    :param entry: a name, or a mapping with some of the keys of :class:`~sb3_actpc.experiments.runs.Run`; ``base`` names the
+    """:param entry: a name, or a mapping with some of the keys of :class:`~sb3_actpc.experiments.runs.Run`; ``base`` names the
         variant that it starts from
     :return: the variant
     :raises ValueError: when it is neither, or has an unknown key or a wrong value

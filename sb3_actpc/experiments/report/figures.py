@@ -49,8 +49,7 @@ def step_curve(results: Results, runs: pd.Index, measure: str = "dense_return") 
 
 
 def time_curve(results: Results, runs: pd.Index, measure: str = "dense_return") -> Curve:
-    """
-    A measure of the evaluations over the seconds of training (evaluations left out), from the last seed's first evaluation
+    """A measure of the evaluations over the seconds of training (evaluations left out), from the last seed's first evaluation
     until the first seed ends.
     """
     rows = results.evaluations[results.evaluations["run"].isin(runs)]

@@ -22,8 +22,7 @@ N_EPISODES = 2 * WINDOW
 
 
 def r_stability(returns: np.ndarray) -> float:
-    """
-    :param returns: (N,) dense or sparse returns, or successes, of all training episodes in order
+    """:param returns: (N,) dense or sparse returns, or successes, of all training episodes in order
     :return: R-stability; NaN with fewer than 200 episodes, where one of the last 200 is NaN, and where the best of the last
         100 is 0
     """

@@ -226,8 +226,7 @@ def find_demonstrations(env_id: str, choice: str) -> Path | str | None:
 
 
 def demonstrations_hash(run: Run) -> str | None:
-    """
-    :param run: with its environment and its demonstrations
+    """:param run: with its environment and its demonstrations
     :return: SHA-256 of what they hold, None for none
     :raises FileNotFoundError: when they are not there
     """

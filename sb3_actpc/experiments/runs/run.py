@@ -18,21 +18,14 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_actpc.checkpoints import CheckpointCallback, DamagedCheckpoint, list_bundles, restore, why_no_checkpoints
 from sb3_actpc.demonstrations import resolve as resolve_demonstrations
 from sb3_actpc.demonstrations.recording import Report, silent
+from sb3_actpc.experiments.runs import record
 from sb3_actpc.experiments.runs.algorithms import load_algorithm
 from sb3_actpc.experiments.runs.environments import check_env_id, make_eval_envs, make_train_env
 from sb3_actpc.experiments.runs.episode_log import EpisodeLog
 from sb3_actpc.experiments.runs.evaluation import PROGRESS, EvaluationCallback, NormalizedPredictor, Predictor, play_episodes
 from sb3_actpc.experiments.runs.presets import agent_keywords, find_demonstrations, fitting_policy, resolve
 from sb3_actpc.experiments.runs.provenance import git_state, package_versions
-from sb3_actpc.experiments.runs.record import (
-    CONFIG,
-    RESULT,
-    check_demonstrations,
-    read_result,
-    read_run,
-    write_config,
-    write_result,
-)
+from sb3_actpc.experiments.runs.record import CONFIG, RESULT, read_result, read_run, write_config, write_result
 from sb3_actpc.experiments.runs.schema import Run, content_id
 from sb3_actpc.experiments.runs.summary import plot_learning_curve
 
@@ -90,7 +83,7 @@ def resume_run(
             f"the run in {folder} is finished and kept no checkpoint to go on from: train another with more --steps"
         )
     check_env_id(run.env, run.gym_packages)
-    check_demonstrations(run)
+    record.check_demonstrations(run)
     if more_steps:
         run = run.model_copy(update={"n_timesteps": (run.n_timesteps or 0) + more_steps})
         write_config(run)

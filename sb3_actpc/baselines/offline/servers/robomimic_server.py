@@ -86,8 +86,7 @@ class Server:
         return {name.replace("/", "_").lower(): float(log[name]) for name in log if name.endswith("Loss")}, {}
 
     def predict(self, values: Values, arrays: Arrays) -> tuple[Values, Arrays]:
-        """
-        As robomimic's ``get_action``, for n episodes that need not begin together: a new subgoal every
+        """As robomimic's ``get_action``, for n episodes that need not begin together: a new subgoal every
         ``subgoal_update_interval`` steps, the actor's memory emptied every ``horizon`` steps. The state is state_subgoals
         (n, obs_dim), state_age (n,) and state_memory (n, n_memory).
         """

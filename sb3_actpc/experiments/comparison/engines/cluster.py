@@ -23,8 +23,7 @@ _PROBE = ".shared-"  # a file by which a node sees whether it shares the folders
 
 
 class RayEngine:
-    """
-    A Ray task for each run. A run whose node dies ends as lost, and is begun again, or gone on with, elsewhere.
+    """A Ray task for each run. A run whose node dies ends as lost, and is begun again, or gone on with, elsewhere.
 
     A node that sees this machine's folders (a network file system, or the same machine) works in them, checkpoints and all.
     To another the run's folder is sent, and what it made of it comes back when the run has ended.

@@ -19,8 +19,7 @@ _THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS
 
 
 class LocalEngine:
-    """
-    A process for each run. A process that dies, whatever the reason, takes no other with it; all save and end when this one
+    """A process for each run. A process that dies, whatever the reason, takes no other with it; all save and end when this one
     dies.
 
     :param n_workers: runs at a time; by default the number of usable cores divided by ``threads``
