@@ -1,5 +1,5 @@
-"""What the constructors of ActPC and of its policy take. The kind and the range of a keyword stand in the constructor's
-signature, where type checkers see them too; :func:`checked` holds the values to it before anything is made of them.
+"""What the constructors of ActPC, of its policy and of the baselines take. The kind and the range of a keyword stand in the
+constructor's signature, where type checkers see them too; :func:`checked` holds the values to it before anything is made.
 """
 
 import inspect
@@ -18,7 +18,7 @@ from stable_baselines3.common.type_aliases import TrainFreq
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_actpc.ngc.circuit import LARGEST_SIZE as LARGEST_LAYER
-from sb3_actpc.utils.checks import LARGEST_SIZE, check_choices, check_device, check_kinds, check_range
+from sb3_actpc.utils.checks import LARGEST_SIZE, check_device, check_kinds
 
 Parameters = ParamSpec("Parameters")
 CIRCUITS = ("actor", "critic", "generator", "prior")
@@ -35,12 +35,15 @@ class Between:
 
     def __call__(self, name: str, value: Any) -> None:
         """:raises ValueError: naming the keyword, its value and the bounds"""
-        check_range({name: value}, name, self.low, self.high)
+        if value is not None and not self.low <= value <= self.high:
+            bounds = f"at least {self.low}" if np.isinf(self.high) else f"between {self.low} and {self.high}"
+            raise ValueError(f"{name}={value!r} must be {bounds}")
 
 
 Share = Annotated[float, Between(0, 1)]
 Weight = Annotated[float, Between(0)]
 Count = Annotated[int, Between(0)]
+Positive = Annotated[int, Between(1)]
 Size = Annotated[int, Between(1, LARGEST_SIZE)]
 Settings = dict[str, Any]
 
@@ -62,7 +65,7 @@ def checked(init: Callable[Parameters, None]) -> Callable[Parameters, None]:
     :param init: an ``__init__``; a function (name, value) in an ``Annotated`` raises ValueError for a bad value
     :return: the same, checked
     """
-    signature = inspect.signature(init)
+    signature = inspect.signature(init, eval_str=True)
 
     @wraps(init)
     def checking(*args: Parameters.args, **kwargs: Parameters.kwargs) -> None:
@@ -79,7 +82,8 @@ def _check(name: str, value: Any, annotation: Any) -> None:
     """:raises ValueError: naming the keyword, its value, what is allowed, and how to mend it"""
     kind, *checks = get_args(annotation) if get_origin(annotation) is Annotated else (annotation,)
     if get_origin(kind) is Literal:
-        check_choices({name: value}, **{name: get_args(kind)})
+        if not isinstance(value, str) or value not in get_args(kind):
+            raise ValueError(f"{name}={value!r} is unknown; choose one of {list(get_args(kind))}")
     elif kind in _KINDS:
         check_kinds({name: value}, **{_KINDS[kind]: name})
     for check in checks:

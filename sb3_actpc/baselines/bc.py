@@ -10,10 +10,10 @@ from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
 from torch import nn
 
+from sb3_actpc.actpc.arguments import Positive, Weight, checked
 from sb3_actpc.baselines.bc_policies import BCPolicy, BCRNNPolicy, CloningPolicy
 from sb3_actpc.baselines.offline_algorithm import OfflineAlgorithm
 from sb3_actpc.demonstrations import Demonstrations, scaled_actions
-from sb3_actpc.utils.checks import check_kinds, check_range
 
 
 class BC(OfflineAlgorithm):
@@ -31,9 +31,8 @@ class BC(OfflineAlgorithm):
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": BCPolicy}
     policy: CloningPolicy
 
-    def __init__(self, *args: Any, weight_decay: float = 0.0, input_noise: float = 0.0, **options: Any) -> None:
-        check_kinds(locals(), numbers="weight_decay input_noise")
-        check_range(locals(), "weight_decay input_noise", 0)
+    @checked
+    def __init__(self, *args: Any, weight_decay: Weight = 0.0, input_noise: Weight = 0.0, **options: Any) -> None:
         self.weight_decay, self.input_noise = weight_decay, input_noise
         super().__init__(*args, **options)
 
@@ -116,9 +115,8 @@ class BCRNN(BC):
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": BCRNNPolicy}
 
-    def __init__(self, *args: Any, sequence_length: int = 10, carry_state: bool = False, **options: Any) -> None:
-        check_kinds(locals(), whole="sequence_length", flags="carry_state")
-        check_range(locals(), "sequence_length", 1)
+    @checked
+    def __init__(self, *args: Any, sequence_length: Positive = 10, carry_state: bool = False, **options: Any) -> None:
         self.sequence_length, self.carry_state = sequence_length, carry_state
         super().__init__(*args, **options)
 

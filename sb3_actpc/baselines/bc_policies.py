@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch as th
@@ -13,7 +13,7 @@ from stable_baselines3.common.torch_layers import create_mlp
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
-from sb3_actpc.utils.checks import check_choices, check_kinds, check_range
+from sb3_actpc.actpc.arguments import Between, Positive, checked
 
 CELLS: dict[str, type[nn.GRU] | type[nn.LSTM]] = {"gru": nn.GRU, "lstm": nn.LSTM}
 SMALLEST_SPREAD = 1e-3  # an entry that hardly varies in the demonstrations is not blown up
@@ -116,19 +116,16 @@ class BCRNNPolicy(CloningPolicy):
     :raises ValueError: for a keyword with a value that is not allowed
     """
 
+    @checked
     def __init__(
         self,
         *args: Any,
-        cell: str = "gru",
-        hidden_size: int = 256,
-        n_layers: int = 1,
-        restart_every: int | None = None,
+        cell: Literal["gru", "lstm"] = "gru",
+        hidden_size: Positive = 256,
+        n_layers: Positive = 1,
+        restart_every: Annotated[int | None, Between(1)] = None,
         **kwargs: Any,
     ) -> None:
-        given = locals()
-        check_choices(given, cell=list(CELLS))
-        check_kinds(given, whole="hidden_size n_layers", optional_whole="restart_every")
-        check_range(given, "hidden_size n_layers restart_every", 1)
         self.cell, self.hidden_size, self.n_layers, self.restart_every = cell, hidden_size, n_layers, restart_every
         super().__init__(*args, **kwargs)
 

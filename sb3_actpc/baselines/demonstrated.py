@@ -12,13 +12,13 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
+from sb3_actpc.actpc.arguments import Share, checked
 from sb3_actpc.baselines.demonstration_buffers import (
     DemonstrationDictReplayBuffer,
     WithDemonstrations,
     demonstration_buffer_class,
 )
 from sb3_actpc.demonstrations import Demonstrations, fit_demonstrations
-from sb3_actpc.utils.checks import check_range
 
 
 class LearnsFromDemonstrations(BaseAlgorithm):
@@ -69,8 +69,8 @@ class DemonstratedAlgorithm(LearnsFromDemonstrations, OffPolicyAlgorithm):
     :raises ValueError: as there, and for a share out of range
     """
 
-    def __init__(self, *args: Any, demonstration_fraction: float = 0.5, **options: Any) -> None:
-        check_range(locals(), "demonstration_fraction", 0, 1)
+    @checked
+    def __init__(self, *args: Any, demonstration_fraction: Share = 0.5, **options: Any) -> None:
         self.demonstration_fraction = demonstration_fraction
         super().__init__(*args, **options)
 

@@ -12,10 +12,10 @@ from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
+from sb3_actpc.actpc.arguments import Share, checked
 from sb3_actpc.actpc.self_imitation import map_observations
 from sb3_actpc.demonstrations import Demonstrations, scaled_actions
 from sb3_actpc.demonstrations.rows import split_observations
-from sb3_actpc.utils.checks import check_range
 
 
 def fill_with_demonstrations(
@@ -58,14 +58,10 @@ class WithDemonstrations(ReplayBuffer):
     _demonstrated_class: ClassVar[type[ReplayBuffer]]
     _own_keywords: ClassVar[tuple[str, ...]] = ()  # of a subclass, not for the demonstrations' buffer
 
+    @checked
     def __init__(
-        self,
-        *args: Any,
-        demonstrations: Demonstrations | None = None,
-        demonstration_fraction: float = 0.5,
-        **kwargs: Any,
+        self, *args: Any, demonstrations: Demonstrations | None = None, demonstration_fraction: Share = 0.5, **kwargs: Any
     ) -> None:
-        check_range({"demonstration_fraction": demonstration_fraction}, "demonstration_fraction", 0, 1)
         super().__init__(*args, **kwargs)
         self.demonstration_fraction = demonstration_fraction
         self.demonstrated: ReplayBuffer | None = None

@@ -9,10 +9,10 @@ import torch as th
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
+from sb3_actpc.actpc.arguments import Share, checked
 from sb3_actpc.baselines.demonstration_buffers import DemonstrationHerReplayBuffer, WithDemonstrations
 from sb3_actpc.baselines.prioritized import DemonstrationPrioritizedHerReplayBuffer, PrioritizedHerReplayBuffer
 from sb3_actpc.baselines.td3 import DDPGDemo
-from sb3_actpc.utils.checks import check_range
 
 
 class HER(DDPGDemo):
@@ -43,17 +43,17 @@ class HER(DDPGDemo):
     :raises ValueError: for an environment without goals, or a value that is not allowed
     """
 
+    @checked
     def __init__(
         self,
         *args: Any,
         prioritized: bool = True,
-        random_action_start: float = 1.0,
-        random_action_decay: float = 0.9999,
-        random_action_end: float = 0.32,
+        random_action_start: Share = 1.0,
+        random_action_decay: Share = 0.9999,
+        random_action_end: Share = 0.32,
         replay_buffer_kwargs: dict[str, Any] | None = None,
         **options: Any,
     ) -> None:
-        check_range(locals(), "random_action_start random_action_decay random_action_end", 0, 1)
         self.prioritized = prioritized
         self.random_action_start, self.random_action_decay = random_action_start, random_action_decay
         self.random_action_end = random_action_end

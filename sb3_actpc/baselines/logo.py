@@ -17,8 +17,8 @@ from stable_baselines3.common.torch_layers import create_mlp
 from stable_baselines3.common.type_aliases import GymEnv
 from torch import nn
 
+from sb3_actpc.actpc.arguments import Count, Positive, Share, Weight, checked
 from sb3_actpc.baselines.demonstrated import LearnsFromDemonstrations
-from sb3_actpc.utils.checks import check_kinds, check_range
 
 ZERO_DELTA = 6e-7  # at or below this the guidance step is left out (the authors' code)
 _NETS = ("discriminator", "guidance_value", "discriminator_optimizer", "guidance_value_optimizer")
@@ -76,24 +76,19 @@ class LOGO(LearnsFromDemonstrations, TRPO):
 
     is_resumable: ClassVar[bool] = False  # its guidance keeps a state of its own
 
+    @checked
     def __init__(
         self,
         *args: Any,
-        guidance_delta: float = 0.01,
-        guidance_iterations: int = 50,
-        guidance_decay: float = 0.95,
-        guidance_delta_min: float = 5e-7,
-        discriminator_learning_rate: float = 3e-4,
-        discriminator_updates: int = 1,
+        guidance_delta: Weight = 0.01,
+        guidance_iterations: Count = 50,
+        guidance_decay: Share = 0.95,
+        guidance_delta_min: Weight = 5e-7,
+        discriminator_learning_rate: Weight = 3e-4,
+        discriminator_updates: Positive = 1,
         discriminator_net_arch: list[int] | None = None,
         **options: Any,
     ) -> None:
-        given = locals()
-        numbers = "guidance_delta guidance_decay guidance_delta_min discriminator_learning_rate"
-        check_kinds(given, numbers=numbers, whole="guidance_iterations discriminator_updates")
-        check_range(given, f"guidance_iterations {numbers}", 0)
-        check_range(given, "guidance_decay", 0, 1)
-        check_range(given, "discriminator_updates", 1)
         self.guidance_delta, self.guidance_iterations = guidance_delta, guidance_iterations
         self.guidance_decay, self.guidance_delta_min = guidance_decay, guidance_delta_min
         self.discriminator_learning_rate, self.discriminator_updates = discriminator_learning_rate, discriminator_updates

@@ -12,9 +12,9 @@ from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 
+from sb3_actpc.actpc.arguments import Positive, checked
 from sb3_actpc.baselines.demonstrated import LearnsFromDemonstrations
 from sb3_actpc.demonstrations.dataset import Demonstrations
-from sb3_actpc.utils.checks import check_kinds, check_range
 
 SelfOffline = TypeVar("SelfOffline", bound="OfflineAlgorithm")
 
@@ -45,6 +45,7 @@ class OfflineAlgorithm(LearnsFromDemonstrations):
 
     is_offline: ClassVar[bool] = True  # for those who run any algorithm: its steps do nothing in the environment
 
+    @checked
     def __init__(
         self,
         policy: str | type[BasePolicy],
@@ -54,7 +55,7 @@ class OfflineAlgorithm(LearnsFromDemonstrations):
         n_demonstrations: int | None = None,
         n_demonstration_transitions: int | None = None,
         learning_rate: float | Schedule = 1e-3,
-        batch_size: int = 256,
+        batch_size: Positive = 256,
         policy_kwargs: dict[str, Any] | None = None,
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
@@ -63,8 +64,6 @@ class OfflineAlgorithm(LearnsFromDemonstrations):
         device: th.device | str = "auto",
         _init_setup_model: bool = True,
     ) -> None:
-        check_kinds(locals(), whole="batch_size")
-        check_range(locals(), "batch_size", 1)
         super().__init__(
             policy,
             env,

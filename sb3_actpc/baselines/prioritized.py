@@ -10,8 +10,8 @@ from stable_baselines3.common.type_aliases import DictReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
+from sb3_actpc.actpc.arguments import Share, Weight, checked
 from sb3_actpc.baselines.demonstration_buffers import DemonstrationHerReplayBuffer, join_batches
-from sb3_actpc.utils.checks import check_range
 
 
 class SumTree:
@@ -65,17 +65,16 @@ class PrioritizedHerReplayBuffer(HerReplayBuffer):
     :raises ValueError: for a value out of range
     """
 
+    @checked
     def __init__(
         self,
         *args: Any,
-        alpha: float = 0.6,
-        beta: float = 0.4,
-        beta_increment: float = 0.001,
-        epsilon: float = 0.01,
+        alpha: Share = 0.6,
+        beta: Share = 0.4,
+        beta_increment: Weight = 0.001,
+        epsilon: Weight = 0.01,
         **kwargs: Any,
     ) -> None:
-        check_range(locals(), "beta_increment epsilon", 0)
-        check_range(locals(), "alpha beta", 0, 1)
         super().__init__(*args, **kwargs)
         self.alpha, self.beta, self.beta_increment, self.epsilon = alpha, beta, beta_increment, epsilon
         self.priorities = np.zeros((self.buffer_size, self.n_envs, 2))

@@ -12,9 +12,10 @@ from stable_baselines3 import TD3
 from stable_baselines3.common.policies import BaseModel
 from stable_baselines3.common.utils import polyak_update
 
+from sb3_actpc.actpc.arguments import Share, Weight, checked
 from sb3_actpc.actpc.self_imitation import map_observations
 from sb3_actpc.baselines.demonstrated import DemonstratedAlgorithm
-from sb3_actpc.utils.checks import check_kinds, check_range
+from sb3_actpc.utils.checks import check_kinds
 
 OPTIMIZERS: dict[str, type[th.optim.Optimizer]] = {"adam": th.optim.Adam, "adamw": th.optim.AdamW}
 NETWORK_KEYWORDS = ("learning_rate", "optimizer", "optimizer_kwargs", "tau")
@@ -33,6 +34,7 @@ class TD3Demo(DemonstratedAlgorithm, TD3):
     :raises ValueError: for a keyword with a value that is not allowed, for demonstrations that do not fit the environment
     """
 
+    @checked
     def __init__(
         self,
         *args: Any,
@@ -40,7 +42,6 @@ class TD3Demo(DemonstratedAlgorithm, TD3):
         critic_kwargs: dict[str, Any] | None = None,
         **options: Any,
     ) -> None:
-        check_kinds(locals(), mappings="actor_kwargs critic_kwargs")
         self.actor_kwargs, self.critic_kwargs = actor_kwargs, critic_kwargs
         super().__init__(*args, **options)
 
@@ -173,18 +174,17 @@ class DDPGDemo(TD3Demo):
     :raises ValueError: as :class:`TD3Demo`
     """
 
+    @checked
     def __init__(
         self,
         *args: Any,
-        policy_gradient_weight: float = 0.001,
-        cloning_weight: float = 1.0,
+        policy_gradient_weight: Weight = 0.001,
+        cloning_weight: Weight = 1.0,
         q_filter: bool = True,
-        demonstration_fraction: float = 1 / 9,
+        demonstration_fraction: Share = 1 / 9,
         policy_kwargs: dict[str, Any] | None = None,
         **options: Any,
     ) -> None:
-        check_kinds(locals(), numbers="policy_gradient_weight cloning_weight", mappings="policy_kwargs")
-        check_range(locals(), "policy_gradient_weight cloning_weight", 0)
         self.policy_gradient_weight, self.cloning_weight, self.q_filter = policy_gradient_weight, cloning_weight, q_filter
         # SB3's DDPG
         options = {"policy_delay": 1, "target_policy_noise": 0.1, "target_noise_clip": 0.0, **options}

@@ -441,6 +441,7 @@ def _correlation(blocks: list[np.ndarray], column: int, rng: np.random.Generator
     """Spearman's rank correlation between column 0 and another of all blocks (one for each state) together, and its standard
     error over resampled states; NaN where one of the columns is constant."""
     from scipy.stats import spearmanr
+
     def correlation(parts: list[np.ndarray]) -> float:
         pairs = np.concatenate(parts)[:, [0, column]]
         return float("nan") if len(pairs) < 3 or np.any(np.ptp(pairs, axis=0) == 0) else float(spearmanr(pairs).statistic)

@@ -1,7 +1,7 @@
 """Checks of what the user passes and of what circuits and environments produce."""
 
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
 from numbers import Integral, Real
@@ -16,22 +16,6 @@ from stable_baselines3.common.utils import get_device
 LARGEST_NUMBER = float(np.finfo(np.float32).max)
 LARGEST_WHOLE = 2**63 - 1
 LARGEST_SIZE = 2**31 - 1
-
-
-def check_choices(given: Mapping[str, Any], **allowed: Sequence[str]) -> None:
-    """ValueError naming the first value that is not one of those allowed for its keyword."""
-    for name, choices in allowed.items():
-        if not isinstance(given[name], str) or given[name] not in choices:
-            raise ValueError(f"{name}={given[name]!r} is unknown; choose one of {list(choices)}")
-
-
-def check_range(given: Mapping[str, Any], names: str, low: float, high: float = np.inf) -> None:
-    """ValueError naming the first of the keywords (separated by spaces) whose number is below ``low`` or above ``high``;
-    None is left alone."""
-    for name in names.split():
-        if given[name] is not None and not low <= given[name] <= high:
-            bounds = f"at least {low}" if np.isinf(high) else f"between {low} and {high}"
-            raise ValueError(f"{name}={given[name]!r} must be {bounds}")
 
 
 def _is(kind: type, largest: float, value: Any) -> bool:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 import torch as th
@@ -17,13 +17,13 @@ from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import Schedule
 
+from sb3_actpc.actpc.arguments import Between, checked
 from sb3_actpc.baselines.bc_policies import LARGEST_INPUT, SMALLEST_SPREAD
 from sb3_actpc.baselines.offline.installation import environment_python
 from sb3_actpc.baselines.offline.process import ServerProcess
 from sb3_actpc.baselines.offline.servers.frames import Arrays
 from sb3_actpc.baselines.offline_algorithm import OfflineAlgorithm
 from sb3_actpc.demonstrations import Demonstrations, scaled_actions
-from sb3_actpc.utils.checks import check_kinds, check_range
 
 SERVERS = Path(__file__).resolve().parent / "servers"
 D3RLPY_RATES = "actor_learning_rate, critic_learning_rate, ..."
@@ -81,16 +81,15 @@ class ServedAlgorithm(OfflineAlgorithm):
     rates: ClassVar[str]  # names of the learning rates in ``method_kwargs``, for a message
     policy: ServedPolicy
 
+    @checked
     def __init__(
         self,
         *args: Any,
         batch_size: int = 100,
         method_kwargs: dict[str, Any] | None = None,
-        timeout: float = 300.0,
+        timeout: Annotated[float, Between(1)] = 300.0,
         **options: Any,
     ) -> None:
-        check_kinds(locals(), numbers="timeout", mappings="method_kwargs")
-        check_range(locals(), "timeout", 1)
         if "learning_rate" in options:
             raise ValueError(
                 f"learning_rate={options['learning_rate']!r} has no effect on {type(self).__name__}: each of its networks has "
