@@ -108,16 +108,7 @@ class SignalReplay(ReplayBuffer):
         infos: list[dict[str, Any]],
         score: Score | None = None,
     ) -> None:
-        """Store a transition of every environment, with its signals.
-
-        :param obs: (n_envs, *obs_shape), or a dict of such
-        :param next_obs: likewise
-        :param action: (n_envs, A), scaled to [-1, 1]
-        :param reward: (n_envs,), the task's
-        :param done: (n_envs,)
-        :param infos: one for each environment
-        :param score: gives the signals; None for zeros
-        """
+        """As SB3's: store a transition of every environment, with its signals, which ``score`` gives (None for zeros)."""
         super().add(obs, next_obs, action, reward, done, infos)
         newest = self.newest
         signals: tuple[Any, Any] = (0.0, 0.0)

@@ -99,13 +99,8 @@ class DemonstrationReplay:
     def refresh_signals(
         self, raw_signals: RawSignals, inputs: CircuitInputs, epistemic: Normalize, instrumental: Normalize
     ) -> None:
-        """Signals of all transitions under the present generator and prior.
-
-        :param raw_signals: summed squared errors of both circuits from (features, actions, next features, memory)
-        :param inputs: turns observations into features
-        :param epistemic: what the generator's summed squared errors pay
-        :param instrumental: what the prior's pay
-        """
+        """Signals of all transitions under the present generator and prior: from the summed squared errors of both circuits,
+        by (features, actions, next features, memory), and what each of the two pays."""
         for start in range(0, len(self), 1024):
             rows = np.arange(start, min(start + 1024, len(self)))
             batch = self.batch(rows, inputs, (0.0, 0.0, 0.0), 0.0)

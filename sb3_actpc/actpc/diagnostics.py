@@ -22,12 +22,10 @@ class Diagnostics:
         self.values: dict[str, float] = {}
 
     def begin_update(self, n_updates: int, step: int, delay: int = 1) -> None:
-        """Decide whether this update is measured, and if so check all synapses.
+        """Decide whether this update, by its number from 1 on, is measured, and if so check all synapses. The actor, which
+        has one update in ``delay``, takes part in every one that is measured.
 
-        :param n_updates: number of the update, from 1 on
-        :param step: environment step to name
-        :param delay: updates for each of the actor, which takes part in every one that is measured
-        :raises ValueError: naming the circuit and the step when a synapse is not finite
+        :raises ValueError: naming the circuit and the environment step when a synapse is not finite
         """
         interval = delay * -(-INTERVAL // delay)
         self.active = n_updates % interval == delay % interval

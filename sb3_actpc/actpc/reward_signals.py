@@ -14,12 +14,8 @@ STORED: tuple[Normalize, Normalize] = (np.asarray, np.asarray)  # both signals p
 
 
 def summed_squared_errors(state: SettledState, which: str = "all") -> th.Tensor:
-    """r̂ = Σ_l ||e^l||^2, the sum that both signals start from (paper, eqs. for r̂^ep and r̂^in).
-
-    :param state: a settled circuit (under "scheduled", the errors as they first arrive)
-    :param which: "all" layers, or the "output" layer's error only
-    :return: (B,)
-    """
+    """r̂ = Σ_l ||e^l||^2, (B,), the sum that both signals start from (paper, eqs. for r̂^ep and r̂^in): over "all" layers of a
+    settled circuit, or the "output" layer alone. Under "scheduled" the errors are those that first arrive."""
     errors = state.errors if which == "all" else state.errors[-1:]
     return th.stack([error.square().sum(1) for error in errors]).sum(0)
 
@@ -42,9 +38,7 @@ class RunningMaximum:
         self.maximum = 1.0
 
     def __call__(self, raw: np.ndarray) -> np.ndarray:
-        """:param raw: (n_envs,) new values r̂ >= 0; the maximum follows them
-        :return: (n_envs,) in [0, 1]
-        """
+        """(n_envs,) in [0, 1], of (n_envs,) new values r̂ >= 0, which the maximum follows."""
         self.maximum = max(self.maximum, float(raw.max()))
         return raw / self.maximum
 
@@ -57,8 +51,7 @@ class Saturating:
     """r = r̂ / (r̂ + 1): no state, so the same transition keeps the same signal."""
 
     def __call__(self, raw: np.ndarray) -> np.ndarray:
-        """:param raw: (n,) values r̂ >= 0
-        :return: (n,) in [0, 1)"""
+        """(n,) in [0, 1), of (n,) values r̂ >= 0."""
         return raw / (raw + 1.0)
 
     rescale = __call__
@@ -74,9 +67,7 @@ class RunningQuantile:
         self.quantile, self.step, self.estimate = quantile, step, 0.0
 
     def __call__(self, raw: np.ndarray) -> np.ndarray:
-        """:param raw: (n_envs,) new values r̂ >= 0; the quantile follows them
-        :return: (n_envs,) in [0, 1]
-        """
+        """(n_envs,) in [0, 1], of (n_envs,) new values r̂ >= 0, which the quantile follows."""
         for value in raw:
             if self.estimate == 0.0:
                 self.estimate = max(float(value), 1e-12)
@@ -118,12 +109,8 @@ class InternalSignals:
     def score(
         self, epistemic: np.ndarray, instrumental: np.ndarray, alpha_ep: float, alpha_in: float
     ) -> tuple[np.ndarray, np.ndarray]:
-        """:param epistemic: summed squared errors r̂ of the generator, (n_envs,); the normalisers follow them
-        :param instrumental: those of the prior
-        :param alpha_ep: a signal without weight stays as it is
-        :param alpha_in: likewise
-        :return: what both pay, (n_envs,) each
-        """
+        """What the summed squared errors r̂ of generator and prior pay, (n_envs,) each; the normalisers follow them, and a
+        signal without weight stays as it is."""
         if alpha_ep:
             epistemic = self.epistemic(epistemic)
         if alpha_in:

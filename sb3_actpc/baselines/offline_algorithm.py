@@ -28,17 +28,10 @@ class OfflineAlgorithm(LearnsFromDemonstrations):
 
     :param policy: "MlpPolicy"
     :param env: a task with Box observations and actions; for its spaces and for evaluations
-    :param demonstrations: a path, or a :class:`~sb3_actpc.demonstrations.dataset.Demonstrations`
-    :param n_demonstrations: use only the first so many episodes of them
-    :param n_demonstration_transitions: use only the first so many transitions
-    :param learning_rate: of the optimiser, or a schedule
+    :param demonstrations: as of :class:`~sb3_actpc.baselines.demonstrated.LearnsFromDemonstrations`, with ``n_demonstrations``
+        and ``n_demonstration_transitions``
+    :param learning_rate: of the optimiser, or a schedule; the other keywords are SB3's
     :param batch_size: B
-    :param policy_kwargs: keywords of the policy
-    :param stats_window_size: as SB3's
-    :param tensorboard_log: as SB3's
-    :param verbose: as SB3's
-    :param seed: as SB3's
-    :param device: as SB3's
     :raises ValueError: for a keyword with a value that is not allowed, without demonstrations, for demonstrations that do not
         fit the environment, for other spaces, and for an environment that normalises observations
     """

@@ -115,13 +115,9 @@ class Bundle:
 
 @contextmanager
 def write_bundle(folder: Path, num_timesteps: int, keep: int, manifest: Mapping[str, Any]) -> Iterator[BundleWriter]:
-    """Write a checkpoint; it appears in ``folder`` only when the block and everything after it has worked.
+    """Write a checkpoint; it appears in ``folder``, that of a run's checkpoints, only when the block and everything after it
+    has worked. ``keep`` of them stay; ``manifest`` holds what else to record, plain values.
 
-    :param folder: of all checkpoints of a run
-    :param num_timesteps: environment steps so far
-    :param keep: how many checkpoints stay
-    :param manifest: what else to record, plain values
-    :return: takes the files
     :raises OSError: when the disk is full or the folder cannot be written; nothing is left behind then
     """
     folder.mkdir(parents=True, exist_ok=True)

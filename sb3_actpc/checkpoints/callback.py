@@ -74,12 +74,8 @@ class CheckpointCallback(BaseCallback):
         self.signals.restore()
 
     def save(self) -> Path:
-        """Write a checkpoint now.
-
-        :return: its folder
-        :raises ValueError: when a weight is not finite
-        :raises OSError: when it cannot be written; those there before stay
-        """
+        """Write a checkpoint now, and return its folder; ValueError when a weight is not finite, OSError when it cannot be
+        written: those there before stay."""
         model = self.model
         manifest = describe_model(model, self._env_id or env_name(self.training_env))
         manifest["settings"] = constructor_settings(model)

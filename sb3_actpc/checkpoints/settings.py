@@ -40,10 +40,8 @@ _ATTRIBUTE_OF = {"stats_window_size": "_stats_window_size"}
 
 
 def constructor_settings(model: BaseAlgorithm) -> dict[str, Any]:
-    """:param model: an SB3 algorithm
-    :return: JSON: its constructor's keywords by name, the policy's name among them; a value that cannot be named is left
-        out and its keyword listed under ``"unnamed"``
-    """
+    """JSON of an SB3 algorithm's constructor keywords by name, the policy's name among them; a value that cannot be named is
+    left out and its keyword listed under ``"unnamed"``."""
     policy = next((name for name, kind in model.policy_aliases.items() if kind is model.policy_class), None)
     record: dict[str, Any] = {"policy": policy, "keywords": {}, "unnamed": []}  # None for a class of the user's
     for name in constructor_keywords(type(model)):

@@ -22,26 +22,19 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "command goes on: finished runs are not repeated, the others continue from their last checkpoint. "
         "`sb3-actpc report` shows what has come of it.",
     )
-    parser.add_argument(
-        "file", nargs="?", metavar="FILE", help="YAML file with these options as keys; options replace its values"
-    )
-    parser.add_argument("--envs", nargs="+", metavar="ID", help="tasks, such as SparseHopper-v5")
-    parser.add_argument(
-        "--algos", nargs="+", metavar="NAME", help="algorithms or named variants, such as actpc refresh_alone td3"
-    )
-    parser.add_argument("--ablate", action="store_true", default=None, help="ActPC with every part, and without each in turn")
-    parser.add_argument("--seeds", type=int, metavar="N", help="seeds 0 to N-1 (default: 3)")
-    parser.add_argument("--output", metavar="DIR", help="folder of the comparison (default: runs/comparison)")
+    add = parser.add_argument
+    add("file", nargs="?", metavar="FILE", help="YAML file with these options as keys; options replace its values")
+    add("--envs", nargs="+", metavar="ID", help="tasks, such as SparseHopper-v5")
+    add("--algos", nargs="+", metavar="NAME", help="algorithms or named variants, such as actpc refresh_alone td3")
+    add("--ablate", action="store_true", default=None, help="ActPC with every part, and without each in turn")
+    add("--seeds", type=int, metavar="N", help="seeds 0 to N-1 (default: 3)")
+    add("--output", metavar="DIR", help="folder of the comparison (default: runs/comparison)")
     add_run_options(parser, eval_episodes=10)
-    parser.add_argument("--workers", type=int, metavar="N", help="runs at a time (default: one for each core)")
-    parser.add_argument(
-        "--engine", default="local", metavar="{local,ray}", help="processes, or a Ray cluster (default: local)"
-    )
-    parser.add_argument("--address", help="Ray cluster to use (default: one is started on this machine)")
-    parser.add_argument("--retry-failed", action="store_true", help="try runs again that failed before")
-    parser.add_argument(
-        "--dry-run", action="store_true", help="print the table of runs, with the seconds of those finished, and end"
-    )
+    add("--workers", type=int, metavar="N", help="runs at a time (default: one for each core)")
+    add("--engine", default="local", metavar="{local,ray}", help="processes, or a Ray cluster (default: local)")
+    add("--address", help="Ray cluster to use (default: one is started on this machine)")
+    add("--retry-failed", action="store_true", help="try runs again that failed before")
+    add("--dry-run", action="store_true", help="print the table of runs, with the seconds of those finished, and end")
 
 
 def run(args: argparse.Namespace) -> int:

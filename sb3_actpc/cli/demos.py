@@ -2,7 +2,7 @@
 
 import argparse
 import shlex
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -127,8 +127,8 @@ def _default_output(env_id: str, suffix: str = "") -> Path:
     return Path(f"{name.replace('sparse', 'sparse_', 1)}{suffix}.npz")
 
 
-def _save(demonstrations: "Demonstrations", output: Path) -> int:
-    demonstrations.save(output)
+def _save(demonstrations: "Demonstrations", output: Path, write: Callable[..., None] | None = None) -> int:
+    (write or type(demonstrations).save)(demonstrations, output)
     _report(repr(demonstrations))
     _report(f"wrote {output} ({output.stat().st_size / 1e6:.2f} MB)")
     return 0
@@ -206,11 +206,7 @@ def _convert(args: argparse.Namespace) -> int:
     output = args.output or args.file.with_suffix(".hdf5")
     if output.suffix not in HDF5_SUFFIXES:
         raise ValueError(f"--output {output} must end in {' or '.join(HDF5_SUFFIXES)}: it will be a robomimic file")
-    demonstrations = Demonstrations.load(args.file)
-    write_robomimic(demonstrations, output)
-    _report(repr(demonstrations))
-    _report(f"wrote {output} ({output.stat().st_size / 1e6:.2f} MB)")
-    return 0
+    return _save(Demonstrations.load(args.file), output, write_robomimic)
 
 
 def _read_hdf5(args: argparse.Namespace) -> "Demonstrations":

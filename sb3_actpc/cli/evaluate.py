@@ -13,18 +13,15 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         help="replay the agent of a run",
         description="Play episodes with the agent of a run folder. Its model.zip is unpickled: open only runs you trust.",
     )
-    parser.add_argument("folder", metavar="RUN", help="run folder, as written by sb3-actpc train")
-    parser.add_argument("--episodes", type=int, default=10, metavar="N", help="episodes to play (default: %(default)s)")
-    parser.add_argument("--seed", type=int, default=0, help="seed of the first episode (default: %(default)s)")
-    parser.add_argument(
-        "--video", metavar="FILE", help="video of the first episode, .mp4 or .gif, or a .png strip (default: RUN/video.mp4)"
-    )
-    parser.add_argument("--frames", type=int, default=300, metavar="N", help="its most frames (default: %(default)s)")
-    parser.add_argument("--size", type=int, metavar="PIXELS", help="its height and width (default: the environment's)")
-    parser.add_argument(
-        "--beside-demonstrator", action="store_true", help="draw the run's first demonstrated episode on the agent's right"
-    )
-    parser.add_argument("--no-video", action="store_true", help="no video")
+    add = parser.add_argument
+    add("folder", metavar="RUN", help="run folder, as written by sb3-actpc train")
+    add("--episodes", type=int, default=10, metavar="N", help="episodes to play (default: %(default)s)")
+    add("--seed", type=int, default=0, help="seed of the first episode (default: %(default)s)")
+    add("--video", metavar="FILE", help="video of the first episode, .mp4 or .gif, or a .png strip (default: RUN/video.mp4)")
+    add("--frames", type=int, default=300, metavar="N", help="its most frames (default: %(default)s)")
+    add("--size", type=int, metavar="PIXELS", help="its height and width (default: the environment's)")
+    add("--beside-demonstrator", action="store_true", help="draw the run's first demonstrated episode on the agent's right")
+    add("--no-video", action="store_true", help="no video")
 
 
 def run(args: argparse.Namespace) -> int:

@@ -196,14 +196,12 @@ class Demonstrations:
         observation_space: spaces.Space[Any] | None = None,
         final_reward: float | None = None,
     ) -> Demonstrations:
-        """Take over trajectories of the ``imitation`` library, or objects like them.
+        """Take over trajectories of the ``imitation`` library, or objects like them, recorded in ``env_id``.
 
         :param trajectories: each with ``obs`` (n + 1 rows), ``acts`` (n rows), ``infos`` (or None), ``terminal``, and perhaps
             ``rews``. A last info with ``TimeLimit.truncated`` is no termination; ``dense_reward`` in every info is kept
-        :param env_id: Gymnasium id of their environment
         :param observation_space: the environment's, needed for dict observations
         :param final_reward: what the last step of each is paid, and all others 0, where they have no ``rews``
-        :return: the demonstrations
         :raises ValueError: when something needed is missing, or does not fit together
         """
         columns = [trajectory_columns(trajectory, observation_space, final_reward) for trajectory in trajectories]
@@ -211,12 +209,8 @@ class Demonstrations:
 
     @classmethod
     def concatenate(cls, parts: Sequence[Demonstrations]) -> Demonstrations:
-        """One after the other.
-
-        :param parts: of the same task; dense rewards stay where all have them
-        :return: all their episodes, with the metadata on which all agree
-        :raises ValueError: when there are none, or they are of several tasks or sizes
-        """
+        """All episodes of demonstrations of one task, with the metadata on which all agree; dense rewards stay where all have
+        them. ValueError when there are none, or they are of several tasks or sizes."""
         names = sorted({base_name(part.env_id) for part in parts})
         if len(names) > 1:
             raise ValueError(f"demonstrations of several tasks cannot be concatenated, found {', '.join(names)}")
@@ -274,30 +268,21 @@ class Demonstrations:
         self._check_action_bounds(action_space.low.reshape(-1), action_space.high.reshape(-1))
 
     def rewarded_by(self, env: VecEnv) -> Demonstrations:
-        """The same transitions with the rewards that ``env`` gives for them, under its own condition and threshold.
-
-        :param env: an environment with a method ``demonstrated_rewards(demonstrations)``, such as this package's MuJoCo
-            tasks; for any other the rewards stay as recorded
-        :return: demonstrations that share every other array
-        """
+        """The same transitions with the rewards that ``env`` gives for them, under its own condition and threshold, by its
+        method ``demonstrated_rewards(demonstrations)``, which this package's MuJoCo tasks have; without one, as recorded."""
         if not env.has_attr("demonstrated_rewards"):
             return self
         return dataclasses.replace(self, rewards=env.env_method("demonstrated_rewards", self, indices=[0])[0])
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write a compressed ``.npz`` file, all at once or not at all, without pickles.
-
-        :param path: file to write (exactly this name)
-        :raises OSError: when it cannot be written; an old file at ``path`` then stays as it was
-        """
+        """Write a compressed ``.npz`` file of exactly this name, all at once or not at all, without pickles; an old file stays
+        as it was when that fails (OSError)."""
         write_npz(path, vars(self))
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Demonstrations:
-        """Read a file written by :meth:`save`; never unpickles.
+        """Read a file written by :meth:`save`, bit for bit as it was; never unpickles.
 
-        :param path: the ``.npz`` file
-        :return: the demonstrations, bit for bit as saved
         :raises FileNotFoundError: when there is no such file
         :raises ValueError: when the file is empty, cut short, damaged, lacks a field, holds one of a wrong type, or has a
             newer format; the message names the file and the field
@@ -314,10 +299,9 @@ class Demonstrations:
         rewards and ``infos["dense_reward"]``, where recorded, the dense ones.
 
         :param dataset: a ``minari.MinariDataset``, or the id of one in the local Minari folder (nothing is downloaded)
-        :param env_id: environment id; by default the one recorded in the dataset
+        :param env_id: by default the one recorded in the dataset
         :param observation_space: the environment's own space, for a Dict whose keys are not in alphabetical order: Minari
             sorts them, so by default only :meth:`to_minari`'s datasets keep another order
-        :return: the demonstrations
         :raises ImportError: when Minari is not installed
         :raises FileNotFoundError: when no local dataset has this id
         :raises ValueError: when the dataset has no episodes, no environment id, spaces other than Box (or Dicts of Box

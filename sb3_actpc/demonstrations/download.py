@@ -12,7 +12,7 @@ from sb3_actpc.envs.robosuite_layouts import robosuite_task
 from sb3_actpc.utils.extras import import_extra
 
 REPOSITORY = "https://huggingface.co/datasets/robomimic/robomimic_datasets/resolve/main"
-KINDS = {"mh": "300 by six humans of three levels", "ph": "200 by one proficient human"}
+KINDS = ("mh", "ph")  # 300 by six humans of three levels, 200 by one proficient human
 TIMEOUT_SECONDS = 30.0
 
 
@@ -28,16 +28,9 @@ def robomimic_url(env_id: str, kind: str = "mh") -> str:
 def download_robomimic(
     env_id: str, path: str | os.PathLike[str], url: str, obs: str = "paper", report: Report = silent
 ) -> Demonstrations:
-    """Download a robomimic file, unless it is there already, and read it.
+    """Download a robomimic file (http or https) to a path, unless it is there already, and read it, see
+    :func:`~sb3_actpc.demonstrations.read_robomimic`. The file appears under its name only when it is whole.
 
-    The file appears under its name only when it is whole.
-
-    :param env_id: the task it must be of
-    :param path: where to put the file
-    :param url: its address (http or https)
-    :param obs: the observations to build
-    :param report: takes lines of progress
-    :return: its demonstrations
     :raises OSError: when it cannot be fetched
     :raises ValueError: when what arrived is not such a file
     :raises ImportError: when h5py is not installed

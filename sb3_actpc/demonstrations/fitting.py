@@ -23,11 +23,9 @@ MINARI_ID = re.compile(r"([\w-]+/)*[\w-]+-v\d+")
 def resolve(
     source: str | os.PathLike[str] | Demonstrations, observation_space: spaces.Space[Any] | None = None
 ) -> Demonstrations:
-    """Demonstrations from a file path or a Minari id, or as they are.
+    """Demonstrations from the path of an ``.npz`` file or the id of a local Minari dataset, or as they are.
 
-    :param source: path of an ``.npz`` file, the id of a local Minari dataset, or the demonstrations themselves
     :param observation_space: the environment's, whose order a Minari dataset's Dict is flattened in; None for its own order
-    :return: the demonstrations
     :raises FileNotFoundError: when there is no such file or dataset
     :raises ImportError: when it is a Minari id and Minari is not installed
     :raises ValueError: when the file is not valid, or ``source`` is neither
@@ -64,13 +62,9 @@ def fit_demonstrations(
 
     Those of the dense base task of a sparse one (such as Minari's ``mujoco/hopper/expert-v0``) fit too.
 
-    :param source: a file, a Minari id, or the demonstrations
+    :param source: as of :func:`resolve`
     :param env: the environment, whose goal version and rewards count; None where there is none yet
-    :param observation_space: the environment's
-    :param action_space: the environment's
-    :param n_episodes: use only the first so many episodes, None for all
-    :param n_transitions: use only the first so many transitions, None for all
-    :return: demonstrations that fit
+    :param n_episodes: use only the first so many episodes, None for all; and likewise ``n_transitions``
     :raises FileNotFoundError: when there is no such file
     :raises ValueError: when they are damaged, fewer than asked for, or of another task
     """

@@ -35,15 +35,14 @@ def record_episodes(
 
     :param demonstrators: as of ``Demonstrations.record``; episode i is by number ``i % len(demonstrators)``, who tries again
         after a failure
-    :param env: environment with Box actions and Box observations, or a Dict of such
-    :param n_episodes: as of ``Demonstrations.record``, as the next
-    :param only_successes: which episodes to keep
     :param deterministic: of ``predict``; False samples the actions of a stochastic policy, from SB3's generators
     :param seed: try number i is reset with the seed ``seed + i``
     :param max_tries: episodes played at most, None for ``10 * n_episodes``
     :param report: takes one line of progress per kept episode
     :return: the columns of each episode (floats float32), and how they were made
     :raises ValueError: if too few of the tries succeed, or an argument is not allowed
+
+    For the other parameters see ``Demonstrations.record``.
     """
     if n_episodes < 1:
         raise ValueError(f"n_episodes={n_episodes} must be at least 1: give the number of demonstrated episodes")

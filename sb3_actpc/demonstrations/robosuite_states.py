@@ -23,11 +23,8 @@ def read_robosuite(path: str | os.PathLike[str], env_id: str, obs: str = "paper"
     :param path: the file: ``data`` (attributes ``env`` and ``env_info``), ``data/demo_i/{states,actions}``
     :param env_id: the task it must be of, ``SparseLift-v0`` or ``SparsePickPlaceCan-v0``
     :param obs: the environment's ``obs``
-    :return: the demonstrations
-    :raises FileNotFoundError: when there is no such file
-    :raises ValueError: when the file is cut short, of another task, or a demonstration lacks a key or holds a wrong one; the
-        message names the file, the demonstration and the key
-    :raises ImportError: when robosuite or h5py is not installed
+    :raises ImportError: when robosuite or h5py is not installed; for other errors see
+        :func:`~sb3_actpc.demonstrations.read_robomimic`
     """
     task, source = robosuite_task(env_id), str(path)
     with open_hdf5(path) as data:

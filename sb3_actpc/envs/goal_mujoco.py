@@ -63,12 +63,9 @@ class GoalTask(gym.Wrapper[Any, np.ndarray, Any, np.ndarray]):
         return demonstrations.rewards
 
     def goal_demonstrations(self, demonstrations: Demonstrations) -> Demonstrations:
-        """Recorded transitions of the sparse task as transitions of this one.
-
-        :param demonstrations: N transitions of the sparse task; those of this one are returned as they are
-        :return: the same transitions, each observation the flattened dictionary, paid by :meth:`compute_reward`
-        :raises ValueError: when the recording does not tell what was achieved
-        """
+        """Recorded transitions of the sparse task as transitions of this one, each observation the flattened dictionary, paid
+        by :meth:`compute_reward`; those of this one as they are. ValueError when the recording does not tell what was
+        achieved."""
         spec = self.spec
         env_id = demonstrations.env_id if spec is None else spec.id
         if demonstrations.env_id.rpartition("-v")[0] == env_id.rpartition("-v")[0]:

@@ -71,16 +71,11 @@ class RobosuiteTask:
     def object_states(
         self, positions: np.ndarray, quats: np.ndarray, eef_positions: np.ndarray, eef_quats: np.ndarray
     ) -> np.ndarray:
-        """The object's states from its poses and the gripper's; quaternions are (x, y, z, w).
+        """The object's states, (N, object_dim) in the order of robosuite 1.5, from its positions (N, 3) and quaternions
+        (N, 4), (x, y, z, w), and the gripper's.
 
         The can is seen in the gripper's frame, with a quaternion whose w is not negative; the cube's position relative to the
         gripper is in the world's frame.
-
-        :param positions: (N, 3) of the object
-        :param quats: (N, 4)
-        :param eef_positions: (N, 3) of the gripper
-        :param eef_quats: (N, 4)
-        :return: (N, object_dim), in the order of robosuite 1.5
         """
         offsets = positions - eef_positions
         if self.name == "Lift":

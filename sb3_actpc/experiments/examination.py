@@ -95,12 +95,9 @@ def examine(
     demonstrated action. Paid returns know nothing of the agent's internal signals: a critic that does is biased by them.
 
     :param model: an :class:`~sb3_actpc.actpc.actpc.ActPC`, with its demonstrations where it has any
-    :param env_id: Gymnasium id of the task
-    :param n_states: how many states
-    :param horizon: steps from each
+    :param horizon: steps from each of the ``n_states``
     :param perturbation: length of a move: root mean square over the dimensions of the scaled action, in (0, 2]
     :param seed: of episodes, noise and random moves
-    :param env_kwargs: keywords of the environment
     :param hold: steps for which actions are moved, directions being found anew at each
     :param noise: standard deviation, in the scaled action, of the noise of the noisy episodes
     :param values: the critic: features (B, n_features) and scaled actions (B, A) to values (B,); by default that of the
@@ -136,9 +133,7 @@ def examine_run(folder: Path, **options: Any) -> Examination:
 
     The run's ``model.zip`` is unpickled: open only runs that you trust.
 
-    :param folder: the run's folder
     :param options: keywords of :func:`examine`
-    :return: what was found
     :raises ValueError: when its agent is not an ActPC, or learned from ``VecNormalize``
     """
     from sb3_actpc.actpc import ActPC

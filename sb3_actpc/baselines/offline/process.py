@@ -53,10 +53,8 @@ class ServerProcess:
             theirs.close()
 
     def ask(self, what: str, arrays: Arrays | None = None, **values: Any) -> tuple[Values, Arrays]:
-        """:param what: the question's name
-        :param arrays: its arrays
-        :param values: its plain values
-        :return: values and arrays of the answer
+        """Values and arrays of the answer to a question of this name, with these arrays and plain values.
+
         :raises ServerFailed: when there is none; the process is then ended
         :raises ValueError: when the answer is that the question was wrong; likewise
         """

@@ -60,9 +60,7 @@ def write_report(folder: Path) -> list[Path]:
     """Write ``report.md``, ``report.html`` (one file, which opens without a network), ``results.csv`` and figures.
 
     :param folder: of a comparison, or of an export
-    :return: the files
     :raises FileNotFoundError: when there are no runs
-    :raises OSError: when a file cannot be written
     """
     results = load_results(folder)
     tasks = list(results.finished["task"].unique())

@@ -20,9 +20,6 @@ def export(folder: Path, target: Path) -> list[Path]:
     ``results.csv`` has a row for each run, ``curves.csv.gz`` their evaluations, ``settings.json`` what the ids of settings
     stand for, ``curves_TASK.png`` the figure of each task.
 
-    :param folder: of the comparison
-    :param target: where to write
-    :return: the files
     :raises FileNotFoundError: when there are no runs
     :raises OSError: when a file cannot be written
     """

@@ -45,13 +45,7 @@ _KEYS = {"from", "rows", "columns", "cell", "score", *_CHOOSING}
 
 
 def write_tables(path: Path) -> bool:
-    """Write the tables of a Markdown file anew.
-
-    :param path: of the file
-    :return: whether it has changed
-    :raises ValueError: when a marker is wrong
-    :raises OSError: when the file, or an export, cannot be read, or the file not be written
-    """
+    """Write the tables of a Markdown file anew, and say whether it has changed; ValueError when a marker is wrong."""
     text = path.read_text(encoding="utf-8")
     filled = fill_tables(text, path.parent)
     if filled != text:

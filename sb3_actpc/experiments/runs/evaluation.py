@@ -130,10 +130,7 @@ def play_episodes(model: Predictor, envs: Sequence[gym.Env[Any, Any]], n_episode
     environments are stepped side by side, each playing at most one episode at a time, so that the policy is asked once
     for all of them and short episodes are not counted more often than long ones.
 
-    :param model: the policy
     :param envs: at least one environment; as many episodes are played at a time
-    :param n_episodes: how many episodes
-    :param seed: seed of the first episode
     :return: returns, successes and lengths, in the order of the seeds
     :raises ValueError: when ``n_episodes`` is less than 1 or there is no environment
     """

@@ -226,10 +226,7 @@ def find_demonstrations(env_id: str, choice: str) -> Path | str | None:
 
 
 def demonstrations_hash(run: Run) -> str | None:
-    """:param run: with its environment and its demonstrations
-    :return: SHA-256 of what they hold, None for none
-    :raises FileNotFoundError: when they are not there
-    """
+    """SHA-256 of what a run's demonstrations hold, None for none; FileNotFoundError when they are not there."""
     found = find_demonstrations(run.env, run.demonstrations)
     return None if found is None else file_hash(*(minari_files(found) if isinstance(found, str) else [found]))
 

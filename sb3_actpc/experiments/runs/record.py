@@ -67,7 +67,6 @@ def check_demonstrations(run: Run) -> None:
 def write_result(folder: Path) -> dict[str, Any]:
     """Write ``result.json`` of a run that has come to its end, from its ``config.json`` and ``progress.csv``.
 
-    :param folder: run folder
     :return: its content: the means and standard deviations of the last evaluation (of the best one, where that agent was to be
         kept), the steps trained, training steps per second (evaluations left out), seconds, and where it comes from
     :raises FileNotFoundError: when one of the two files is missing

@@ -95,10 +95,7 @@ def finish_run(run: Run, report: Report = silent, callbacks: Sequence[BaseCallba
     """Bring a run to its end, whatever has become of it: begun now, gone on with from its newest whole checkpoint, given more
     steps when it ended with fewer, or left alone when it is done.
 
-    :param run: with its folder (``output``)
-    :param report: as of :func:`train_run`
-    :param callbacks: as of :func:`train_run`
-    :return: as :func:`train_run`
+    :param run: with its folder (``output``); for the rest see :func:`train_run`
     :raises ValueError: when the folder holds another run, or for a wrong setting
     """
     check_env_id(run.env, run.gym_packages)
@@ -226,11 +223,9 @@ def _keep_last_checkpoint(saver: CheckpointCallback | None, continuable: bool, r
 
 
 def evaluate_run(folder: Path, n_episodes: int = 10, seed: int = 0) -> dict[str, Any]:
-    """Play episodes with the policy of a run. Its ``model.zip`` is unpickled: open only runs that you trust.
+    """Play episodes with the policy of a run, the first from ``seed``. Its ``model.zip`` is unpickled: open only runs that you
+    trust.
 
-    :param folder: run folder
-    :param n_episodes: how many episodes
-    :param seed: seed of the first episode
     :return: means and standard deviations over the episodes, where those without success ended, and what identifies the run
     :raises FileNotFoundError: when the folder is not that of a run
     :raises ValueError: when its files are damaged
@@ -256,7 +251,6 @@ def evaluate_run(folder: Path, n_episodes: int = 10, seed: int = 0) -> dict[str,
 def load_run(folder: Path) -> tuple[Run, Predictor]:
     """A run and its model. The model is unpickled: open only runs that you trust.
 
-    :param folder: run folder
     :return: the run, and the model on the CPU, with its normalisation of observations where it has one
     :raises FileNotFoundError: when the folder, ``config.json`` or ``model.zip`` does not exist
     :raises ValueError: when one of the two cannot be read

@@ -62,11 +62,8 @@ def record_video(
 ) -> int:
     """Write a video of the first steps of an episode with the deterministic policy.
 
-    :param model: SB3 algorithm or policy
-    :param env_id: Gymnasium id
     :param env_kwargs: keywords of the environment; ``width`` and ``height`` in pixels where it takes them
     :param path: file to write: ``.mp4``, ``.gif``, or ``.png`` for ``STRIP_LENGTH`` pictures side by side, at half the size
-    :param seed: seed of the episode
     :param n_frames: most frames to render
     :param demonstrations: draw their first episode on the right of the agent, or None
     :return: number of frames, each (height, width, 3) uint8
