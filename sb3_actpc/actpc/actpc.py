@@ -46,7 +46,7 @@ from sb3_actpc.actpc.features import Batch, CircuitInputs
 from sb3_actpc.actpc.habit import Trials
 from sb3_actpc.actpc.policies import POLICIES, ActPCActor, ActPCPolicy, Critics, check_policy, check_policy_kwargs
 from sb3_actpc.actpc.reward_signals import InternalSignals, summed_squared_errors
-from sb3_actpc.actpc.self_imitation import Episodes, Observations, map_observations, sample_union
+from sb3_actpc.actpc.self_imitation import Episodes, Observations, Refresh, map_observations, sample_union
 from sb3_actpc.actpc.trust_region import spread_of
 from sb3_actpc.checkpoints import Restored, between_updates, load_checkpoint, load_weights, save_weights
 from sb3_actpc.demonstrations import fit_demonstrations
@@ -125,8 +125,8 @@ class ActPC(OffPolicyAlgorithm):
     :param actor_warm_start: updates of the actor on the demonstrations before learning starts, with learning rates that fall
         from ``WARM_START_RATES[0]`` to ``[1]``
     :param refresh_weight: weight of the actor's refresh from the demonstrations and its own best episodes
-    :param refresh_noise: standard deviation of Gaussian noise on the features (normalised observations) that refresh and warm
-        start imitate on, not on the working memory's; against overfitting to few demonstrations. 0 for none (the paper)
+    :param refresh_kwargs: keywords of :class:`~sb3_actpc.actpc.self_imitation.Refresh`, for refresh and warm start:
+        ``weighting`` (by "returns"; the paper's is "uniform") and ``noise``
     :param demonstration_fraction: share of the critic's batch that comes from the demonstrations
     :param alpha_ep: weight of the epistemic signal
     :param alpha_in: weight of the instrumental signal
@@ -195,7 +195,7 @@ class ActPC(OffPolicyAlgorithm):
         prior_updates: Count = 2000,
         actor_warm_start: Annotated[int | None, Between(0)] = None,
         refresh_weight: Weight = 1.0,
-        refresh_noise: Weight = 0.0,
+        refresh_kwargs: Settings | None = None,
         demonstration_fraction: Annotated[float | None, Between(0, 1)] = None,
         exploration_noise: Weight = 0.1,
         alpha_ep: Weight = 0.0,
@@ -258,7 +258,9 @@ class ActPC(OffPolicyAlgorithm):
         self.prior_updates = prior_updates
         self.actor_warm_start: int = default(actor_warm_start, 7500, 0)
         self.refresh_weight = refresh_weight
-        self.refresh_noise = refresh_noise
+        self.refresh_kwargs = refresh_kwargs
+        with named_in_errors(f"refresh_kwargs={refresh_kwargs!r}"):
+            self.refresh = Refresh(**(refresh_kwargs or {}))
         self.demonstration_fraction: float = default(demonstration_fraction, 0.5, 0.0)
         self.exploration_noise = exploration_noise
         self.alpha_ep = alpha_ep
@@ -795,10 +797,10 @@ class ActPC(OffPolicyAlgorithm):
     def _sample_imitated(self, n: int) -> tuple[th.Tensor, th.Tensor, th.Tensor | None]:
         """Features, actions and working memory of ``n`` imitated steps."""
         inputs = self.inputs
-        samples = sample_union(self._imitated(), n, self.memory_history)
+        samples = sample_union(self._imitated(), n, self.memory_history, self.refresh.weighting)
         features = inputs.features(inputs.observations(samples.observations))
-        if self.refresh_noise:
-            features = features + self.refresh_noise * th.randn_like(features)
+        if self.refresh.noise:
+            features = features + self.refresh.noise * th.randn_like(features)
         return features, inputs.tensor(samples.actions), inputs.memory(*inputs.past(samples.history, samples.history_mask))
 
     # ------------------------------------------------------------------ logging, saving

@@ -38,6 +38,7 @@ class DemonstrationReplay:
             split_observations(observation_space, demonstrations.next_observations),
             self.episodes.actions,
             self.episodes.starts,
+            self.episodes.returns,
         )
         self.epistemic, self.instrumental = np.zeros((2, len(demonstrations)), dtype=np.float32)
         self.has_signals = False

@@ -2,19 +2,37 @@
 
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from dataclasses import dataclass, fields
+from functools import cached_property
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
 
+from sb3_actpc.actpc.arguments import Weight, checked
 from sb3_actpc.demonstrations import Demonstrations, scaled_actions
 from sb3_actpc.demonstrations.rows import split_observations
 
 Observations = np.ndarray | dict[str, np.ndarray]
 TensorObservations = th.Tensor | dict[str, th.Tensor]
+RETURN_EXPONENT = 4.0  # an episode that was paid half as much is imitated a sixteenth as often
 PATIENCE = 20  # episodes, all with a negative return, after which the memory warns
+
+
+class Refresh:
+    """How refresh and warm start imitate.
+
+    :param weighting: "returns" (a step is drawn in proportion to its episode's return to the power of ``RETURN_EXPONENT``, a
+        reward-weighted regression, Peters and Schaal 2007; where nothing was paid, uniformly) or "uniform" (the paper)
+    :param noise: standard deviation of Gaussian noise on the features (normalised observations), not on the working memory's;
+        against overfitting to few demonstrations. 0 for none (the paper)
+    :raises ValueError: for another value
+    """
+
+    @checked
+    def __init__(self, weighting: Literal["returns", "uniform"] = "returns", noise: Weight = 0.0) -> None:
+        self.weighting, self.noise = weighting, noise
 
 
 class ImitationSamples(NamedTuple):
@@ -46,11 +64,18 @@ class Episodes:
     :param observations: (N, *obs_shape), or a dict of such
     :param actions: (N, A), scaled to [-1, 1]
     :param starts: (N,) index of the first transition of each row's episode
+    :param returns: (N,) what each row's episode was paid
     """
 
     observations: Observations
     actions: np.ndarray
     starts: np.ndarray
+    returns: np.ndarray
+
+    @cached_property
+    def cumulative_weights(self) -> np.ndarray:
+        """(N,), running sum of the positive returns to the power of ``RETURN_EXPONENT``."""
+        return np.cumsum(np.maximum(self.returns, 0.0) ** RETURN_EXPONENT)
 
     def __len__(self) -> int:
         return len(self.actions)
@@ -61,10 +86,12 @@ class Episodes:
     ) -> "Episodes":
         """The demonstrations with actions scaled to [-1, 1]."""
         bounds = demonstrations.episode_bounds
+        lengths = bounds[:, 1] - bounds[:, 0]
         return cls(
             observations=split_observations(observation_space, demonstrations.observations),
             actions=scaled_actions(demonstrations, action_space),
-            starts=np.repeat(bounds[:, 0], bounds[:, 1] - bounds[:, 0]),
+            starts=np.repeat(bounds[:, 0], lengths),
+            returns=np.repeat(demonstrations.episode_returns, lengths),
         )
 
     def take(self, indices: np.ndarray, history: int = 0) -> ImitationSamples:
@@ -139,11 +166,13 @@ class SelfImitationMemory:
             observations = _concatenate([kept, observations])
             actions = np.concatenate([self.episodes.actions[n_gone:], actions])
         starts = np.repeat(np.cumsum([0, *self.lengths[:-1]]), self.lengths)
-        self.episodes = Episodes(observations, actions, starts)
+        self.episodes = Episodes(observations, actions, starts, np.repeat(self.returns, self.lengths))
 
     def checkpoint_state(self) -> dict[str, Any]:
         """The stored episodes and their returns, for a checkpoint."""
-        episodes = None if self.episodes is None else dict(vars(self.episodes))
+        episodes = None
+        if self.episodes is not None:
+            episodes = {field.name: getattr(self.episodes, field.name) for field in fields(self.episodes)}
         return {"returns": list(self.returns), "lengths": list(self.lengths), "episodes": episodes}
 
     def restore_checkpoint_state(self, state: dict[str, Any]) -> None:
@@ -152,15 +181,26 @@ class SelfImitationMemory:
         self.episodes = None if state["episodes"] is None else Episodes(**state["episodes"])
 
 
-def sample_union(parts: list[Episodes], n: int, history: int = 0) -> ImitationSamples:
-    """``n`` rows drawn uniformly from the union of ``parts`` (global NumPy generator, as SB3's buffers)."""
+def sample_union(
+    parts: list[Episodes], n: int, history: int = 0, weighting: Literal["returns", "uniform"] = "uniform"
+) -> ImitationSamples:
+    """``n`` rows drawn from the union of ``parts`` (global NumPy generator, as SB3's buffers); see :class:`Refresh`."""
     parts = [part for part in parts if len(part)]
-    offsets = np.cumsum([len(part) for part in parts])
-    drawn = np.sort(np.random.randint(0, offsets[-1], size=n))
-    taken, start = [], 0
-    for part, end in zip(parts, offsets, strict=True):
-        taken.append(part.take(drawn[(drawn >= start) & (drawn < end)] - start, history))
-        start = int(end)
+    by_return = weighting == "returns" and any(part.cumulative_weights[-1] > 0.0 for part in parts)
+    if by_return:
+        weights = [part.cumulative_weights for part in parts]
+        ends = np.cumsum([running[-1] for running in weights])
+        drawn = np.sort(np.random.random(n)) * ends[-1]
+    else:
+        ends = np.cumsum([len(part) for part in parts])
+        drawn = np.sort(np.random.randint(0, ends[-1], size=n))
+    taken, start = [], 0.0
+    for index, (part, end) in enumerate(zip(parts, ends, strict=True)):
+        rows = drawn[(drawn >= start) & (drawn < end)] - start
+        if by_return:
+            rows = np.searchsorted(weights[index], rows, side="right").clip(max=len(part) - 1)
+        taken.append(part.take(rows.astype(np.int64), history))
+        start = end
     if len(taken) == 1:
         return taken[0]
     columns: list[Any] = [None if column[0] is None else _concatenate(column) for column in zip(*taken, strict=True)]

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 FORMAT = "sb3_actpc checkpoint"
-VERSION = 4
+VERSION = 5
 MANIFEST = "manifest.json"
 PIECE = 2**18  # bytes read at a time
 _NAME = re.compile(r"(\d{6,})_step_(\d+)")

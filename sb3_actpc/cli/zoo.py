@@ -171,9 +171,10 @@ def sample_actpc_params(trial: Any, n_actions: int, n_envs: int, additional_args
 
 def convert_actpc_params(sampled: dict[str, Any]) -> dict[str, Any]:
     """Keywords of ActPC from the parameters of a trial, as :func:`sample_actpc_params` named them."""
-    params = {name: sampled[name] for name in ("learning_rate", "tau", "actor_pressure", "refresh_weight", "refresh_noise")}
+    params = {name: sampled[name] for name in ("learning_rate", "tau", "actor_pressure", "refresh_weight")}
     return {
         **params,
+        "refresh_kwargs": {"noise": sampled["refresh_noise"]},
         "alpha_ep": sampled["alpha_ep"],
         "alpha_in": sampled["alpha_in"],
         "gamma": 1.0 - sampled["one_minus_gamma"],

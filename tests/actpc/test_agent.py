@@ -396,7 +396,8 @@ def test_noise_on_refreshed_observations_is_ridge_regression():
     slopes = []
     for noise in (0.0, 1.0):
         model = make(
-            demonstrations=data, policy_kwargs={"actor_kwargs": {"net_arch": []}}, actor_warm_start=2500, refresh_noise=noise
+            demonstrations=data, policy_kwargs={"actor_kwargs": {"net_arch": []}}, actor_warm_start=2500,
+            refresh_kwargs={"noise": noise},
         )
         model.pretrain()
         slopes.append(model.actor.circuit.weights[0][:, :2].diagonal().mean().item())

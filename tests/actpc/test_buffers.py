@@ -8,7 +8,7 @@ from gymnasium import spaces
 from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 
 from sb3_actpc.actpc.buffers import CombinedReplayBuffer, combined_buffer_class
-from sb3_actpc.actpc.self_imitation import Episodes, SelfImitationMemory, sample_union
+from sb3_actpc.actpc.self_imitation import RETURN_EXPONENT, Episodes, SelfImitationMemory, sample_union
 
 SPACES = (spaces.Box(-1, 1, (2,), np.float64), spaces.Box(-1, 1, (1,), np.float32))
 
@@ -176,14 +176,37 @@ def test_a_task_that_pays_negative_rewards_alone_is_warned_of_once():
         assert not any(sparse.takes(5, 0.0) for _ in range(60))
 
 
+def paid_episodes(*paid: tuple[int, float]) -> Episodes:
+    """An episode for each (length, return), its number as the observation."""
+    lengths, returns = zip(*paid, strict=True)
+    numbers = np.repeat(np.arange(len(paid), dtype=float), lengths)[:, None]
+    starts = np.repeat(np.cumsum([0, *lengths[:-1]]), lengths)
+    return Episodes(numbers, np.zeros((len(numbers), 1)), starts, np.repeat(returns, lengths))
+
+
 def test_the_union_is_drawn_uniformly():
-    parts = [Episodes(np.full((n, 1), value), np.zeros((n, 1)), np.zeros(n, int)) for n, value in ((30, 0.0), (10, 1.0))]
+    parts = [paid_episodes((30, 5.0)), paid_episodes((0, 0.0), (10, 1.0))]
     share = np.mean([sample_union(parts, 100).observations.mean() for _ in range(200)])
     assert share == pytest.approx(0.25, abs=0.02)
 
 
+def test_refresh_draws_a_step_by_what_its_episode_was_paid():
+    """p ∝ length * max(return, 0)^k, over the union of both parts; whatever is drawn comes with its own past."""
+    shown = paid_episodes((10, 1.0), (20, 2.0), (30, -3.0))
+    own = paid_episodes((0, 0.0), (0, 0.0), (0, 0.0), (5, 4.0), (7, 0.0))
+    drawn = sample_union([shown, own], 40_000, weighting="returns").observations[:, 0].astype(int)
+    expected = np.array([10, 20 * 2.0**RETURN_EXPONENT, 0, 5 * 4.0**RETURN_EXPONENT, 0])
+    assert np.bincount(drawn, minlength=5) / 40_000 == pytest.approx(expected / expected.sum(), abs=0.01)
+
+
+@pytest.mark.parametrize("unpaid", [0.0, -5.0])
+def test_where_nothing_was_paid_refresh_draws_uniformly(unpaid):
+    drawn = sample_union([paid_episodes((10, unpaid), (30, 2 * unpaid))], 20_000, weighting="returns").observations
+    assert drawn.mean() == pytest.approx(0.75, abs=0.02)
+
+
 def test_episode_history_stops_at_the_start_of_the_episode():
-    episodes = Episodes(np.arange(6.0)[:, None], np.zeros((6, 1)), np.array([0, 0, 0, 3, 3, 3]))
+    episodes = Episodes(np.arange(6.0)[:, None], np.zeros((6, 1)), np.array([0, 0, 0, 3, 3, 3]), np.zeros(6))
     rows = episodes.take(np.array([1, 4, 3]), history=2)
     assert np.array_equal(rows.history_mask, [[0, 1], [0, 1], [0, 0]])
     assert np.array_equal(rows.history[0, 1], [0.0]) and np.array_equal(rows.history[1, 1], [3.0])

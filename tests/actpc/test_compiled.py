@@ -14,7 +14,7 @@ SWEEPING = {
     "demonstrations": demonstrations(),
     "demonstration_fraction": 0.5,
     "target_policy_noise": 0.2,
-    "refresh_noise": 0.1,
+    "refresh_kwargs": {"noise": 0.1},
     "scale_pressure": True,
     "actor_warm_start": 5,
 }

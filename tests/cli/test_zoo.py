@@ -177,7 +177,8 @@ def test_sampled_parameters_become_keywords() -> None:
     params = convert_actpc_params(sampled)
     assert (params["gamma"], params["batch_size"]) == (0.99, 128)
     circuits = {"circuit_kwargs": {"weight_decay": 0.3}}
-    assert params["policy_kwargs"] == {"net_arch": NET_ARCHS["small"], **circuits} and params["refresh_noise"] == 0.1
+    assert params["policy_kwargs"] == {"net_arch": NET_ARCHS["small"], **circuits}
+    assert params["refresh_kwargs"] == {"noise": 0.1}
 
 
 @pytest.mark.parametrize(
