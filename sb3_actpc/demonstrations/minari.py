@@ -10,7 +10,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from sb3_actpc.demonstrations.rows import box_paths, field_error, join_observations, split_observations
+from sb3_actpc.demonstrations.rows import box_paths, field_error, join_observations, split_observations, transition_columns
 from sb3_actpc.utils.extras import import_extra
 
 
@@ -117,19 +117,10 @@ def _has_json_spec(env: gym.Env[Any, Any] | None) -> bool:
 
 def _columns(episode: Any, paths: list[list[str]], source: str) -> dict[str, np.ndarray]:
     """One Minari episode (n + 1 observations for n steps) as columns."""
-    observations = join_observations(episode.observations, paths, source)
-    n_steps = len(episode.rewards)
-    if len(observations) != n_steps + 1:
-        expected = f"{n_steps + 1} rows for {n_steps} steps in episode {episode.id}"
-        raise field_error(source, "observations", expected, f"{len(observations)}")
-    columns = {
-        "observations": observations[:-1],
-        "actions": np.asarray(episode.actions).reshape(n_steps, -1),
-        "next_observations": observations[1:],
-        "rewards": np.asarray(episode.rewards),
-        "terminations": np.asarray(episode.terminations),
-    }
+    rows = join_observations(episode.observations, paths, source)
+    columns = transition_columns(rows, episode.actions, f"{source}: episode {episode.id}")
+    columns |= {"rewards": np.asarray(episode.rewards), "terminations": np.asarray(episode.terminations)}
     dense_rewards = (episode.infos or {}).get("dense_reward")
     if dense_rewards is not None:  # one more when the reset's info was recorded
-        columns["dense_rewards"] = np.asarray(dense_rewards)[-n_steps:]
+        columns["dense_rewards"] = np.asarray(dense_rewards)[-len(episode.rewards) :]
     return columns

@@ -21,6 +21,8 @@ HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 _ARRAYS = ("observations", "actions", "rewards", "terminations", "episode_starts")
 _TEXTS = ("env_id", "metadata")
 _NEXT = ("next_observation_indices", "next_observation_rows")
+# of what the next observations are rebuilt from: kinds of numbers, number of dimensions, shape
+_FORMS = (("observations", "f", 2, "N, size"), ("episode_starts", "iu", 1, "n"), (_NEXT[0], "iu", 1, "n"))
 
 
 def write_npz(path: str | os.PathLike[str], fields: Mapping[str, Any]) -> None:
@@ -102,20 +104,17 @@ def _read_json(array: np.ndarray, name: str, source: str) -> Any:
 
 def _rebuild_next_observations(stored: dict[str, np.ndarray], source: str) -> np.ndarray:
     """Next observations, (N, obs_dim): the following rows, except where others are stored."""
-    observations, starts = stored["observations"], stored["episode_starts"]
-    indices, rows = (stored[name] for name in _NEXT)
-    if observations.ndim != 2 or len(observations) == 0 or observations.dtype.kind != "f":
-        found = f"type {observations.dtype}, shape {observations.shape}"
-        raise field_error(source, "observations", "floats of shape (N, size)", found)
-    if indices.dtype.kind not in "iu" or indices.ndim != 1 or np.any(np.diff(indices) <= 0):
-        found = f"type {indices.dtype}, shape {indices.shape}"
-        raise field_error(source, "next_observation_indices", "increasing whole numbers", found)
-    if starts.dtype.kind not in "iu" or starts.ndim != 1:
-        found = f"type {starts.dtype}, shape {starts.shape}"
-        raise field_error(source, "episode_starts", "a row of whole numbers", found)
+    for name, kinds, n_dims, shape in _FORMS:
+        array = stored[name]
+        if array.dtype.kind not in kinds or array.ndim != n_dims or array.size == 0:
+            expected = f"{'floats' if kinds == 'f' else 'whole numbers'} of shape ({shape})"
+            raise field_error(source, name, expected, f"type {array.dtype}, shape {array.shape}")
+    observations, starts = stored["observations"], stored["episode_starts"].astype(np.int64)
+    indices, rows = stored[_NEXT[0]].astype(np.int64), stored[_NEXT[1]]
     last = np.append(starts[1:], len(observations)) - 1
-    if np.any(indices < 0) or np.any(indices >= len(observations)) or not np.isin(last, indices).all():
-        expected = f"indices below {len(observations)} that include the end of every episode"
+    is_within = np.all(np.diff(indices) > 0) and indices[0] >= 0 and indices[-1] < len(observations)
+    if not is_within or not np.isin(last, indices).all():
+        expected = f"increasing indices below {len(observations)} that include the end of every episode"
         raise field_error(source, "next_observation_indices", expected, f"{len(indices)} indices that do not")
     if rows.shape != (len(indices), observations.shape[1]) or rows.dtype != observations.dtype:
         expected = f"shape {(len(indices), observations.shape[1])} of {observations.dtype}"

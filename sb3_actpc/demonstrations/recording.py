@@ -10,7 +10,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from sb3_actpc.demonstrations.rows import box_paths, join_observations
+from sb3_actpc.demonstrations.rows import box_paths, join_observations, transition_columns
 from sb3_actpc.utils.versions import installed_version
 
 Columns = dict[str, np.ndarray]
@@ -86,22 +86,14 @@ def trajectory_columns(
     if isinstance(observations, Mapping) and observation_space is None:
         raise ValueError("trajectories with dict observations need observation_space: give the environment's")
     rows = join_observations(observations, [[]] if observation_space is None else box_paths(observation_space))
-    n_steps = len(trajectory.acts)
-    if len(rows) != n_steps + 1:
-        raise ValueError(f"a trajectory of {n_steps} actions must have {n_steps + 1} observations, found {len(rows)}")
+    columns, n_steps = transition_columns(rows, trajectory.acts, "a trajectory"), len(trajectory.acts)
     infos = [info or {} for info in trajectory.infos] if trajectory.infos is not None else [{}] * n_steps
     rewards = getattr(trajectory, "rews", None)
     if rewards is None:
         if final_reward is None:
             raise ValueError("trajectories without rews need final_reward, the reward of each one's last step (1.0, say)")
         rewards = np.append(np.zeros(n_steps - 1), final_reward)
-    columns = {
-        "observations": rows[:-1],
-        "actions": np.asarray(trajectory.acts).reshape(n_steps, -1),
-        "next_observations": rows[1:],
-        "rewards": np.asarray(rewards),
-        "terminations": np.zeros(n_steps, dtype=bool),
-    }
+    columns |= {"rewards": np.asarray(rewards), "terminations": np.zeros(n_steps, dtype=bool)}
     columns["terminations"][-1] = trajectory.terminal and not infos[-1].get("TimeLimit.truncated", False)
     if all("dense_reward" in info for info in infos):
         columns["dense_rewards"] = np.array([info["dense_reward"] for info in infos])

@@ -63,6 +63,14 @@ def join_observations(observations: Any, paths: list[list[str]], source: str = "
     return np.concatenate(parts, axis=1)
 
 
+def transition_columns(rows: np.ndarray, actions: Any, where: str) -> dict[str, np.ndarray]:
+    """Columns of n actions and of the n + 1 observations (n + 1, obs_dim) around them; ValueError for another number."""
+    n = len(actions)
+    if len(rows) != n + 1:
+        raise ValueError(f"{where} of {n} actions must have {n + 1} observations, found {len(rows)}")
+    return {"observations": rows[:-1], "actions": np.asarray(actions).reshape(n, -1), "next_observations": rows[1:]}
+
+
 def unchained_indices(observations: np.ndarray, next_observations: np.ndarray, episode_starts: np.ndarray) -> np.ndarray:
     """(M,) int64, the transitions whose next observation is not, bit for bit, the next row of the same episode;
     observations are (N, obs_dim) float32."""

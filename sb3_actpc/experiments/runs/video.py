@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from sb3_actpc.demonstrations.dataset import Demonstrations
-from sb3_actpc.experiments.runs.evaluation import stacked
+from sb3_actpc.experiments.runs.evaluation import play_episodes
 from sb3_actpc.utils.files import atomic_write
 
 GL_BACKENDS = ("egl", "osmesa")
@@ -117,7 +117,7 @@ def _rendering(env_id: str, env_kwargs: dict[str, Any]) -> Iterator[Any]:
         except ValueError as error:  # it takes no render_mode
             raise NotImplementedError(str(error)) from error
         yield env
-    except (FatalError, gym.error.Error, ImportError, OSError, RuntimeError, AttributeError, NotImplementedError) as error:
+    except (FatalError, gym.error.Error, ImportError, OSError, RuntimeError, AttributeError, AssertionError) as error:
         raise RenderingUnavailable(f"{type(error).__name__}: {error}") from error
     finally:
         if env is not None:
@@ -133,26 +133,19 @@ def _replay(demonstrations: Demonstrations, env: Any, n_frames: int) -> list[Any
     frames = []
     for position in simulator.demonstrated_positions(demonstrations)[:end]:
         simulator.set_state(position, np.zeros(simulator.model.nv))
-        frames.append(_frame(env))
+        frames.append(_checked(env.render()))
     return frames
 
 
-def _play(model: Any, env: Any, seed: int, n_frames: int) -> list[Any]:
-    observation, _ = env.reset(seed=seed)
-    frames = [_frame(env)]
-    state, episode_start, finished = None, np.ones(1, dtype=bool), False
-    while not finished and len(frames) < n_frames:
-        batch = stacked([observation])
-        action, state = model.predict(batch, state=state, episode_start=episode_start, deterministic=True)
-        observation, _, terminated, truncated, _ = env.step(action[0])
-        episode_start = np.zeros(1, dtype=bool)
-        finished = terminated or truncated
-        frames.append(_frame(env))
-    return frames
+def _play(model: Any, env: Any, seed: int, n_frames: int) -> list[np.ndarray]:
+    from gymnasium.wrappers import RenderCollection, TimeLimit
+
+    collection = RenderCollection(TimeLimit(env, max(1, n_frames - 1)))
+    play_episodes(model, [collection], 1, seed)
+    return [_checked(frame) for frame in collection.render()[:n_frames]]
 
 
-def _frame(env: Any) -> np.ndarray:
-    frame = env.render()
+def _checked(frame: Any) -> np.ndarray:
     if not isinstance(frame, np.ndarray):
         raise NotImplementedError(f"the environment renders {type(frame).__name__}, not an image")
     return frame
