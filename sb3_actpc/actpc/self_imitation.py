@@ -104,12 +104,9 @@ class Episodes:
     def past(
         self, indices: np.ndarray, history: int, including: bool = False
     ) -> tuple[Observations | None, np.ndarray | None]:
-        """:param indices: (B,) rows
-        :param history: H
-        :param including: the past of the step after each row, the row itself its newest part
-        :return: (B, H, *obs_shape), the observations before each row, oldest first, and (B, H), 1 where there is one in the
-            same episode; None and None without a history
-        """
+        """The ``history`` observations before each of (B,) rows, (B, H, *obs_shape), oldest first, and (B, H), 1 where there
+        is one in the same episode; None and None without a history. ``including`` asks for the past of the step after each
+        row, the row itself its newest part."""
         if not history:
             return None, None
         earlier = indices[:, None] + np.arange(-history, 0) + int(including)

@@ -24,12 +24,9 @@ class CloningPolicy(BasePolicy):
     """What both policies share: the normalisation of observations, the optimiser, and actions cut to [-1, 1] before they are
     given the environment's units.
 
-    :param observation_space: a Box
-    :param action_space: a Box with bounds
-    :param lr_schedule: learning rate
-    :param optimizer_class: of torch
-    :param optimizer_kwargs: its keywords, without the learning rate
-    :raises ValueError: for other spaces
+    The parameters are SB3's.
+
+    :raises ValueError: for observations that are no Box
     """
 
     mean: th.Tensor
@@ -106,13 +103,13 @@ class BCRNNPolicy(CloningPolicy):
     Its state is a tuple of arrays, as in sb3-contrib's RecurrentPPO: (n_layers, n, hidden_size) of the cells (two for an
     LSTM), and last the steps since it began, (n,).
 
-    :param args: as :class:`CloningPolicy`'s
+    The other parameters are :class:`CloningPolicy`'s.
+
     :param cell: "gru" or "lstm"
     :param hidden_size: units of each layer
     :param n_layers: recurrent layers
     :param restart_every: steps after which the state begins anew, as it does in the sequences that it learned from; None
         carries it through the episode
-    :param kwargs: as :class:`CloningPolicy`'s
     :raises ValueError: for a keyword with a value that is not allowed
     """
 
@@ -159,11 +156,9 @@ class BCRNNPolicy(CloningPolicy):
         episode_start: np.ndarray | None = None,
         deterministic: bool = False,
     ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
-        """:param observation: of one environment, or of n
-        :param state: what the call before returned; None at the beginning
-        :param episode_start: (n,), true where an episode begins, and so the state
-        :param deterministic: has no effect
-        :return: actions in the environment's units, and the next state
+        """As SB3's: actions in the environment's units, and the next state, which begins anew where ``episode_start``, (n,),
+        is true; ``deterministic`` has no effect.
+
         :raises ValueError: when the state is not that of n episodes of this network
         """
         self.set_training_mode(False)

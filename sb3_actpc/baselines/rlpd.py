@@ -39,10 +39,8 @@ class LayerNormCritic(ContinuousCritic):
 class LayerNormSACPolicy(SACPolicy):
     """SB3's SAC policy with :class:`LayerNormCritic`.
 
-    :param args: as SB3's
     :param n_critics: how many critics
     :param n_target_critics: how many drawn target critics give the smallest value that bootstraps (REDQ, arXiv 2101.05982)
-    :param kwargs: as SB3's
     :raises ValueError: when more are to be drawn than there are
     """
 

@@ -37,10 +37,8 @@ def load_checkpoint(
 ) -> Restored:
     """Make an agent with the settings of a checkpoint and put everything back into it; no code is run from the file.
 
-    :param algorithm: the class
     :param path: a checkpoint, or the folder of several: the newest whole one is taken
     :param env: an environment made as the stopped run's
-    :param device: where the agent lives
     :param report: given a line for each damaged checkpoint, and when episodes must start again
     :param overrides: constructor keywords: those that could not be stored by name, and what may differ (``verbose``, ...)
     :return: the agent (``model``), for :func:`~sb3_actpc.checkpoints.continue_learning`
@@ -103,10 +101,7 @@ def load_weights(
 ) -> SelfAlgorithm:
     """Make an agent from a file of :func:`save_weights`. Nothing in the file is run: it holds numbers and names.
 
-    :param algorithm: the class
     :param path: the file; ``.safetensors`` may be left out
-    :param env: the environment, or its id
-    :param device: where the agent lives
     :param without: stored keywords that are left at the constructor's defaults
     :param overrides: constructor keywords that replace the stored ones
     :return: the agent; its replay buffer is empty

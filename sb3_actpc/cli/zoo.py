@@ -221,8 +221,6 @@ def _training_arguments(arguments: Sequence[str], folder: Path, optimize: bool) 
         ours.conf_file = str(conf_file)
     passed = ["--algo", ours.algo, "--env", ours.env, "--conf-file", ours.conf_file, "--log-folder", ours.log_folder]
     passed += ["--gym-packages", *ours.gym_packages] if ours.gym_packages else []
-    if ours.trained_agent:
-        passed += ["--trained-agent", ours.trained_agent]
     if optimize:
         samplers = import_extra("rl_zoo3.hyperparams_opt", "zoo").HYPERPARAMS_SAMPLER
         if ours.algo not in samplers:
@@ -232,8 +230,8 @@ def _training_arguments(arguments: Sequence[str], folder: Path, optimize: bool) 
         ours.study_name = ours.study_name or f"{ours.algo}_{ours.env}"
         # a journal: several processes can work on it, and a stopped search goes on
         ours.storage = ours.storage or os.path.join(ours.log_folder, ours.algo, f"{ours.study_name}.log")
-    for option, value in (("--storage", ours.storage), ("--study-name", ours.study_name)):
-        passed += [option, value] if value else []
+    for option in ("trained_agent", "storage", "study_name"):
+        passed += [f"--{option.replace('_', '-')}", getattr(ours, option)] if getattr(ours, option) else []
     return [*passed, *rest]
 
 

@@ -8,6 +8,7 @@ then played without noise. A critic that is worth following ranks the moved acti
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -113,16 +114,12 @@ def examine(
         raise ValueError(f"perturbation={perturbation} must be above 0 and at most 2, the width of the scaled action")
     if model.demonstrations is not None and model.expert is None:
         raise ValueError(f"the agent's demonstrations are not at {model.demonstrations}: set agent.demonstrations")
-    agent = _Agent(model, values, perturbation)
-    branches = ["policy", "along", "against", *(["demonstration"] if agent.demonstrated else []), *["random"] * N_RANDOM]
-    n_envs = max(N_EPISODES, min(N_TOGETHER, n_states) * len(branches))
-    envs = [gym.make(env_id, disable_env_checker=True, **(env_kwargs or {})) for _ in range(n_envs)]
-    try:
-        starts = _starts(agent, envs, n_states, noise, seed)
-        rows = _try_all(agent, envs, starts, branches, horizon, hold, seed)
-    finally:
-        for env in envs:
-            env.close()
+    agent = _Agent(model, values, perturbation, horizon, hold)
+    n_envs = max(N_EPISODES, min(N_TOGETHER, n_states) * len(agent.branches))
+    with ExitStack() as stack:
+        options = {"disable_env_checker": True, **(env_kwargs or {})}
+        envs = [stack.enter_context(gym.make(env_id, **options)) for _ in range(n_envs)]
+        rows = _try_all(agent, envs, _starts(agent, envs, n_states, noise, seed), seed)
     tables = [_measures(part, seed).assign(group=name, states=part.state.nunique()) for name, part in _groups(rows).items()]
     columns = ["group", "measure", "states", "value", "standard_error"]
     return Examination(rows, pd.concat(tables, ignore_index=True)[columns])
@@ -156,10 +153,13 @@ def examine_run(folder: Path, **options: Any) -> Examination:
 class _Agent:
     """The agent as it is examined; actions are scaled to [-1, 1]."""
 
-    def __init__(self, model: Any, values: Values | None, perturbation: float) -> None:
-        self.model, self.values, self.perturbation = model, values or self._first_critic, perturbation
+    def __init__(self, model: Any, values: Values | None, perturbation: float, horizon: int, hold: int) -> None:
+        self.model, self.values = model, values or self._first_critic
+        self.perturbation, self.horizon, self.hold = perturbation, horizon, hold
+        self.branches = ["policy", "along", "against", *["random"] * N_RANDOM]
         self.demonstrated = model.expert is not None
         if self.demonstrated:
+            self.branches.insert(3, "demonstration")
             episodes = model.expert.episodes
             self._seen = self.features(episodes.observations)
             self._spread = self._seen.std(0).clamp_min(1e-4)
@@ -304,15 +304,7 @@ def _restore(env: gym.Env[Any, Any], captured: tuple[dict[str, Any], Decoder]) -
 # ------------------------------------------------------------------ trying actions
 
 
-def _try_all(
-    agent: _Agent,
-    envs: Sequence[gym.Env[Any, Any]],
-    starts: Sequence[_Start],
-    branches: Sequence[str],
-    horizon: int,
-    hold: int,
-    seed: int,
-) -> pd.DataFrame:
+def _try_all(agent: _Agent, envs: Sequence[gym.Env[Any, Any]], starts: Sequence[_Start], seed: int) -> pd.DataFrame:
     """Every branch from every state; columns as in :class:`Examination`."""
     rng, frames = np.random.default_rng(seed), []
     distances = np.full(len(starts), np.nan)
@@ -321,24 +313,18 @@ def _try_all(
     for env in envs:
         env.reset(seed=seed)  # a wrapper refuses steps before
     for first in range(0, len(starts), N_TOGETHER):
-        states = np.repeat(np.arange(first, min(first + N_TOGETHER, len(starts))), len(branches))
-        moves = list(branches) * (len(states) // len(branches))
+        states = np.repeat(np.arange(first, min(first + N_TOGETHER, len(starts))), len(agent.branches))
+        moves = agent.branches * (len(states) // len(agent.branches))
         group = [starts[state] for state in states]
         randoms = rng.standard_normal((len(states), int(np.prod(agent.model.action_space.shape))))
-        frame = _roll_out(agent, envs, group, moves, th.as_tensor(randoms, dtype=th.float32), horizon, hold)
+        frame = _roll_out(agent, envs, group, moves, th.as_tensor(randoms, dtype=th.float32))
         sources = [start.source for start in group]
         frames.append(frame.assign(state=states, source=sources, distance=distances[states], move=moves))
     return pd.concat(frames, ignore_index=True)
 
 
 def _roll_out(
-    agent: _Agent,
-    envs: Sequence[gym.Env[Any, Any]],
-    starts: Sequence[_Start],
-    branches: Sequence[str],
-    randoms: th.Tensor,
-    horizon: int,
-    hold: int,
+    agent: _Agent, envs: Sequence[gym.Env[Any, Any]], starts: Sequence[_Start], branches: Sequence[str], randoms: th.Tensor
 ) -> pd.DataFrame:
     """Side by side: the branch's actions for ``hold`` steps, then the policy's. A row each: value, paid, dense, rest, fell."""
     for env, start in zip(envs, starts, strict=False):
@@ -347,12 +333,12 @@ def _roll_out(
     observations = [start.observation for start in starts]
     memory, begins = _memories(starts)
     values, paid, dense, fell = np.zeros((4, n))
-    rest = np.full(n, gamma**horizon)
+    rest = np.full(n, gamma**agent.horizon)
     playing = np.ones(n, dtype=bool)
-    for t in range(horizon):
+    for t in range(agent.horizon):
         actions, memory = agent.act(stacked(observations), memory, begins)
         begins = np.zeros(n, dtype=bool)
-        if t < hold:
+        if t < agent.hold:
             features = agent.features(stacked(observations))
             actions = agent.move(features, actions, branches, randoms)
             values = values if t else agent.values(features, actions).double().numpy()

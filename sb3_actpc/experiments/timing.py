@@ -111,10 +111,10 @@ def updates(device: str, compiled: bool) -> Group:
         settings |= {f"{name}, bfloat16": with_changes(settings[name], low) for name in (shipped, paper)}
     if compiled:
         settings |= {f"{name}, compiled": {**settings[name], "compile": True} for name in settings if name.startswith(shipped)}
-    shared = {"learning_starts": 10 * N_FILLED, "buffer_size": 10 * N_FILLED, "device": device, "seed": 0}
+    shared: dict[str, Any] = {"learning_starts": 10 * N_FILLED, "buffer_size": 10 * N_FILLED, "device": device, "seed": 0}
     entries = {"SB3 TD3 train()": _updater(TD3("MlpPolicy", TASK, **TD3_SIZES, **shared))}
     for name, keywords in settings.items():
-        own = {"policy": "MlpPolicy", **keywords, **QUICK, "batch_size": BATCH_SIZE, **shared}
+        own: dict[str, Any] = {"policy": "MlpPolicy", **keywords, **QUICK, "batch_size": BATCH_SIZE, **shared}
         entries[name] = _updater(ActPC(env=TASK, **own))
     return entries, {"SB3 TD3 train()": "TD3"}
 
@@ -167,7 +167,7 @@ def _learners(task: str, device: str) -> Entries:
     shared: dict[str, Any] = {"learning_starts": 100, "buffer_size": 100 * N_FILLED, "seed": 0}
     same: dict[str, Any] = {"train_freq": 1, "gradient_steps": 1, **shared}
     bare: dict[str, Any] = {"policy_kwargs": {"circuit_kwargs": SWEEP}, "batch_size": BATCH_SIZE, **same}
-    shipped = {**preset(task, "actpc"), **QUICK, "batch_size": BATCH_SIZE, **shared}
+    shipped: dict[str, Any] = {**preset(task, "actpc"), **QUICK, "batch_size": BATCH_SIZE, **shared}
     models: dict[str, OffPolicyAlgorithm] = {
         f"SB3 TD3, {task}": TD3("MlpPolicy", task, device=device, **TD3_SIZES, **same),
         f"bare, learned sweep, {task}": ActPC("MlpPolicy", task, device=device, compile=False, **bare),

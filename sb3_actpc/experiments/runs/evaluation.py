@@ -185,10 +185,7 @@ class EvaluationCallback(BaseCallback):
     since :meth:`begin`, the evaluations' own (``evaluation_seconds``) among them; ``updates`` are the agent's.
 
     :param envs: environments that only this callback uses, closed by whoever made them
-    :param folder: run folder
-    :param eval_freq: environment steps between two evaluations
-    :param eval_episodes: episodes in each evaluation
-    :param seed: seed of the first episode of each evaluation
+    :param eval_freq: environment steps between two evaluations, of ``eval_episodes`` each, the first from ``seed``
     :param report: given one line of text after each evaluation
     :param keeps_best: keep the agent of the best evaluation, not that of the last
     :param target_return: end the training at the first evaluation whose mean dense return reaches it; None for never

@@ -60,10 +60,7 @@ def resume_run(
 ) -> dict[str, Any]:
     """Go on with a run from its newest whole checkpoint, with the settings in its ``config.json``.
 
-    :param folder: run folder
     :param report: given a line of text when the run goes on, after each evaluation and for each damaged checkpoint
-    :param progress: show a progress bar
-    :param callbacks: further ones to watch the training with
     :param more_steps: added to those that the run was to have; a finished run needs some
     :return: as :func:`train_run`
     :raises FileNotFoundError: when the folder is not that of a run
@@ -137,9 +134,7 @@ def _content(run: Run) -> str:
 def _run(run: Run, report: Report, callbacks: Sequence[BaseCallback], resumes: bool) -> dict[str, Any]:
     th.set_num_threads(run.threads)
     with ExitStack() as stack:
-        eval_envs = make_eval_envs(run.env, run.env_kwargs, run.eval_episodes)
-        for env in eval_envs:
-            stack.callback(env.close)
+        eval_envs = [stack.enter_context(env) for env in make_eval_envs(run.env, run.env_kwargs, run.eval_episodes)]
         train_env = make_train_env(run.env, run.env_kwargs, run.n_envs or 1, run.seed, run.normalize)
         stack.callback(train_env.close)
         model = build_model(run, train_env)
@@ -236,9 +231,7 @@ def evaluate_run(folder: Path, n_episodes: int = 10, seed: int = 0) -> dict[str,
     run, model = load_run(folder)
     with ExitStack() as stack:
         stack.callback(close_model, model)
-        envs = make_eval_envs(run.env, run.env_kwargs, n_episodes)
-        for env in envs:
-            stack.callback(env.close)
+        envs = [stack.enter_context(env) for env in make_eval_envs(run.env, run.env_kwargs, n_episodes)]
         statistics = play_episodes(model, envs, n_episodes, seed)
     return {
         **statistics.summary(),
