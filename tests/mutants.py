@@ -535,8 +535,8 @@ MUTANTS = [
     Mutant(
         "only the first part of the union is drawn",
         IMITATION,
-        "np.random.randint(0, offsets[-1], size=n)",
-        "np.random.randint(0, offsets[0], size=n)",
+        "np.random.randint(0, ends[-1], size=n)",
+        "np.random.randint(0, ends[0], size=n)",
         f"{STORES} -k union",
     ),
     # ------------------------------------------------------------------ tasks

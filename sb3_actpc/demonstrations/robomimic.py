@@ -13,14 +13,8 @@ from typing import Any
 
 import numpy as np
 
+from sb3_actpc.demonstrations import hdf5
 from sb3_actpc.demonstrations.dataset import ACTION_TOLERANCE, Demonstrations
-from sb3_actpc.demonstrations.hdf5 import (
-    check_recorded_task,
-    demo_names,
-    open_hdf5,
-    read_array,
-    read_json_attribute,
-)
 from sb3_actpc.demonstrations.recording import Columns
 from sb3_actpc.envs.robosuite_layouts import ACTION_DIM, OBSERVATIONS, PROPRIOCEPTION, RobosuiteTask, robosuite_task
 from sb3_actpc.utils.extras import import_extra
@@ -54,10 +48,12 @@ def read_robomimic(
     """
     task, source = robosuite_task(env_id), str(path)
     task.layout(obs)
-    with open_hdf5(path) as data:
-        arguments = read_json_attribute(data, "env_args", source)
-        check_recorded_task({**(arguments.get("env_kwargs") or {}), "env_name": arguments.get("env_name")}, task.name, source)
-        names = demo_names(data) if filter_key is None else _filtered(data, filter_key, source)
+    with hdf5.open_hdf5(path) as data:
+        arguments = hdf5.read_json_attribute(data, "env_args", source)
+        hdf5.check_recorded_task(
+            {**(arguments.get("env_kwargs") or {}), "env_name": arguments.get("env_name")}, task.name, source
+        )
+        names = hdf5.demo_names(data) if filter_key is None else _filtered(data, filter_key, source)
         episodes = [_read_episode(data[name], task, obs, f"{source}: {name}") for name in names]
     metadata = {"source": "robomimic", "env_version": str(arguments.get("env_version", "unknown")), "demos": names}
     if filter_key is not None:
@@ -100,11 +96,11 @@ def _filtered(data: Any, filter_key: str, source: str) -> list[str]:
     unknown = [name for name in names if name not in data]
     if unknown or not names:
         raise ValueError(f"{source}: mask {filter_key!r} must name demonstrations, found {', '.join(unknown) or 'none'}")
-    return sorted(names, key=demo_names(data).index)
+    return sorted(names, key=hdf5.demo_names(data).index)
 
 
 def _read_episode(group: Any, task: RobosuiteTask, obs: str, source: str) -> Columns:
-    actions = read_array(group, "actions", source, size=ACTION_DIM)
+    actions = hdf5.read_array(group, "actions", source, size=ACTION_DIM)
     length = len(actions)
     too_large = np.argwhere(np.abs(actions) > 1.0 + ACTION_TOLERANCE)
     if len(too_large):
@@ -116,7 +112,7 @@ def _read_episode(group: Any, task: RobosuiteTask, obs: str, source: str) -> Col
     else:
         next_parts = {name: np.concatenate([part[1:], part[-1:]]) for name, part in parts.items()}
     successes = task.is_success(next_parts["object"], next_parts["robot0_eef_pos"])
-    recorded = read_array(group, "rewards", source, length=length) if "rewards" in group else None
+    recorded = hdf5.read_array(group, "rewards", source, length=length) if "rewards" in group else None
     is_sparse = recorded is not None and bool(np.isin(recorded, (0.0, 1.0)).all())
     rewards = recorded if recorded is not None and is_sparse else successes.astype(np.float64)
     end = int(np.argmax(rewards)) + 1 if rewards.any() else length
@@ -140,7 +136,7 @@ def _read_parts(group: Any, kind: str, task: RobosuiteTask, obs: str, length: in
     parts = {}
     for name in OBSERVATIONS[obs]:
         try:
-            parts[name] = read_array(group[kind], name, f"{source}: {kind}", sizes[name], length)
+            parts[name] = hdf5.read_array(group[kind], name, f"{source}: {kind}", sizes[name], length)
         except ValueError as error:
             hint = "" if name in OBSERVATIONS["robomimic"] or name in group[kind] else " (obs='robomimic' needs fewer keys)"
             raise ValueError(f"{error}{hint}") from None

@@ -15,15 +15,8 @@ import gymnasium as gym
 import numpy as np
 
 from sb3_actpc.demonstrations.dataset import Demonstrations
-from sb3_actpc.envs.robosuite_layouts import (
-    ACTION_DIM,
-    CAN_BIN_HIGH,
-    CAN_BIN_LOW,
-    TABLE_HEIGHT,
-    RobosuiteTask,
-    quaternion_product,
-    robosuite_task,
-)
+from sb3_actpc.envs import robosuite_layouts
+from sb3_actpc.envs.robosuite_layouts import ACTION_DIM, RobosuiteTask, quaternion_product, robosuite_task
 
 METRES_PER_ACTION = 0.05
 RADIANS_PER_ACTION = 0.5
@@ -36,6 +29,7 @@ CONJUGATE = np.array([-1.0, -1.0, -1.0, 1.0])
 # the can's centre above the bins' walls; where it stands on the bin's floor
 CARRYING_HEIGHT = 1.05
 CAN_STANDING_HEIGHT = 0.86
+CAN_BIN_CENTRE = (robosuite_layouts.CAN_BIN_LOW + robosuite_layouts.CAN_BIN_HIGH)[:2] / 2.0
 
 MIXED_DEMONSTRATORS: tuple[tuple[str, float], ...] = (
     ("worse", 0.1),
@@ -187,17 +181,17 @@ class ScriptedDemonstrator:
         return view.eef_position, CLOSE, bool(is_still and self._steps() > 3)
 
     def _lift(self, view: View) -> tuple[np.ndarray, float, bool]:
-        height = CARRYING_HEIGHT if self.task.name == "PickPlaceCan" else TABLE_HEIGHT + self._lift_height
+        height = CARRYING_HEIGHT if self.task.name == "PickPlaceCan" else robosuite_layouts.TABLE_HEIGHT + self._lift_height
         target = view.eef_position + np.array([0.0, 0.0, height + 0.03 - view.object_position[2]])
         return target, CLOSE, bool(self.task.name == "PickPlaceCan" and view.object_position[2] > height)
 
     def _carry(self, view: View) -> tuple[np.ndarray, float, bool]:
-        to_bin = (CAN_BIN_LOW + CAN_BIN_HIGH)[:2] / 2.0 - view.object_position[:2]
+        to_bin = CAN_BIN_CENTRE - view.object_position[:2]
         target = view.eef_position + np.array([*to_bin, CARRYING_HEIGHT - view.object_position[2]])
         return target, CLOSE, bool(np.linalg.norm(to_bin) < 0.05)
 
     def _lower(self, view: View) -> tuple[np.ndarray, float, bool]:
-        to_bin = (CAN_BIN_LOW + CAN_BIN_HIGH)[:2] / 2.0 - view.object_position[:2]
+        to_bin = CAN_BIN_CENTRE - view.object_position[:2]
         target = view.eef_position + np.array([*to_bin, CAN_STANDING_HEIGHT - view.object_position[2]])
         return target, CLOSE, bool(view.object_position[2] < CAN_STANDING_HEIGHT + 0.02)
 

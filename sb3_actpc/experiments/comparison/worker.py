@@ -11,6 +11,7 @@ import os
 import signal
 import sys
 import threading
+from contextlib import suppress
 from typing import Any
 
 
@@ -25,10 +26,8 @@ def main() -> int:
     from sb3_actpc.experiments.runs import Run
 
     def send(**message: Any) -> None:
-        try:
+        with suppress(BrokenPipeError):  # the command was killed: nobody listens
             print(json.dumps(message), file=channel, flush=True)
-        except BrokenPipeError:  # the command was killed: nobody listens
-            pass
 
     outcome = execute_run(Run.model_validate_json(text), lambda line: print(line, flush=True), lambda steps: send(steps=steps))
     send(status=outcome.status, message=outcome.message)

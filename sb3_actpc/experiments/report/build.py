@@ -10,25 +10,14 @@ import numpy as np
 import pandas as pd
 
 from sb3_actpc.experiments.comparison.execution import FINISHED
+from sb3_actpc.experiments.report import figures, statistics
 from sb3_actpc.experiments.report.ablations import ablation_sections
-from sb3_actpc.experiments.report.figures import (
-    MEASURE_NAMES,
-    demonstrators_returns,
-    draw_aggregates,
-    draw_curves,
-    draw_diagnostics,
-)
+from sb3_actpc.experiments.report.figures import MEASURE_NAMES
 from sb3_actpc.experiments.report.page import Section, write_pages
 from sb3_actpc.experiments.report.r_stability import N_EPISODES, WINDOW
 from sb3_actpc.experiments.report.references import measure_of, paper_results, reference_score
 from sb3_actpc.experiments.report.results import Results, load_results, write_runs
-from sb3_actpc.experiments.report.statistics import (
-    Scores,
-    interquartile_mean,
-    interquartile_mean_interval,
-    probability_of_improvement,
-    probability_of_improvement_interval,
-)
+from sb3_actpc.experiments.report.statistics import Scores
 from sb3_actpc.experiments.report.tables import UNDEFINED, interval, mean_and_deviation, number
 
 REFRESH_ALONE = "refresh_alone"
@@ -97,7 +86,7 @@ def _overview(runs: pd.DataFrame) -> str:
 
 def _task_section(results: Results, task: str, folder: Path) -> Section:
     picture = f"curves_{task}.png"
-    draw_curves(results, task, folder / picture)
+    figures.draw_curves(results, task, folder / picture)
     text, groups = "", results.groups(task).values()
     variants = {name for runs in groups for name in runs["variant"]}
     if any((runs["algorithm"] == "actpc").any() for runs in groups) and REFRESH_ALONE not in variants:
@@ -143,7 +132,7 @@ def task_table(results: Results, task: str) -> pd.DataFrame:
 
 def _reference_rows(results: Results, task: str) -> list[dict[tuple[str, str], str]]:
     """The demonstrators' and the random actions' scores, in the columns of the evaluation's."""
-    given, reference = demonstrators_returns(results, task), reference_score(task)
+    given, reference = figures.demonstrators_returns(results, task), reference_score(task)
     name, score = ("", "variant"), (LAST, "return")
     rows = [{name: "demonstrators", score: " or ".join(f"{value:.1f}" for value in given)}] if given else []
     if reference is not None and reference.measure == "dense_return":
@@ -167,8 +156,11 @@ def _aggregate_sections(results: Results, folder: Path) -> list[Section]:
     }
     if not whole:
         return []
-    means = {name: (interquartile_mean(scores), interquartile_mean_interval(scores)) for name, scores in whole.items()}
-    draw_aggregates(means, whole, folder / "aggregates.png")
+    means = {
+        name: (statistics.interquartile_mean(scores), statistics.interquartile_mean_interval(scores))
+        for name, scores in whole.items()
+    }
+    figures.draw_aggregates(means, whole, folder / "aggregates.png")
     left_out = sorted(set(map(str, by_label)) - set(whole))
     missing = f" Left out, because not run on every one: {', '.join(left_out)}." if left_out else ""
     text = (
@@ -188,8 +180,8 @@ def _aggregate_sections(results: Results, folder: Path) -> list[Section]:
 def _improvement_section(scores: Mapping[str, Scores]) -> list[Section]:
     rows = []
     for name, other in combinations(scores, 2):
-        value = probability_of_improvement(scores[name], scores[other])
-        bounds = probability_of_improvement_interval(scores[name], scores[other])
+        value = statistics.probability_of_improvement(scores[name], scores[other])
+        bounds = statistics.probability_of_improvement_interval(scores[name], scores[other])
         rows.append((f"{name} over {other}", number(value, ".2f"), interval(bounds, ".2f")))
     table = pd.DataFrame(rows, columns=["pair", "probability", "95 % interval"])
     return [Section("Probability of improvement", table=table, level=3)] if rows else []
@@ -201,7 +193,7 @@ def _improvement_section(scores: Mapping[str, Scores]) -> list[Section]:
 def _diagnostic_section(results: Results, task: str, folder: Path) -> list[Section]:
     own = {label: runs for label, runs in results.groups(task).items() if (runs["algorithm"] == "actpc").all()}
     picture = f"diagnostics_{task}.png"
-    if not own or not draw_diagnostics(results, own, task, folder / picture):
+    if not own or not figures.draw_diagnostics(results, own, task, folder / picture):
         return []
     caption = f"{task}: signals, energies, action-values, self-imitation memory"
     return [Section(f"Inside ActPC: {task}", picture=picture, caption=caption)]

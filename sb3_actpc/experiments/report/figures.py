@@ -9,16 +9,11 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from sb3_actpc.experiments.report import statistics
 from sb3_actpc.experiments.report.r_stability import WINDOW, smooth
 from sb3_actpc.experiments.report.references import measure_of, reference_score
 from sb3_actpc.experiments.report.results import MEASURES, Results, side_by_side
-from sb3_actpc.experiments.report.statistics import (
-    Interval,
-    Scores,
-    mean_interval,
-    performance_profile,
-    performance_profile_interval,
-)
+from sb3_actpc.experiments.report.statistics import Interval, Scores, mean_interval
 from sb3_actpc.utils.files import atomic_write
 
 _COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#999999", "#7f3c8d", "#a5aa99")
@@ -124,8 +119,8 @@ def draw_aggregates(intervals: Mapping[str, tuple[float, Interval]], scores: Map
     thresholds = np.linspace(min(0.0, everything.min()) - 0.05, max(1.0, everything.max()) + 0.05, 60)
     for index, (name, parts) in enumerate(scores.items()):
         look = _look(index)
-        profiles.plot(thresholds, performance_profile(parts, thresholds), label=name, **look)
-        low, high = performance_profile_interval(parts, thresholds)
+        profiles.plot(thresholds, statistics.performance_profile(parts, thresholds), label=name, **look)
+        low, high = statistics.performance_profile_interval(parts, thresholds)
         profiles.fill_between(thresholds, low, high, color=look["color"], alpha=0.15, linewidth=0)
     profiles.set(xlabel="normalised score τ", ylabel="share of runs with a score above τ", ylim=(-0.02, 1.02))
     _legend(figure)

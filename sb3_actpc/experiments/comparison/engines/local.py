@@ -8,7 +8,7 @@ import queue
 import subprocess
 import sys
 import threading
-from typing import IO
+from contextlib import suppress
 
 from sb3_actpc.experiments.comparison.engines.base import Event
 from sb3_actpc.experiments.comparison.execution import LOG, LOST, STOPPED, Outcome
@@ -52,7 +52,8 @@ class LocalEngine:
                 start_new_session=True,  # Ctrl-C is for the command, which tells its workers
             )
         assert worker.stdin is not None
-        _send(worker.stdin, run.model_dump_json())
+        with suppress(BrokenPipeError):  # it died at once; its end says so
+            print(run.model_dump_json(), file=worker.stdin, flush=True)
         self.workers[run.id] = worker
         threading.Thread(target=self._listen, args=(run.id, worker), daemon=True).start()
 
@@ -105,17 +106,7 @@ class LocalEngine:
 
 def usable_cores() -> int:
     """How many cores this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
-
-
-def _send(stream: IO[str], line: str) -> None:
-    try:
-        stream.write(line + "\n")
-        stream.flush()
-    except BrokenPipeError:  # it died at once; its end says so
-        pass
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _describe_exit(code: int) -> str:
