@@ -522,6 +522,15 @@ MUTANTS = [
         "episode_return > self.best_return",
         f"{STORES} -k enters",
     ),
+    Mutant("refresh squares returns", IMITATION, "** RETURN_EXPONENT", "** 2", f"{STORES} -k paid"),
+    Mutant("lost returns weigh", IMITATION, "np.maximum(self.returns, 0.0)", "np.abs(self.returns)", f"{STORES} -k paid"),
+    Mutant(
+        "refresh ignores what was paid",
+        AGENT,
+        "n, self.memory_history, self.refresh.weighting)",
+        "n, self.memory_history)",
+        f"{LEARNS} -k paid",
+    ),
     Mutant(
         "an unpaid episode enters", IMITATION, "episode_return > 0.0 and", "episode_return >= 0.0 and", f"{STORES} -k enters"
     ),

@@ -396,12 +396,32 @@ def test_noise_on_refreshed_observations_is_ridge_regression():
     slopes = []
     for noise in (0.0, 1.0):
         model = make(
-            demonstrations=data, policy_kwargs={"actor_kwargs": {"net_arch": []}}, actor_warm_start=2500,
+            demonstrations=data,
+            policy_kwargs={"actor_kwargs": {"net_arch": []}},
+            actor_warm_start=2500,
             refresh_kwargs={"noise": noise},
         )
         model.pretrain()
         slopes.append(model.actor.circuit.weights[0][:, :2].diagonal().mean().item())
     assert slopes == pytest.approx([0.1, 0.05], rel=0.1)
+
+
+@pytest.mark.parametrize(("weighting", "share"), [("returns", 0.0), ("uniform", 0.5)])
+def test_the_actor_imitates_the_episodes_that_were_paid(weighting, share):
+    """Of two equally long halves, one unpaid: by returns its steps are never drawn, by the paper's rule half the time."""
+    data = demonstrations(n_episodes=2, length=50)
+    unpaid = np.arange(len(data)) < 50
+    data = dataclasses.replace(data, rewards=np.where(unpaid, 0.0, 1.0).astype(np.float32))
+    model = make(demonstrations=data, refresh_kwargs={"weighting": weighting})
+    features = model._sample_imitated(2000)[0]
+    from_unpaid = (features[:, None] == th.as_tensor(data.observations[unpaid])[None]).all(-1).any(1)
+    assert from_unpaid.float().mean().item() == pytest.approx(share, abs=0.05)
+
+
+@pytest.mark.parametrize("wrong", [{"weighting": "best"}, {"noise": -0.1}, {"nose": 0.1}])
+def test_refresh_kwargs_are_checked(wrong):
+    with pytest.raises(ValueError, match=next(iter(wrong))):
+        make(demonstrations=demonstrations(), refresh_kwargs=wrong)
 
 
 def test_demonstrations_fill_their_share_of_the_critic_batch():
