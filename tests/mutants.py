@@ -396,6 +396,7 @@ MUTANTS = [
         "self.deviation / self.radius - 1.0",
         REGIONS,
     ),
+    Mutant("pressure goes as slowly as it comes", REGION, "FALL * unused", "RISE * unused", REGIONS),
     Mutant("the multiplier is let go", REGION, ".clamp_(*MULTIPLIERS)", "", REGIONS),
     Mutant("ties change nothing", REGION, '"tied": 2.0', '"tied": 1.0', REGIONS),
     Mutant("unpaid ties widen", AGENT, "verdict is not None and is_paid", "verdict is not None", f"{HABIT} -k resized"),

@@ -5,8 +5,10 @@ from torch import nn
 
 SMALLEST_SPREAD = 0.02  # of actions in [-1, 1], where demonstrations hardly spread around their clone
 DEVIATION_RATE = 0.02  # of the running deviation, per update
-MULTIPLIER_RATE = 0.01  # of the multiplier's logarithm, per update, while nothing of the radius is used
-MULTIPLIERS = 0.02, 200.0
+# of the multiplier's logarithm, per update: while nothing of the radius is used, and while twice of it is. A critic that has
+# just begun points anywhere, so that pressure comes slowly and goes at once
+RISE, FALL = 0.003, 0.01
+FIRST_MULTIPLIER, MULTIPLIERS = 0.1, (0.02, 200.0)
 RADII = 0.1, 1000.0  # below a third of a standard deviation nothing is learned
 # what a verdict about a candidate (:mod:`sb3_actpc.actpc.habit`) does to the radius
 RADIUS_FACTORS = {"accepted": 1.25, "tied": 2.0, "rejected": 0.7}
@@ -25,10 +27,10 @@ class TrustRegion(nn.Module):
     The critic's pressure as the multiplier of a trust region, regulated as SAC regulates its temperature.
 
     The deviation is the mean squared difference of the learning actor's actions from the habit's, in units of the variance
-    that the demonstrated actions have around their clone, dimension by dimension. The multiplier grows while the deviation is
-    below the radius and falls while it is above. So a set of demonstrations that holds one action for a state allows little,
-    one that holds many allows much; and the radius follows outcomes: it widens with candidates that hold their own, and
-    shrinks with those that do not.
+    that the demonstrated actions have around their clone, dimension by dimension. The multiplier begins small, grows slowly
+    while the deviation is below the radius, and falls quickly while it is above. So a set of demonstrations that holds one
+    action for a state allows little, one that holds many allows much; and the radius follows outcomes: it widens with
+    candidates that hold their own, and shrinks with those that do not.
 
     :param radius: at first
     """
@@ -41,7 +43,7 @@ class TrustRegion(nn.Module):
         super().__init__()
         self.register_buffer("radius", th.tensor(float(radius)))
         self.register_buffer("deviation", th.tensor(0.0))
-        self.register_buffer("multiplier", th.tensor(1.0))
+        self.register_buffer("multiplier", th.tensor(FIRST_MULTIPLIER))
 
     def regulate(self, actions: th.Tensor, habit_actions: th.Tensor, spread: th.Tensor) -> th.Tensor:
         """
@@ -53,7 +55,7 @@ class TrustRegion(nn.Module):
         deviation = ((actions - habit_actions) / spread.clamp_max(1.0)).square().mean()
         self.deviation.lerp_(deviation, DEVIATION_RATE)
         unused = (1.0 - self.deviation / self.radius).clamp_min(-1.0)
-        self.multiplier.mul_((MULTIPLIER_RATE * unused).exp()).clamp_(*MULTIPLIERS)
+        self.multiplier.mul_((RISE * unused.clamp_min(0.0) + FALL * unused.clamp_max(0.0)).exp()).clamp_(*MULTIPLIERS)
         return self.multiplier.clone()
 
     def resize(self, verdict: str) -> None:

@@ -27,7 +27,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     add("--envs", nargs="+", metavar="ID", help="tasks, such as SparseHopper-v5")
     add("--algos", nargs="+", metavar="NAME", help="algorithms or named variants, such as actpc refresh_alone td3")
     add("--ablate", action="store_true", default=None, help="ActPC with every part, and without each in turn")
-    add("--seeds", type=int, metavar="N", help="seeds 0 to N-1 (default: 3)")
+    add("--seeds", type=int, metavar="N", help="how many seeds (default: 3)")
+    add("--first-seed", type=int, metavar="N", help="the first of them (default: 0)")
     add("--output", metavar="DIR", help="folder of the comparison (default: runs/comparison)")
     add_run_options(parser, eval_episodes=10)
     add("--workers", type=int, metavar="N", help="runs at a time (default: one for each core)")
@@ -65,7 +66,7 @@ def _given(args: argparse.Namespace) -> dict[str, Any]:
     from sb3_actpc.experiments.comparison.plan import read_comparison_file
 
     from_file = {} if args.file is None else read_comparison_file(Path(args.file))
-    options = given(args, "envs", "algos", "ablate", "seeds", "output")
+    options = given(args, "envs", "algos", "ablate", "seeds", "first_seed", "output")
     if "steps" in options:  # a file may call them n_timesteps
         from_file.pop("n_timesteps", None)
     return {**from_file, **options}

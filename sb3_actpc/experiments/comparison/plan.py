@@ -6,13 +6,15 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from pydantic import Field
+
 from sb3_actpc.experiments.comparison.variants import ablation_variants, parse_variant, part_of_run
 from sb3_actpc.experiments.runs import Run, resolve
 from sb3_actpc.experiments.runs.environments import check_env_id
 from sb3_actpc.experiments.runs.presets import read_yaml
 from sb3_actpc.experiments.runs.schema import Count, Schema, merged
 
-OWN_KEYS = ("envs", "algos", "ablate", "seeds", "output")
+OWN_KEYS = ("envs", "algos", "ablate", "seeds", "first_seed", "output")
 
 
 class Comparison(Schema):
@@ -20,7 +22,8 @@ class Comparison(Schema):
 
     :param tasks: parts of runs, with ``env``
     :param variants: parts of runs, with a name and an algorithm
-    :param seeds: how many seeds; they are 0, 1, ...
+    :param seeds: how many seeds
+    :param first_seed: the first of them; settings that were chosen on some seeds are to be shown on others
     :param shared: what holds for all runs; a task's own comes first, and a variant's before that
     :param output: folder of the comparison
     :raises ValueError: for a wrong number of seeds
@@ -29,6 +32,7 @@ class Comparison(Schema):
     tasks: tuple[Run, ...]
     variants: tuple[Run, ...]
     seeds: Count = 3
+    first_seed: int = Field(0, ge=0)
     shared: Run = Run()
     output: str = "runs/comparison"
 
@@ -36,7 +40,8 @@ class Comparison(Schema):
 def read_comparison(given: Mapping[str, Any]) -> Comparison:
     """:param given: ``envs`` (ids, or mappings with ``env`` and other keys of a :class:`~sb3_actpc.experiments.runs.Run`),
         ``algos`` (names, or mappings: see :func:`~sb3_actpc.experiments.comparison.variants.parse_variant`), ``ablate`` (true
-        adds the ablations), ``seeds``, ``output``, and keys of a run that hold for all. Values of None count as not given
+        adds the ablations), ``seeds``, ``first_seed``, ``output``, and keys of a run that hold for all. Values of None count
+        as not given
     :return: the comparison
     :raises ValueError: when a key is unknown or a value is wrong
     """
@@ -53,7 +58,7 @@ def read_comparison(given: Mapping[str, Any]) -> Comparison:
         raise ValueError("no algorithm to compare: give at least one, such as --algos actpc, or --ablate")
     _check_names([task.env for task in tasks])
     _check_names([str(variant.name) for variant in variants])
-    rest = {key: own[key] for key in ("seeds", "output") if key in own}
+    rest = {key: own[key] for key in ("seeds", "first_seed", "output") if key in own}
     return Comparison(tasks=tuple(tasks), variants=tuple(variants), shared=shared, **rest)
 
 
@@ -79,7 +84,8 @@ def plan_runs(comparison: Comparison, folder: Path | None = None) -> list[Run]:
     """
     folder = Path(comparison.output) if folder is None else folder
     filled = [_fill(comparison.shared, task, variant) for task in comparison.tasks for variant in comparison.variants]
-    seeded = [run.model_copy(update={"seed": seed}) for seed in range(comparison.seeds) for run in filled]
+    seeds = range(comparison.first_seed, comparison.first_seed + comparison.seeds)
+    seeded = [run.model_copy(update={"seed": seed}) for seed in seeds for run in filled]
     own = [folder / str(run.task).replace(":", "_") / str(run.name) / f"seed{run.seed}_{run.id}" for run in seeded]
     return [run.model_copy(update={"output": str(place)}) for run, place in zip(seeded, own, strict=True)]
 

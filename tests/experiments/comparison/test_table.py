@@ -36,6 +36,13 @@ def test_every_algorithm_meets_every_task_with_every_seed_and_the_first_seeds_co
     assert len(runs) == 8 and len({run.id for run in runs}) == 8 and len({run.folder for run in runs}) == 8
 
 
+def test_seeds_that_nothing_was_chosen_on_can_be_asked_for() -> None:
+    assert [run.seed for run in plan(seeds=3, first_seed=4)] == [4, 5, 6]
+    assert plan(seeds=1, first_seed=2)[0].id == plan(seeds=3)[2].id
+    with pytest.raises(ValueError, match="first_seed=-1 must be"):
+        plan(first_seed=-1)
+
+
 def test_an_id_follows_the_content_of_a_run_and_nothing_else() -> None:
     [run] = plan(steps=500)
     assert plan(steps=500, threads=2, checkpoint_freq=7)[0].id == run.id  # how it is run is not what is run
@@ -65,11 +72,13 @@ def test_a_run_survives_its_trip_to_a_worker() -> None:
 
 
 def test_a_file_says_the_same_as_the_options(capsys: pytest.CaptureFixture[str]) -> None:
-    given = {"envs": ["SparseReacher-v5"], "algos": ["actpc", "no_refresh"], "seeds": 2, "steps": 300, "output": "there"}
+    given = {"envs": ["SparseReacher-v5"], "algos": ["actpc", "no_refresh"], "seeds": 2, "first_seed": 3, "steps": 300}
+    given["output"] = "there"
     Path("c.yml").write_text(yaml.safe_dump(given), encoding="utf-8")
     assert main(["compare", "c.yml", "--dry-run"]) == 0
     of_file = capsys.readouterr().out
     options = ["--envs", "SparseReacher-v5", "--algos", "actpc", "no_refresh", "--seeds", "2", "--steps", "300"]
+    options += ["--first-seed", "3"]
     assert main(["compare", *options, "--output", "there", "--dry-run"]) == 0
     assert capsys.readouterr().out == of_file
     assert "4 of 4 runs to do" in of_file
