@@ -385,7 +385,7 @@ MUTANTS = [
     Mutant(
         "the deviation has no unit",
         REGION,
-        "(actions - habit_actions) / spread.clamp_max(1.0)",
+        "(actions - habit_actions) / spread.clamp(SMALLEST_UNIT, 1.0)",
         "(actions - habit_actions)",
         REGIONS,
     ),
@@ -396,6 +396,7 @@ MUTANTS = [
         "self.deviation / self.radius - 1.0",
         REGIONS,
     ),
+    Mutant("lost states count as well", REGION, "(squares * weights).mean()", "squares.mean() * weights.mean()", REGIONS),
     Mutant("pressure goes as slowly as it comes", REGION, "FALL * unused", "RISE * unused", REGIONS),
     Mutant("the multiplier is let go", REGION, ".clamp_(*MULTIPLIERS)", "", REGIONS),
     Mutant("ties change nothing", REGION, '"tied": 2.0', '"tied": 1.0', REGIONS),

@@ -727,7 +727,8 @@ class ActPC(OffPolicyAlgorithm):
         weight: float | th.Tensor = self.actor_pressure
         if self.policy.trust_region is not None and self.actor.habit is not None:
             habit_actions = self.actor.habit.project(batch.features, batch.memory)
-            weight = weight * self.policy.trust_region.regulate(coupled.actions, habit_actions, self.policy.spread)
+            values = coupled.action_values.mean(1)
+            weight = weight * self.policy.trust_region.regulate(coupled.actions, habit_actions, values, self.policy.spread)
         return weight / coupled.action_values.abs().mean().clamp_min(SMALLEST_VALUE_SCALE) if self.scale_pressure else weight
 
     def _update_critic(self, batch: Batch) -> None:

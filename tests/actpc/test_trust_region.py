@@ -12,6 +12,7 @@ from sb3_actpc.actpc.trust_region import (
     RADII,
     RISE,
     SMALLEST_SPREAD,
+    SMALLEST_UNIT,
     TrustRegion,
     spread_of,
 )
@@ -20,6 +21,7 @@ ZEROS = th.zeros(4, 2)
 
 
 ONES = th.ones(2)
+WORTH = th.full((4,), 7.0)  # all states the same
 
 
 def test_the_spread_is_the_residuals_root_mean_square_in_every_dimension_and_has_a_least():
@@ -30,16 +32,32 @@ def test_the_spread_is_the_residuals_root_mean_square_in_every_dimension_and_has
 def test_the_deviation_is_counted_in_variances_of_each_dimension():
     """One standard deviation in every dimension is a deviation of 1, whatever its spread; the start is forgotten."""
     region, spread = TrustRegion(1), th.tensor([0.1, 0.5])
-    region.regulate(th.tensor([[0.1, -0.5]] * 4), ZEROS, spread)
+    region.regulate(th.tensor([[0.1, -0.5]] * 4), ZEROS, WORTH, spread)
     assert float(region.deviation) == pytest.approx(DEVIATION_RATE)
     for _ in range(1000):
-        region.regulate(th.tensor([[0.1, -0.5]] * 4), ZEROS, spread)
+        region.regulate(th.tensor([[0.1, -0.5]] * 4), ZEROS, WORTH, spread)
     assert float(region.deviation) == pytest.approx(1.0, abs=1e-4)
+
+
+@pytest.mark.parametrize("scale", [0.1, 1.0, 50.0])
+@pytest.mark.parametrize("shift", [-30.0, 0.0, 30.0])
+def test_a_state_counts_by_its_worth_above_the_worst(shift, scale):
+    """Worth 0, 1, 2, 5 and squares 9, 1, 1, 4: (1 + 2 + 20) / 8, whatever values are shifted or scaled by."""
+    region = TrustRegion(1)
+    actions = th.tensor([3.0, 1.0, -1.0, 2.0])[:, None].expand(4, 2)
+    region.regulate(actions, ZEROS, shift + scale * th.tensor([0.0, 1.0, 2.0, 5.0]), ONES)
+    assert float(region.deviation) == pytest.approx(DEVIATION_RATE * 23 / 8, rel=1e-3)
+
+
+def test_a_small_spread_counts_as_the_smallest_unit():
+    region = TrustRegion(1)
+    region.regulate(th.full((4, 2), SMALLEST_UNIT), ZEROS, WORTH, th.full((2,), SMALLEST_SPREAD))
+    assert float(region.deviation) == pytest.approx(DEVIATION_RATE)
 
 
 def test_an_unknown_spread_counts_as_one():
     region = TrustRegion(1)
-    region.regulate(th.full((4, 2), 0.5), ZEROS, th.full((2,), th.inf))
+    region.regulate(th.full((4, 2), 0.5), ZEROS, WORTH, th.full((2,), th.inf))
     assert float(region.deviation) == pytest.approx(0.25 * DEVIATION_RATE)
 
 
@@ -49,7 +67,7 @@ def test_the_multiplier_grows_inside_falls_outside_and_rests_on_the_border():
         region = TrustRegion(1.0)
         region.deviation.fill_(deviation)
         before = float(region.multiplier)
-        after = float(region.regulate(th.full((4, 2), math.sqrt(deviation)), ZEROS, ONES))
+        after = float(region.regulate(th.full((4, 2), math.sqrt(deviation)), ZEROS, WORTH, ONES))
         rates.append(math.log(after / before))
     assert rates == pytest.approx([RISE, RISE / 2, 0.0, -FALL / 2, -FALL, -FALL], abs=1e-5)
 
@@ -59,7 +77,7 @@ def test_a_wider_radius_is_reached_by_an_actor_that_follows_the_pressure():
     for radius in (0.25, 4.0):
         region = TrustRegion(radius)
         for _ in range(6000):
-            region.regulate(region.multiplier.expand(4, 2), ZEROS, ONES)
+            region.regulate(region.multiplier.expand(4, 2), ZEROS, WORTH, ONES)
         assert float(region.multiplier) == pytest.approx(math.sqrt(radius), rel=0.01)
 
 
@@ -67,7 +85,7 @@ def test_multiplier_and_radius_stay_within_bounds():
     for verdict, actions, bound in (("tied", ZEROS, 1), ("rejected", ZEROS + 1e6, 0)):
         region = TrustRegion(1)
         for _ in range(3000):
-            region.regulate(actions, ZEROS, ONES)
+            region.regulate(actions, ZEROS, WORTH, ONES)
             region.resize(verdict)
         assert float(region.radius) == pytest.approx(RADII[bound])
         assert float(region.multiplier) == pytest.approx(MULTIPLIERS[bound])
@@ -82,7 +100,7 @@ def test_holding_its_own_widens_the_radius_and_losing_shrinks_it():
 
 def test_what_is_returned_does_not_change_with_the_next_update():
     region = TrustRegion(1)
-    first = region.regulate(ZEROS, ZEROS, ONES)
+    first = region.regulate(ZEROS, ZEROS, WORTH, ONES)
     kept = float(first)
-    region.regulate(ZEROS, ZEROS, ONES)
+    region.regulate(ZEROS, ZEROS, WORTH, ONES)
     assert float(first) == kept < float(region.multiplier)
