@@ -259,8 +259,6 @@ class ActPC(OffPolicyAlgorithm):
         self.actor_warm_start: int = default(actor_warm_start, 7500, 0)
         self.refresh_weight = refresh_weight
         self.refresh_kwargs = refresh_kwargs
-        with named_in_errors(f"refresh_kwargs={refresh_kwargs!r}"):
-            self.refresh = Refresh(**(refresh_kwargs or {}))
         self.demonstration_fraction: float = default(demonstration_fraction, 0.5, 0.0)
         self.exploration_noise = exploration_noise
         self.alpha_ep = alpha_ep
@@ -290,6 +288,8 @@ class ActPC(OffPolicyAlgorithm):
             raise ValueError("env=None: an environment or the id of one is needed, such as 'Pendulum-v1'")
         assert isinstance(self.action_space, spaces.Box)
         check_actions(self.action_space, self.action_noise)
+        with named_in_errors(f"refresh_kwargs={self.refresh_kwargs!r}"):
+            self.refresh = Refresh(**(self.refresh_kwargs or {}))  # here, as a loaded agent may be given others
         self._setup_lr_schedule()
         self.set_random_seed(self.seed)
         self.policy = self._make_policy().to(self.device)
@@ -456,9 +456,18 @@ class ActPC(OffPolicyAlgorithm):
             "demonstrations in the critic's batch": self.demonstration_fraction,
             "working memory": self.memory_history,
         }
+        imitated = "every step alike"
+        if self.expert is not None and self.refresh.weighting == "returns":
+            returns = self.expert.demonstrations.episode_returns
+            n_paid = int((returns > 0).sum())
+            if n_paid:
+                imitated = f"{n_paid} of {len(returns)} episodes, by their returns"
+            else:
+                imitated += ", as no return is positive"
         return (
             f"reward: {ext:g} x task (alpha_ext) + {ep:g} x epistemic (alpha_ep) + {inst:g} x instrumental signal (alpha_in)\n"
             f"demonstrations: {'none' if self.expert is None else self.expert.demonstrations!r}\n"
+            f"imitated: {imitated}\n"
             f"off: {', '.join(name for name, value in parts.items() if not value) or 'nothing'}"
         )
 
@@ -483,7 +492,7 @@ class ActPC(OffPolicyAlgorithm):
             updates = tqdm(updates, "pre-training", n_prior + self.actor_warm_start, initial=self.n_pretraining_updates)
         for update in updates:
             if self.verbose and update % PRETRAINING_INTERVAL == 0:
-                print(f"pre-training: update {update} of {n_prior} of the prior and {self.actor_warm_start} of the actor")
+                print(f"pre-training: update {update} of {n_prior + self.actor_warm_start}")
             before_update()
             if update < n_prior:
                 self._update_prior(self.policy.batch_size_of("prior", self.batch_size))
@@ -851,8 +860,9 @@ class ActPC(OffPolicyAlgorithm):
             if "in state_dict" not in str(error):
                 raise
             raise ValueError(of_another_version.format("its policy has other parts")) from error
-        if hasattr(model, "signal_normalizer"):
-            raise ValueError(of_another_version.format("before signal_kwargs"))
+        for name, later in (("signal_normalizer", "signal_kwargs"), ("refresh_noise", "refresh_kwargs")):
+            if hasattr(model, name):
+                raise ValueError(of_another_version.format(f"before {later}"))
         return model
 
     def checkpoint_state(self) -> dict[str, Any]:
@@ -926,7 +936,7 @@ class ActPC(OffPolicyAlgorithm):
 
     def _excluded_save_params(self) -> list[str]:
         aliases = ["actor", "critic", "generator", "prior", "actor_target", "critic_target"]
-        derived = ["expert", "_followed", "diagnostics", "_compiled"]
+        derived = ["expert", "_followed", "diagnostics", "_compiled", "refresh"]
         return [*super()._excluded_save_params(), *aliases, *derived]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:

@@ -18,7 +18,7 @@ from stable_baselines3.common.type_aliases import TrainFreq
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_actpc.ngc.circuit import LARGEST_SIZE as LARGEST_LAYER
-from sb3_actpc.utils.checks import LARGEST_SIZE, check_device, check_kinds
+from sb3_actpc.utils.checks import LARGEST_SIZE, check_device, check_kinds, nearest
 
 Parameters = ParamSpec("Parameters")
 CIRCUITS = ("actor", "critic", "generator", "prior")
@@ -63,12 +63,18 @@ def checked(init: Callable[Parameters, None]) -> Callable[Parameters, None]:
     """A constructor that refuses values which its annotations do not allow.
 
     :param init: an ``__init__``; a function (name, value) in an ``Annotated`` raises ValueError for a bad value
-    :return: the same, checked
+    :return: the same, checked; it names the nearest keyword to one that it does not know
     """
     signature = inspect.signature(init, eval_str=True)
+    known = list(signature.parameters)[1:]
+    is_open = any(parameter.kind is parameter.VAR_KEYWORD for parameter in signature.parameters.values())
 
     @wraps(init)
     def checking(*args: Parameters.args, **kwargs: Parameters.kwargs) -> None:
+        for name in kwargs:
+            if not is_open and name not in known:
+                expected = f": expected some of {', '.join(known)}" if len(known) < 10 else ""
+                raise TypeError(f"{type(args[0]).__name__} has no keyword {name!r}{nearest(name, known)}{expected}")
         given = signature.bind(*args, **kwargs)
         given.apply_defaults()
         for name, value in given.arguments.items():

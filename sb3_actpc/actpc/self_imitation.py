@@ -24,7 +24,7 @@ class Refresh:
     """How refresh and warm start imitate.
 
     :param weighting: "returns" (a step is drawn in proportion to its episode's return to the power of ``RETURN_EXPONENT``, a
-        reward-weighted regression, Peters and Schaal 2007; where nothing was paid, uniformly) or "uniform" (the paper)
+        reward-weighted regression, Peters and Schaal 2007; where no return is positive, uniformly) or "uniform" (the paper)
     :param noise: standard deviation of Gaussian noise on the features (normalised observations), not on the working memory's;
         against overfitting to few demonstrations. 0 for none (the paper)
     :raises ValueError: for another value

@@ -23,7 +23,7 @@ from sb3_actpc.utils.files import atomic_write
 SelfAlgorithm = TypeVar("SelfAlgorithm", bound=OffPolicyAlgorithm)
 
 FORMAT = "sb3_actpc weights"
-VERSION = 3
+VERSION = 4
 _SUFFIX = ".safetensors"
 
 

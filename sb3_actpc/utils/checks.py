@@ -1,7 +1,8 @@
 """Checks of what the user passes and of what circuits and environments produce."""
 
+import difflib
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
 from numbers import Integral, Real
@@ -54,6 +55,12 @@ def check_kinds(given: Mapping[str, Any], **names: str) -> None:
         for name in keywords.split():
             if not is_kind(given[name]):
                 raise ValueError(f"{name}={given[name]!r} must be {wanted}")
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """``" (did you mean 'gamma'?)"``, or nothing where no known name is near."""
+    close = difflib.get_close_matches(name, list(known), n=1)
+    return f" (did you mean {close[0]!r}?)" if close else ""
 
 
 @contextmanager

@@ -419,9 +419,31 @@ def test_the_actor_imitates_the_episodes_that_were_paid(weighting, share):
 
 
 @pytest.mark.parametrize("wrong", [{"weighting": "best"}, {"noise": -0.1}, {"nose": 0.1}])
-def test_refresh_kwargs_are_checked(wrong):
+def test_refresh_kwargs_are_checked_when_made_and_when_loaded(wrong, tmp_path):
     with pytest.raises(ValueError, match=next(iter(wrong))):
         make(demonstrations=demonstrations(), refresh_kwargs=wrong)
+    make(demonstrations=demonstrations()).save(tmp_path / "agent")
+    with pytest.raises(ValueError, match=next(iter(wrong))):
+        ActPC.load(tmp_path / "agent", refresh_kwargs=wrong)
+    assert ActPC.load(tmp_path / "agent", refresh_kwargs={"weighting": "uniform"}).refresh.weighting == "uniform"
+
+
+@pytest.mark.parametrize(
+    ("paid", "said"), [((1.0, 0.0), "1 of 2 episodes, by their returns"), ((-1.0, -2.0), "every step alike, as")]
+)
+def test_an_agent_says_what_it_imitates(paid, said):
+    data = demonstrations(n_episodes=2, length=5)
+    data = dataclasses.replace(data, rewards=np.repeat(paid, 5).astype(np.float32))
+    assert f"imitated: {said}" in make(demonstrations=data).describe()
+
+
+def test_an_unknown_keyword_is_answered_with_the_nearest_one():
+    with pytest.raises(TypeError, match=r"ActPC has no keyword 'learning_rat' .did you mean 'learning_rate'"):
+        make(learning_rat=0.1)
+    with pytest.raises(
+        ValueError, match=r"Refresh has no keyword 'nose' .did you mean 'noise'.*: expected some of weighting, noise"
+    ):
+        make(refresh_kwargs={"nose": 0.1})
 
 
 def test_demonstrations_fill_their_share_of_the_critic_batch():
@@ -809,7 +831,7 @@ def test_learning_says_what_the_reward_is_made_of_and_how_far_pre_training_is(ca
     assert "reward: 0 x task (alpha_ext) + 0.5 x epistemic (alpha_ep) + 1 x instrumental signal (alpha_in)" in printed
     assert "3 episodes, 60 transitions" in printed and "mean return 1.0" in printed
     assert "off: the task's reward, demonstrations in the critic's batch, working memory" in printed
-    assert "update 1000 of 5 of the prior and 1200 of the actor" in printed
+    assert "update 1000 of 1205" in printed
     assert model.start_time > began and model.start_time - began > 0.5 * (time.time_ns() - began)  # time/fps leaves it out
 
 

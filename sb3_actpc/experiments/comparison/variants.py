@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from sb3_actpc.experiments.runs import ALGORITHMS, Run
-from sb3_actpc.experiments.runs.algorithms import nearest
 from sb3_actpc.experiments.runs.presets import read_yaml
 from sb3_actpc.experiments.runs.schema import merged
+from sb3_actpc.utils.checks import nearest
 
 # what the comparison itself says of each of its runs
 PLANNED = ("seed", "task", "progress", "output")

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import difflib
 import importlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 
+from sb3_actpc.utils.checks import nearest
 from sb3_actpc.utils.constructors import constructor_keywords
 
 # name on the command line -> "module:class", imported only when it is used
@@ -29,12 +29,13 @@ ALGORITHMS = {
     "td3": "sb3_actpc.baselines:TD3Demo",
     "trpo": "sb3_contrib:TRPO",
 }
-# constructor keywords that have an option of their own
+# constructor keywords that have an option of their own, or another name
 _OPTION_OF = {
     "env": "--env",
     "seed": "--seed",
     "device": "--device",
     "demonstrations": "--demonstrations",
+    "refresh_noise": "--set refresh_kwargs.noise",
     "action_noise": "--set noise_type=normal --set noise_std=0.1",
 }
 
@@ -60,9 +61,3 @@ def check_keywords(algorithm: type[BaseAlgorithm], settings: Mapping[str, Any]) 
             raise ValueError(f"{name!r} is not set here: use {_OPTION_OF[name]}")
         if name not in known:
             raise ValueError(f"{algorithm.__name__} has no setting {name!r}{nearest(name, known)}")
-
-
-def nearest(name: str, known: Iterable[str]) -> str:
-    """``" (did you mean 'gamma'?)"``, or nothing where no known name is near."""
-    close = difflib.get_close_matches(name, list(known), n=1)
-    return f" (did you mean {close[0]!r}?)" if close else ""

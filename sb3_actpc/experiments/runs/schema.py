@@ -15,8 +15,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, AliasChoices, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
-from sb3_actpc.experiments.runs.algorithms import ALGORITHMS, nearest
-from sb3_actpc.utils.checks import check_device
+from sb3_actpc.experiments.runs.algorithms import ALGORITHMS
+from sb3_actpc.utils.checks import check_device, nearest
 
 VERSION = 2  # of config.json
 MAX_SEED = 2**31 - 1  # other generators get a seed derived from it, which must be below 2**32
