@@ -456,20 +456,25 @@ class ActPC(OffPolicyAlgorithm):
             "demonstrations in the critic's batch": self.demonstration_fraction,
             "working memory": self.memory_history,
         }
-        imitated = "every step alike"
-        if self.expert is not None and self.refresh.weighting == "returns":
-            returns = self.expert.demonstrations.episode_returns
-            n_paid = int((returns > 0).sum())
-            if n_paid:
-                imitated = f"{n_paid} of {len(returns)} episodes, by their returns"
-            else:
-                imitated += ", as no return is positive"
         return (
             f"reward: {ext:g} x task (alpha_ext) + {ep:g} x epistemic (alpha_ep) + {inst:g} x instrumental signal (alpha_in)\n"
             f"demonstrations: {'none' if self.expert is None else self.expert.demonstrations!r}\n"
-            f"imitated: {imitated}\n"
+            f"imitated: {self._describe_imitated()}\n"
             f"off: {', '.join(name for name, value in parts.items() if not value) or 'nothing'}"
         )
+
+    def _describe_imitated(self) -> str:
+        if not (self.refresh_weight or self.actor_warm_start):
+            return "nothing"
+        own = "" if self.expert is not None else "own episodes, "
+        if self.refresh.weighting == "uniform":
+            return f"{own}every step alike"
+        if self.expert is None:
+            return f"{own}by their returns"
+        n = self.expert.episodes.effective_number()
+        if not n:
+            return "every step alike, as no demonstration's return is positive"
+        return f"by returns, as if {n:.1f} of {self.expert.demonstrations.n_episodes} episodes"
 
     def pretrain(self, before_update: Callable[[], None] = lambda: None, progress_bar: bool = False) -> None:
         """

@@ -378,8 +378,7 @@ def relabels(given: Any) -> bool:
 def combined_buffer_class(
     given: type[ReplayBuffer] | str | None, observation_space: spaces.Space, n_steps: int = 1
 ) -> type[SignalReplay]:
-    """The ActPC buffer that does what the class the user asked for does, or its name, or None; ValueError for one that does
-    not keep ActPC's signals."""
+    """ActPC's counterpart of ``given``: a class of SB3's, its name, or None; ValueError for a class without one."""
     if isinstance(given, str):
         if given not in _BY_NAME:
             raise ValueError(f"replay_buffer_class={given!r} is unknown; choose one of {list(_BY_NAME)}")

@@ -24,7 +24,9 @@ class Refresh:
     """How refresh and warm start imitate.
 
     :param weighting: "returns" (a step is drawn in proportion to its episode's return to the power of ``RETURN_EXPONENT``, a
-        reward-weighted regression, Peters and Schaal 2007; where no return is positive, uniformly) or "uniform" (the paper)
+        reward-weighted regression, Peters and Schaal 2007; uniformly where no demonstration's return is positive) or
+        "uniform" (the paper). Returns are compared as they are: where episodes differ in difficulty, as with random goals, the
+        easy ones are imitated most
     :param noise: standard deviation of Gaussian noise on the features (normalised observations), not on the working memory's;
         against overfitting to few demonstrations. 0 for none (the paper)
     :raises ValueError: for another value
@@ -76,6 +78,11 @@ class Episodes:
     def cumulative_weights(self) -> np.ndarray:
         """(N,), running sum of the positive returns to the power of ``RETURN_EXPONENT``."""
         return np.cumsum(np.maximum(self.returns, 0.0) ** RETURN_EXPONENT)
+
+    def effective_number(self) -> float:
+        """Of the episodes, as they are drawn by returns: (Σw)^2 / Σw^2; 0 where none is."""
+        weights = np.add.reduceat(np.maximum(self.returns, 0.0) ** RETURN_EXPONENT, np.unique(self.starts))
+        return float(weights.sum() ** 2 / max((weights**2).sum(), np.finfo(float).tiny))
 
     def __len__(self) -> int:
         return len(self.actions)
@@ -165,6 +172,11 @@ class SelfImitationMemory:
         starts = np.repeat(np.cumsum([0, *self.lengths[:-1]]), self.lengths)
         self.episodes = Episodes(observations, actions, starts, np.repeat(self.returns, self.lengths))
 
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        if state["episodes"] is not None and "returns" not in vars(state["episodes"]):
+            raise ValueError("the replay buffer is of another version of sb3_actpc: load it with that one")
+        self.__dict__.update(state)
+
     def checkpoint_state(self) -> dict[str, Any]:
         """The stored episodes and their returns, for a checkpoint."""
         episodes = None
@@ -183,7 +195,7 @@ def sample_union(
 ) -> ImitationSamples:
     """``n`` rows drawn from the union of ``parts`` (global NumPy generator, as SB3's buffers); see :class:`Refresh`."""
     parts = [part for part in parts if len(part)]
-    by_return = weighting == "returns" and any(part.cumulative_weights[-1] > 0.0 for part in parts)
+    by_return = weighting == "returns" and parts[0].cumulative_weights[-1] > 0.0  # or one own episode would end imitation
     if by_return:
         weights = [part.cumulative_weights for part in parts]
         ends = np.cumsum([running[-1] for running in weights])

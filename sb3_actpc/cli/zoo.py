@@ -163,6 +163,7 @@ def sample_actpc_params(trial: Any, n_actions: int, n_envs: int, additional_args
     trial.suggest_categorical("alpha_in", [0.0, 0.1, 1.0])
     trial.suggest_categorical("weight_decay", [0.0, 0.1, 0.3, 1.0])
     trial.suggest_categorical("refresh_noise", [0.0, 0.05, 0.1, 0.2])
+    trial.suggest_categorical("refresh_weighting", ["returns", "uniform"])
     params = convert_actpc_params(trial.params)
     trial.set_user_attr("gamma", params["gamma"])
     trial.set_user_attr("batch_size", params["batch_size"])
@@ -174,7 +175,7 @@ def convert_actpc_params(sampled: dict[str, Any]) -> dict[str, Any]:
     params = {name: sampled[name] for name in ("learning_rate", "tau", "actor_pressure", "refresh_weight")}
     return {
         **params,
-        "refresh_kwargs": {"noise": sampled["refresh_noise"]},
+        "refresh_kwargs": {"noise": sampled["refresh_noise"], "weighting": sampled["refresh_weighting"]},
         "alpha_ep": sampled["alpha_ep"],
         "alpha_in": sampled["alpha_in"],
         "gamma": 1.0 - sampled["one_minus_gamma"],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import statistics
 import time
@@ -176,7 +177,7 @@ def _learners(task: str, device: str) -> Entries:
     if find_spec("sbx"):
         import sbx
 
-        models[f"SBX TD3, {task}"] = sbx.TD3("MlpPolicy", task, **TD3_SIZES, **same)
+        models[f"SBX TD3, {task}"] = sbx.TD3("MlpPolicy", task, **copy.deepcopy(TD3_SIZES), **same)
     return {name: _learner(model) for name, model in models.items()}
 
 

@@ -420,21 +420,31 @@ def test_the_actor_imitates_the_episodes_that_were_paid(weighting, share):
 
 @pytest.mark.parametrize("wrong", [{"weighting": "best"}, {"noise": -0.1}, {"nose": 0.1}])
 def test_refresh_kwargs_are_checked_when_made_and_when_loaded(wrong, tmp_path):
-    with pytest.raises(ValueError, match=next(iter(wrong))):
+    message = rf"{next(iter(wrong))}=.* (must be|is unknown)|has no keyword '{next(iter(wrong))}'"
+    with pytest.raises(ValueError, match=message):
         make(demonstrations=demonstrations(), refresh_kwargs=wrong)
     make(demonstrations=demonstrations()).save(tmp_path / "agent")
-    with pytest.raises(ValueError, match=next(iter(wrong))):
+    with pytest.raises(ValueError, match=message):
         ActPC.load(tmp_path / "agent", refresh_kwargs=wrong)
     assert ActPC.load(tmp_path / "agent", refresh_kwargs={"weighting": "uniform"}).refresh.weighting == "uniform"
 
 
 @pytest.mark.parametrize(
-    ("paid", "said"), [((1.0, 0.0), "1 of 2 episodes, by their returns"), ((-1.0, -2.0), "every step alike, as")]
+    ("paid", "settings", "said"),
+    [
+        ((2.0, 1.0), {}, "by returns, as if 1.1 of 2 episodes"),  # (16 + 1)^2 / (16^2 + 1)
+        ((-1.0, -2.0), {}, "every step alike, as no demonstration's return is positive"),
+        ((2.0, 1.0), {"refresh_kwargs": {"weighting": "uniform"}}, "every step alike"),
+        ((2.0, 1.0), {"refresh_weight": 0.0, "actor_warm_start": 0}, "nothing"),
+        (None, {}, "own episodes, by their returns"),
+    ],
 )
-def test_an_agent_says_what_it_imitates(paid, said):
-    data = demonstrations(n_episodes=2, length=5)
-    data = dataclasses.replace(data, rewards=np.repeat(paid, 5).astype(np.float32))
-    assert f"imitated: {said}" in make(demonstrations=data).describe()
+def test_an_agent_says_what_it_imitates(paid, settings, said):
+    data = None
+    if paid is not None:
+        data = demonstrations(n_episodes=2, length=5)
+        data = dataclasses.replace(data, rewards=np.repeat(paid, 5).astype(np.float32))
+    assert f"imitated: {said}\n" in make(demonstrations=data, **settings).describe()
 
 
 def test_an_unknown_keyword_is_answered_with_the_nearest_one():

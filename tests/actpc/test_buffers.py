@@ -1,5 +1,6 @@
 """Replay: combined experience replay, signals kept apart, self-imitation, n-step sums, memory."""
 
+import pickle
 import warnings
 
 import numpy as np
@@ -191,12 +192,27 @@ def test_the_union_is_drawn_uniformly():
 
 
 def test_refresh_draws_a_step_by_what_its_episode_was_paid():
-    """p ∝ length * max(return, 0)^k, over the union of both parts; whatever is drawn comes with its own past."""
+    """p ∝ length * max(return, 0)^k, over the union of both parts."""
     shown = paid_episodes((10, 1.0), (20, 2.0), (30, -3.0))
     own = paid_episodes((0, 0.0), (0, 0.0), (0, 0.0), (5, 4.0), (7, 0.0))
     drawn = sample_union([shown, own], 40_000, weighting="returns").observations[:, 0].astype(int)
     expected = np.array([10, 20 * 2.0**RETURN_EXPONENT, 0, 5 * 4.0**RETURN_EXPONENT, 0])
     assert np.bincount(drawn, minlength=5) / 40_000 == pytest.approx(expected / expected.sum(), abs=0.01)
+
+
+def test_an_own_episode_that_was_paid_does_not_end_the_imitation_of_unpaid_demonstrations():
+    shown, own = paid_episodes((30, 0.0)), paid_episodes((0, 0.0), (10, 0.01))
+    drawn = sample_union([shown, own], 20_000, weighting="returns").observations
+    assert drawn.mean() == pytest.approx(0.25, abs=0.02)
+
+
+def test_a_memory_of_another_version_says_so():
+    memory = SelfImitationMemory(10)
+    memory.store(np.zeros((2, 1)), np.zeros((2, 1)), 1.0)
+    assert pickle.loads(pickle.dumps(memory)).returns == [1.0]
+    del vars(memory.episodes)["returns"]
+    with pytest.raises(ValueError, match="of another version"):
+        pickle.loads(pickle.dumps(memory))
 
 
 @pytest.mark.parametrize("unpaid", [0.0, -5.0])

@@ -173,12 +173,13 @@ def test_sampled_parameters_become_keywords() -> None:
         "net_arch": "small",
         "weight_decay": 0.3,
         "refresh_noise": 0.1,
+        "refresh_weighting": "uniform",
     }
     params = convert_actpc_params(sampled)
     assert (params["gamma"], params["batch_size"]) == (0.99, 128)
     circuits = {"circuit_kwargs": {"weight_decay": 0.3}}
     assert params["policy_kwargs"] == {"net_arch": NET_ARCHS["small"], **circuits}
-    assert params["refresh_kwargs"] == {"noise": 0.1}
+    assert params["refresh_kwargs"] == {"noise": 0.1, "weighting": "uniform"}
 
 
 @pytest.mark.parametrize(

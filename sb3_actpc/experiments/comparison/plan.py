@@ -6,13 +6,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from pydantic import Field
-
 from sb3_actpc.experiments.comparison.variants import ablation_variants, parse_variant, part_of_run
 from sb3_actpc.experiments.runs import Run, resolve
 from sb3_actpc.experiments.runs.environments import check_env_id
 from sb3_actpc.experiments.runs.presets import read_yaml
-from sb3_actpc.experiments.runs.schema import Count, Schema, merged
+from sb3_actpc.experiments.runs.schema import Count, Schema, Seed, merged
 
 OWN_KEYS = ("envs", "algos", "ablate", "seeds", "first_seed", "output")
 
@@ -32,7 +30,7 @@ class Comparison(Schema):
     tasks: tuple[Run, ...]
     variants: tuple[Run, ...]
     seeds: Count = 3
-    first_seed: int = Field(0, ge=0)
+    first_seed: Seed = 0
     shared: Run = Run()
     output: str = "runs/comparison"
 

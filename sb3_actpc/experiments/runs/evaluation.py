@@ -185,7 +185,7 @@ class EvaluationCallback(BaseCallback):
     since :meth:`begin`, the evaluations' own (``evaluation_seconds``) among them; ``updates`` are the agent's.
 
     :param envs: environments that only this callback uses, closed by whoever made them
-    :param eval_freq: environment steps between two evaluations, of ``eval_episodes`` each, the first from ``seed``
+    :param eval_freq: environment steps between two evaluations, of ``eval_episodes`` each; their first episode is of ``seed``
     :param report: given one line of text after each evaluation
     :param keeps_best: keep the agent of the best evaluation, not that of the last
     :param target_return: end the training at the first evaluation whose mean dense return reaches it; None for never

@@ -73,6 +73,7 @@ def _keywords(value: Any) -> Any:
 
 
 Count = Annotated[int, BeforeValidator(_number), Field(ge=1)]
+Seed = Annotated[int, BeforeValidator(_number), Field(ge=0, le=MAX_SEED)]
 Real = Annotated[float, BeforeValidator(_number), Field(allow_inf_nan=False)]
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.+-]*$")]
 Keywords = dict[str, Any]
@@ -144,7 +145,7 @@ class Run(Schema):
     algo: Annotated[str, AfterValidator(_algorithm)] = "actpc"
     preset: str | None = None
     n_timesteps: Count | None = Field(default=None, validation_alias=AliasChoices("n_timesteps", "steps"))
-    seed: Annotated[int, BeforeValidator(_number), Field(ge=0, le=MAX_SEED)] = 0
+    seed: Seed = 0
     demonstrations: str = "shipped"
     settings: Keywords = Field(default_factory=dict)
     env_kwargs: Keywords = Field(default_factory=dict)
