@@ -75,13 +75,18 @@ class Episodes:
     returns: np.ndarray
 
     @cached_property
+    def weights(self) -> np.ndarray:
+        """(N,), the positive returns to the power of ``RETURN_EXPONENT``."""
+        return np.maximum(self.returns, 0.0) ** RETURN_EXPONENT
+
+    @cached_property
     def cumulative_weights(self) -> np.ndarray:
-        """(N,), running sum of the positive returns to the power of ``RETURN_EXPONENT``."""
-        return np.cumsum(np.maximum(self.returns, 0.0) ** RETURN_EXPONENT)
+        """(N,), their running sum."""
+        return np.cumsum(self.weights)
 
     def effective_number(self) -> float:
         """Of the episodes, as they are drawn by returns: (Σw)^2 / Σw^2; 0 where none is."""
-        weights = np.add.reduceat(np.maximum(self.returns, 0.0) ** RETURN_EXPONENT, np.unique(self.starts))
+        weights = np.add.reduceat(self.weights, np.unique(self.starts))
         return float(weights.sum() ** 2 / max((weights**2).sum(), np.finfo(float).tiny))
 
     def __len__(self) -> int:

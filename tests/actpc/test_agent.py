@@ -719,7 +719,7 @@ def test_discrete_actions_and_images_get_one_clear_line():
     [
         ({"bootstrap": "both"}, "bootstrap='both'"),
         ({"signal_kwargs": {"normalizer": "mean"}}, "signal_kwargs={'normalizer': 'mean'}: normalizer='mean'"),
-        ({"signal_kwargs": {"normaliser": "max"}}, "signal_kwargs.*unexpected keyword argument 'normaliser'"),
+        ({"signal_kwargs": {"normaliser": "max"}}, "signal_kwargs.*has no keyword 'normaliser'"),
         ({"target_update_interval": 0}, "target_update_interval=0"),
         ({"demonstration_fraction": 1.5}, "demonstration_fraction=1.5"),
         ({"refresh_weight": -1.0}, "refresh_weight=-1.0"),

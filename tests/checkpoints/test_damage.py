@@ -142,7 +142,7 @@ def test_another_version_is_not_read(tmp_path: Path, saved: Path) -> None:
     manifest["version"] += 1
     del manifest["sha256"]
     file.write_text(json.dumps({**manifest, "sha256": _manifest_hash(manifest)}))
-    with pytest.raises(ValueError, match="format version 5, this sb3_actpc reads 4"):
+    with pytest.raises(ValueError, match="format version 6, this sb3_actpc reads 5"):
         find_bundle(tmp_path / "newer")
 
 
