@@ -14,9 +14,10 @@ Role = Literal["actor", "candidate", "habit"]
 Verdict = Literal["accepted", "tied", "rejected"]
 
 N_PROOFS = 2  # episodes of a candidate at least, before it is accepted
-PROOF_STEPS, MOST_PROOF_STEPS = 500, 2000  # environment steps of a candidate before it is judged, and that it has for a proof
-ENOUGH_PROOFS = 10  # episodes after which a candidate is judged however short they were
-HABIT_PROOFS, KEPT_RETURNS = 5, 20  # episodes of the habit that are asked for between candidates, and kept
+# environment steps, or episodes however short, of a candidate before it is judged, and of the habit between two candidates
+PROOF_STEPS, ENOUGH_PROOFS = 500, 10
+MOST_PROOF_STEPS = 2000  # that a candidate has for a proof
+KEPT_RETURNS = 20  # of the habit
 SURE, LIKELY = 1.5, 0.5  # standard errors that a gain must pass: at any time, and after ``MOST_PROOF_STEPS``
 # shares of the habit's mean return: what counts as a gain or a loss, and with what loss a candidate is rejected at once
 SMALLEST_GAIN, GREAT_LOSS = 0.01, 0.2
@@ -30,6 +31,7 @@ class Trials:
     Episodes alternate: with exploration noise by the learning actor, without by the habit or a candidate. A gain must pass a
     share of the habit's absolute mean return and ``SURE`` of its own standard errors, from the variance that candidate and
     habit have in common. While it only passes the first, the candidate plays on; when it has had its steps, ``LIKELY`` does.
+    After a candidate that did not prove itself the habit plays again: what made it the habit was partly luck.
 
     :param n_envs: environments, each with an episode of its own
     """
@@ -43,6 +45,8 @@ class Trials:
     habit_returns: list[float] = field(default_factory=list)
     candidate_returns: list[float] = field(default_factory=list)
     candidate_steps: int = 0
+    habit_proofs: int = 0  # episodes since the last verdict, and their steps
+    habit_steps: int = 0
     tests_habit: bool = True  # the next quiet episode is the habit's: its return must be known, or known better
 
     def __post_init__(self) -> None:
@@ -84,7 +88,9 @@ class Trials:
         self.returns[env], self.lengths[env] = 0.0, 0
         if role == "habit":
             self.habit_returns = [*self.habit_returns, episode_return][-KEPT_RETURNS:]
-            self.tests_habit = not has_learned or len(self.habit_returns) < N_PROOFS
+            self.habit_proofs, self.habit_steps = self.habit_proofs + 1, self.habit_steps + length
+            is_known = len(self.habit_returns) >= N_PROOFS and _is_tried(self.habit_proofs, self.habit_steps)
+            self.tests_habit = not (has_learned and is_known)
         if role != "candidate" or self.generations[env] != self.generation:
             return None
         self.candidate_returns.append(episode_return)
@@ -102,9 +108,8 @@ class Trials:
         gain, unit = fmean(own) - self.habit_return, abs(self.habit_return)
         error = self._standard_error()
         great_loss = gain + SURE * error < -GREAT_LOSS * unit
-        is_tried = n >= ENOUGH_PROOFS or self.candidate_steps >= PROOF_STEPS
         enough = LIKELY if self.candidate_steps >= MOST_PROOF_STEPS else SURE
-        if not is_tried and not (n >= N_PROOFS and great_loss):
+        if not _is_tried(n, self.candidate_steps) and not (n >= N_PROOFS and great_loss):
             return None
         verdict: Verdict = "tied"
         if great_loss or (n >= N_PROOFS and gain < -SMALLEST_GAIN * unit):
@@ -115,8 +120,9 @@ class Trials:
             verdict, self.habit_returns = "accepted", own[-KEPT_RETURNS:]
             # what the old habit has begun elsewhere is no return of the new one
             self.roles = ["actor" if role == "habit" else role for role in self.roles]
-        self.tests_habit = verdict != "accepted" and len(self.habit_returns) < HABIT_PROOFS
+        self.tests_habit = verdict != "accepted"
         self.candidate_returns, self.candidate_steps = [], 0
+        self.habit_proofs, self.habit_steps = 0, 0
         self.generation += 1
         return verdict
 
@@ -130,3 +136,7 @@ class Trials:
     def checkpoint_state(self) -> dict[str, Any]:
         """Everything, as plain values."""
         return asdict(self)
+
+
+def _is_tried(n_episodes: int, n_steps: int) -> bool:
+    return n_episodes >= ENOUGH_PROOFS or n_steps >= PROOF_STEPS

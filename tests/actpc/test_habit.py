@@ -16,7 +16,6 @@ from sb3_actpc.actpc import habit as habit_module
 from sb3_actpc.actpc.actpc import AVERAGING_RATE
 from sb3_actpc.actpc.habit import (
     ENOUGH_PROOFS,
-    HABIT_PROOFS,
     KEPT_RETURNS,
     LIKELY,
     MOST_PROOF_STEPS,
@@ -66,13 +65,23 @@ def tried(habit_return, candidate_returns, length=PROOF_STEPS, trials=None):
 
 
 def test_noisy_and_quiet_episodes_take_turns_and_the_habit_plays_first():
-    """Two whole episodes are what a tie takes; then the habit is tested again, until enough of its returns are known."""
+    """Two whole episodes are what a tie takes; then the habit is tested again."""
     trials = Trials(1)
     roles = [play(trials, 1.0)[0] for _ in range(26)]
     assert roles[::2] == ["actor"] * 13
     tie = ["candidate", "candidate"]
     assert roles[1::2] == ["habit", "habit", *tie, "habit", *tie, "habit", *tie, "habit", *tie]
-    assert len(trials.habit_returns) == HABIT_PROOFS
+
+
+@pytest.mark.parametrize(("length", "n"), [(PROOF_STEPS, 1), (PROOF_STEPS - 1, 2), (PROOF_STEPS // 4, 4), (1, ENOUGH_PROOFS)])
+def test_after_every_candidate_that_did_not_prove_itself_the_habit_is_tested_as_long_as_one(length, n):
+    """However well it is known: what it was accepted for may have been luck."""
+    trials = Trials(1)
+    assert tried(100.0, [0.0, 0.0], 1, trials)[-1] == "rejected"
+    trials.habit_returns = [100.0] * KEPT_RETURNS
+    for _ in range(2):
+        assert [play_quiet(trials, 100.0, length)[0] for _ in range(n)] == ["habit"] * n
+        assert [play_quiet(trials, 0.0, 1) for _ in range(2)] == [("candidate", None), ("candidate", "rejected")]
 
 
 def test_before_anything_is_learned_the_quiet_episodes_are_the_habits():
@@ -372,9 +381,10 @@ def test_quiet_episodes_are_exactly_the_habits_or_the_candidates_and_the_others_
     lengths = [(5, 9, 3, 12), (8, 4, 11)][:n_envs]
     env = DummyVecEnv([lambda one=one: Unpaid(one) for one in lengths])
     model, roles = imitating(env, {"memory_history": history}), Roles()
-    model.learn(60 * n_envs, callback=roles)
-    assert model.trials.generation == 0 and len(roles.rows) == 60
-    rows, envs = (part.ravel() for part in np.mgrid[:60, :n_envs])
+    model.learn(240, callback=roles)
+    n_rows = 240 // n_envs
+    assert model.trials.generation == 0 and len(roles.rows) == n_rows
+    rows, envs = (part.ravel() for part in np.mgrid[:n_rows, :n_envs])
     batch = model.inputs.replayed(model.replay_buffer._gather(rows, envs, None), model.reward_weights, model.gamma)
     assert (batch.memory is None) == (history == 0)
     played = np.array([roles.rows[row][env] for row, env in zip(rows, envs, strict=True)])
@@ -400,9 +410,9 @@ def test_the_average_follows_the_actor_with_its_rate(target_update_interval):
 
 def test_a_normalised_reward_proves_by_what_was_really_paid():
     model = imitating(VecNormalize(DummyVecEnv([CountingEnv]), norm_obs=False))
-    model.learn(60)  # episodes of 5, 9, 3 and 12 steps in turn, paid 0, 1, 0 and 2; every second one is quiet
-    assert model.trials.habit_returns == [1.0, 2.0]
-    assert model.trials.candidate_returns == [1.0, 2.0]
+    model.learn(240)  # episodes of 5, 9, 3 and 12 steps in turn, paid 0, 1, 0 and 2; every second one is quiet
+    assert model.trials.habit_returns == [1.0, 2.0] * (ENOUGH_PROOFS // 2)
+    assert model.trials.candidate_returns == [1.0, 2.0] * 3
 
 
 def test_another_environment_may_pay_otherwise():
