@@ -66,6 +66,7 @@ WARM_START_RATES, WARM_START_BATCH = (1e-3, 5e-5), 256  # a precise clone: what 
 ACTOR_SLOWNESS = 4.0  # how much slower than the others the actor learns, after a warm start
 TARGET_NOISE_CLIP = 2.5  # standard deviations, as TD3's 0.5 for 0.2
 AVERAGING_RATE = 0.001  # per update, of the average of the actor that becomes the habit
+CANDIDATE_AGE = 2000  # updates with a critic's pressure before that average is a candidate: a critic that begins is wrong
 
 
 class ActPC(OffPolicyAlgorithm):
@@ -502,22 +503,30 @@ class ActPC(OffPolicyAlgorithm):
             if update < n_prior:
                 self._update_prior(self.policy.batch_size_of("prior", self.batch_size))
             else:
-                self._warm_up_actor((update - n_prior) / self.actor_warm_start)
+                self._warm_up_actor(self.actor.circuit, (update - n_prior) / self.actor_warm_start)
             self.n_pretraining_updates += 1
-        if self.actor_warm_start:
-            self.actor.circuit.optimizer.state.clear()  # its moments are those of other learning rates
-        _copy(self.actor.circuit, self.actor_target, self.actor.habit, self.policy.actor_average)
-        if self.actor_warm_start:
-            self.policy.spread.copy_(spread_of(self._imitation_residuals()))
+        self._start_from(self.actor.circuit)
+        if self.actor_warm_start and self.trials is not None:
+            self.trials.imitated_return = self.expert.episodes.imitated_return(self.refresh.weighting)
+            self.trials.n_clones = self.refresh.n_clones - 1
         self.pretrained = True
 
-    def _warm_up_actor(self, progress: float) -> None:
+    def _warm_up_actor(self, circuit: NGCCircuit, progress: float) -> None:
         """One update on imitated actions; ``progress`` is the share of the warm start that is done."""
         first, last = WARM_START_RATES
-        circuit, rate = self.actor.circuit, first * (last / first) ** progress
+        rate = first * (last / first) ** progress
         for group, own in zip(circuit.optimizer.param_groups, circuit.parameter_groups(rate), strict=True):
             group["lr"] = own["lr"]
-        circuit.apply_changes(self._refresh_changes(WARM_START_BATCH))
+        circuit.apply_changes(self._refresh_changes(circuit, WARM_START_BATCH))
+
+    def _start_from(self, clone: NGCCircuit) -> None:
+        """Learning begins with this actor."""
+        if clone is not self.actor.circuit:
+            _copy(clone, self.actor.circuit)
+        _copy(self.actor.circuit, self.actor_target, self.actor.habit, self.policy.actor_average)
+        if self.actor_warm_start:
+            self.actor.circuit.optimizer.state.clear()  # its moments are those of other learning rates
+            self.policy.spread.copy_(spread_of(self._imitation_residuals()))
 
     def _update_prior(self, batch_size: int) -> None:
         assert self.expert is not None
@@ -595,15 +604,39 @@ class ActPC(OffPolicyAlgorithm):
             self.trials.step(env, float(reward))
             if not done:
                 continue
-            verdict = self.trials.end(env, has_learned=self._n_updates > self.critic_warmup)
+            verdict = self.trials.end(env, has_learned=self._n_updates > self.critic_warmup + CANDIDATE_AGE)
             region, is_paid = self.policy.trust_region, self.trials.habit_return != 0.0
-            if region is not None and verdict is not None and is_paid:  # nothing is proven where nothing is paid
+            # nothing is proven where nothing is paid, and a clone proves nothing about the pressure
+            if region is not None and verdict is not None and is_paid and not self.trials.is_clone:
                 region.resize(verdict)
             if verdict == "accepted":
-                _copy(self.policy.candidate, self.actor.habit)
-            if self.trials.needs_candidate():
-                _copy(self.policy.actor_average, self.policy.candidate)
+                self._accept_candidate()
+            if self.trials.needs_candidate(env):
+                self._take_candidate()
             self.trials.begin(env)
+
+    def _accept_candidate(self) -> None:
+        assert self.trials is not None and self.policy.candidate is not None
+        if self.trials.is_clone:
+            self._start_from(self.policy.candidate)
+        else:
+            _copy(self.policy.candidate, self.actor.habit)
+
+    def _take_candidate(self) -> None:
+        """The learning actor's average, or another clone: trained here and now, as the warm start was."""
+        assert self.trials is not None
+        self.trials.is_clone = self.trials.needs_clone()
+        if not self.trials.is_clone:
+            _copy(self.policy.actor_average, self.policy.candidate)
+            return
+        self.trials.n_clones -= 1
+        if self.verbose:
+            paid, imitated = self.trials.habit_return, self.trials.imitated_return
+            print(f"another clone: this one is paid {paid:.4g}, and what it imitates {imitated:.4g}")
+        clone = self.policy.make_actor()
+        for update in range(self.actor_warm_start):
+            self._warm_up_actor(clone, update / self.actor_warm_start)
+        _copy(clone, self.policy.candidate)
 
     def _check_observations(self, observations: Any) -> None:
         map_observations(lambda array: check_finite("environment", "observations", array, self.num_timesteps), observations)
@@ -715,7 +748,9 @@ class ActPC(OffPolicyAlgorithm):
 
     def _update_actor(self, batch: Batch) -> None:
         """Motor-action circuit: pressure of the critic (line 19) plus refresh (line 26), in one step of the optimiser."""
-        changes = self._refresh_changes(len(batch.features)) if self.refresh_weight and self._imitated() else None
+        changes = None
+        if self.refresh_weight and self._imitated():
+            changes = self._refresh_changes(self.actor.circuit, len(batch.features))
         if changes is not None:
             self.diagnostics.change_norms("refresh", changes.scale_(self.refresh_weight))
         if self.actor_pressure and self._n_updates > self.critic_warmup:
@@ -803,11 +838,11 @@ class ActPC(OffPolicyAlgorithm):
         own = [] if memory is None or memory.episodes is None else [memory.episodes]
         return own if self.expert is None else [self.expert.episodes, *own]
 
-    def _refresh_changes(self, n: int) -> HebbianChanges:
-        """Settle the actor on ``n`` imitated actions."""
-        state = self.actor.circuit.settle(*self._sample_imitated(n))
+    def _refresh_changes(self, circuit: NGCCircuit, n: int) -> HebbianChanges:
+        """Settle the actor, or a clone of the same imitated actions, on ``n`` of them."""
+        state = circuit.settle(*self._sample_imitated(n))
         self.diagnostics.settled("actor", state)
-        return self.actor.circuit.hebbian_update(state)
+        return circuit.hebbian_update(state)
 
     def _sample_imitated(self, n: int) -> tuple[th.Tensor, th.Tensor, th.Tensor | None]:
         """Features, actions and working memory of ``n`` imitated steps."""

@@ -3,7 +3,7 @@
 The circuit that learns is pressed by a critic that can be wrong, so it does not act for others at once. A *candidate*, the
 slow average of the learning actor, is frozen and plays every second episode without exploration noise. When it is paid more
 than the habit, by more than chance would have it, it becomes the habit. The warm-started clone is the first habit: what the
-agent does is imitation until something better is proven.
+agent does is imitation until something better is proven. Before anything is learned that can be another clone.
 """
 
 from dataclasses import asdict, dataclass, field
@@ -18,6 +18,7 @@ N_PROOFS = 2  # episodes of a candidate at least, before it is accepted
 PROOF_STEPS, ENOUGH_PROOFS = 500, 10
 MOST_PROOF_STEPS = 2000  # that a candidate has for a proof
 KEPT_RETURNS = 20  # of the habit
+ENOUGH = 0.9  # of what the imitated episodes were paid: a clone that is paid less is no good one
 SURE, LIKELY = 1.5, 0.5  # standard errors that a gain must pass: at any time, and after ``MOST_PROOF_STEPS``
 # shares of the habit's mean return: what counts as a gain or a loss, and with what loss a candidate is rejected at once
 SMALLEST_GAIN, GREAT_LOSS = 0.01, 0.2
@@ -33,6 +34,9 @@ class Trials:
     habit have in common. While it only passes the first, the candidate plays on; when it has had its steps, ``LIKELY`` does.
     After a candidate that did not prove itself the habit plays again: what made it the habit was partly luck.
 
+    Clones of the same demonstrations can do very differently, by their first synapses alone. So while the habit is paid less
+    than what it imitates, further clones are candidates: before anything is learned, and after a rejected learner.
+
     :param n_envs: environments, each with an episode of its own
     """
 
@@ -47,6 +51,11 @@ class Trials:
     candidate_steps: int = 0
     habit_proofs: int = 0  # episodes since the last verdict, and their steps
     habit_steps: int = 0
+    imitated_return: float = 0.0  # what the imitated episodes were paid
+    n_clones: int = 0  # that may still be tried
+    is_clone: bool = False  # the candidate is one, not the learning actor's average
+    has_learned: bool = False
+    learner_was_rejected: bool = False  # and no clone was tried since
     tests_habit: bool = True  # the next quiet episode is the habit's: its return must be known, or known better
 
     def __post_init__(self) -> None:
@@ -64,10 +73,17 @@ class Trials:
         """Mean of the habit's last returns; 0 where there is none yet."""
         return fmean(self.habit_returns) if self.habit_returns else 0.0
 
-    def needs_candidate(self) -> bool:
-        """Whether the next quiet episode is the first of a new candidate, which is then taken from the learning actor."""
+    def needs_clone(self) -> bool:
+        """Whether the next candidate is a clone."""
+        is_due = self.learner_was_rejected or not self.has_learned
+        return is_due and self.n_clones > 0 and self.habit_return < ENOUGH * self.imitated_return
+
+    def needs_candidate(self, env: int) -> bool:
+        """Whether the episode of ``env`` that begins now is the first of a new candidate: of a clone if one is needed, else of
+        the learning actor's average. To be asked after :meth:`end`."""
         present = zip(self.roles, self.generations, strict=True)  # one that was judged meanwhile may still be playing
-        return not self.tests_habit and not self.candidate_returns and ("candidate", self.generation) not in present
+        is_quiet = self.roles[env] == "actor"  # the one that has ended was noisy
+        return is_quiet and not (self.tests_habit or self.candidate_returns or ("candidate", self.generation) in present)
 
     def step(self, env: int, reward: float) -> None:
         """:param env: which environment
@@ -79,18 +95,19 @@ class Trials:
         """
         The episode of ``env`` has ended.
 
-        :param has_learned: whether the learning actor differs from the habit by more than imitation; there are no candidates
-            before
+        :param has_learned: whether the learning actor differs from the habit by more than imitation; before, clones alone are
+            candidates
         :return: "accepted": the candidate becomes the habit; "tied": it is dropped, being neither proven better nor worse;
             "rejected": it is dropped, being worse; None: nothing follows yet
         """
+        self.has_learned = has_learned
         role, episode_return, length = self.roles[env], self.returns[env], self.lengths[env]
         self.returns[env], self.lengths[env] = 0.0, 0
         if role == "habit":
             self.habit_returns = [*self.habit_returns, episode_return][-KEPT_RETURNS:]
             self.habit_proofs, self.habit_steps = self.habit_proofs + 1, self.habit_steps + length
             is_known = len(self.habit_returns) >= N_PROOFS and _is_tried(self.habit_proofs, self.habit_steps)
-            self.tests_habit = not (has_learned and is_known)
+            self.tests_habit = not (is_known and (has_learned or self.needs_clone()))
         if role != "candidate" or self.generations[env] != self.generation:
             return None
         self.candidate_returns.append(episode_return)
@@ -120,7 +137,8 @@ class Trials:
             verdict, self.habit_returns = "accepted", own[-KEPT_RETURNS:]
             # what the old habit has begun elsewhere is no return of the new one
             self.roles = ["actor" if role == "habit" else role for role in self.roles]
-        self.tests_habit = verdict != "accepted"
+        self.learner_was_rejected = verdict == "rejected" and not self.is_clone
+        self.tests_habit = verdict != "accepted" or not (self.has_learned or self.needs_clone())
         self.candidate_returns, self.candidate_steps = [], 0
         self.habit_proofs, self.habit_steps = 0, 0
         self.generation += 1

@@ -115,14 +115,7 @@ class ActPCActor(BasePolicy):
         self.net_arch, self.circuit_kwargs, self.memory_history = list(net_arch), circuit_kwargs, memory_history
         self.normalizer = ObservationNormalizer(n_features)
         self.memory = WorkingMemory(n_features, memory_history) if memory_history else None
-        self.circuit = NGCCircuit(
-            n_features,
-            int(np.prod(action_space.shape)),
-            net_arch,
-            output_activation="tanh",
-            n_memory=self.memory.size if self.memory else 0,
-            **circuit_kwargs,
-        )
+        self.circuit = self.make_circuit()
         self.habit = copy.deepcopy(self.circuit) if with_habit else None
         self._warned_of_empty_memory = False
 
@@ -136,6 +129,17 @@ class ActPCActor(BasePolicy):
             with_habit=self.habit is not None,
         )
         return data
+
+    def make_circuit(self) -> NGCCircuit:
+        """One that has learned nothing yet."""
+        return NGCCircuit(
+            self.features_extractor.features_dim,
+            int(np.prod(self.action_space.shape)),
+            self.net_arch,
+            output_activation="tanh",
+            n_memory=self.memory.size if self.memory else 0,
+            **self.circuit_kwargs,
+        ).to(self.device)
 
     @property
     def acting(self) -> NGCCircuit:
@@ -353,6 +357,12 @@ class ActPCPolicy(BasePolicy):
         self.trust_region = TrustRegion(self.trust_radius) if self.habit and self.trust_radius else None
         for name, circuit in self.named_circuits():
             circuit.optimizer = self._optimizer(name.partition(".")[0], circuit)
+
+    def make_actor(self) -> NGCCircuit:
+        """An actor's circuit that has learned nothing yet."""
+        circuit = self.actor.make_circuit()
+        circuit.optimizer = self._optimizer("actor", circuit)
+        return circuit
 
     def named_circuits(self) -> list[tuple[str, NGCCircuit]]:
         """The circuits that learn, with their names: actor, critic.0, ..., generator, prior."""

@@ -4,18 +4,19 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
 
-from sb3_actpc.actpc.arguments import Weight, checked
+from sb3_actpc.actpc.arguments import Between, Weight, checked
 from sb3_actpc.demonstrations import Demonstrations, scaled_actions
 from sb3_actpc.demonstrations.rows import split_observations
 
 Observations = np.ndarray | dict[str, np.ndarray]
 TensorObservations = th.Tensor | dict[str, th.Tensor]
+Weighting = Literal["returns", "uniform"]
 RETURN_EXPONENT = 4.0  # an episode that was paid half as much is imitated a sixteenth as often
 PATIENCE = 20  # episodes, all with a negative return, after which the memory warns
 
@@ -29,12 +30,19 @@ class Refresh:
         easy ones are imitated most
     :param noise: standard deviation of Gaussian noise on the features (normalised observations), not on the working memory's;
         against overfitting to few demonstrations. 0 for none (the paper)
+    :param n_clones: clones that are tried at most, before anything is learned, while the habit is paid less than what it
+        imitates (:mod:`sb3_actpc.actpc.habit`). 1 for the warm-started actor alone (the paper)
     :raises ValueError: for another value
     """
 
     @checked
-    def __init__(self, weighting: Literal["returns", "uniform"] = "returns", noise: Weight = 0.0) -> None:
-        self.weighting, self.noise = weighting, noise
+    def __init__(
+        self,
+        weighting: Weighting = "returns",
+        noise: Weight = 0.0,
+        n_clones: Annotated[int, Between(1)] = 4,
+    ) -> None:
+        self.weighting, self.noise, self.n_clones = weighting, noise, n_clones
 
 
 class ImitationSamples(NamedTuple):
@@ -88,6 +96,11 @@ class Episodes:
         """Of the episodes, as they are drawn by returns: (Σw)^2 / Σw^2; 0 where none is."""
         weights = np.add.reduceat(self.weights, np.unique(self.starts))
         return float(weights.sum() ** 2 / max((weights**2).sum(), np.finfo(float).tiny))
+
+    def imitated_return(self, weighting: Weighting) -> float:
+        """Mean return of the episodes that steps are drawn from."""
+        by_return = weighting == "returns" and self.weights.any()
+        return float(np.average(self.returns, weights=self.weights if by_return else None))
 
     def __len__(self) -> int:
         return len(self.actions)
@@ -195,9 +208,7 @@ class SelfImitationMemory:
         self.episodes = None if state["episodes"] is None else Episodes(**state["episodes"])
 
 
-def sample_union(
-    parts: list[Episodes], n: int, history: int = 0, weighting: Literal["returns", "uniform"] = "uniform"
-) -> ImitationSamples:
+def sample_union(parts: list[Episodes], n: int, history: int = 0, weighting: Weighting = "uniform") -> ImitationSamples:
     """``n`` rows drawn from the union of ``parts`` (global NumPy generator, as SB3's buffers); see :class:`Refresh`."""
     parts = [part for part in parts if len(part)]
     by_return = weighting == "returns" and parts[0].cumulative_weights[-1] > 0.0  # or one own episode would end imitation

@@ -12,6 +12,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 
 from sb3_actpc import ActPC
+from sb3_actpc.actpc import actpc as actpc_module
 from sb3_actpc.actpc import habit as habit_module
 from sb3_actpc.actpc.actpc import AVERAGING_RATE
 from sb3_actpc.actpc.habit import (
@@ -24,12 +25,18 @@ from sb3_actpc.actpc.habit import (
     SURE,
     Trials,
 )
-from sb3_actpc.actpc.trust_region import RADIUS_FACTORS
+from sb3_actpc.actpc.trust_region import RADIUS_FACTORS, spread_of
 from tests.actpc.agents import QUICK, differ, make, weights_of
 from tests.actpc.envs import CountingEnv, demonstrations
 from tests.checkpoints.runs import assert_same, learn_in_two, learn_straight
 
+ONE_CLONE = {"refresh_kwargs": {"n_clones": 1}}
 OBSERVATIONS = np.random.default_rng(0).normal(size=(7, 3)).astype(np.float32)
+
+
+@pytest.fixture(autouse=True)
+def candidates_of_any_age(monkeypatch):
+    monkeypatch.setattr(actpc_module, "CANDIDATE_AGE", 0)
 
 
 def play(trials, episode_return, length=PROOF_STEPS, env=0, has_learned=True):
@@ -213,12 +220,12 @@ def test_a_new_candidate_is_taken_before_its_first_episode_and_not_between_its_e
             trials.step(0, paid / PROOF_STEPS)
         role = trials.roles[0]
         trials.end(0, True)
-        asked.append((role, trials.needs_candidate()))
+        asked.append((role, trials.needs_candidate(0)))
         trials.begin(0)
     # at the end of: noise, habit, noise (here it is taken), candidate, noise, candidate (a tie), noise
     assert asked == [
         ("actor", False),
-        ("habit", True),
+        ("habit", False),
         ("actor", True),
         ("candidate", False),
         ("actor", False),
@@ -246,9 +253,9 @@ def test_a_candidate_that_still_plays_when_it_is_judged_does_not_keep_the_next_o
     play(trials, 0.0, env=0)
     assert play(trials, 100.0, env=0) == ("habit", None)
     trials.end(0, True)
-    assert trials.roles == ["actor", "candidate"] and trials.needs_candidate()
+    assert trials.roles == ["actor", "candidate"] and trials.needs_candidate(0)
     trials.begin(0)
-    assert trials.roles == ["candidate", "candidate"] and not trials.needs_candidate()
+    assert trials.roles == ["candidate", "candidate"] and not trials.needs_candidate(0)
 
 
 def test_what_the_old_habit_has_begun_elsewhere_is_no_return_of_the_new_one():
@@ -283,6 +290,57 @@ def test_trials_that_were_stored_go_on_as_they_would_have():
         for env in (0, 1):
             assert play(trials, paid, env=env) == play(again, paid, env=env)
     assert again == trials
+
+
+def test_while_nothing_is_learned_and_the_habit_is_paid_less_than_what_it_imitates_clones_are_tried():
+    trials = Trials(1, imitated_return=100.0, n_clones=2)
+
+    def quiet_ones(*paid):
+        roles = []
+        for one in paid:
+            trials.end(0, False)
+            due = trials.needs_candidate(0)
+            assert not due or trials.needs_clone()
+            trials.n_clones -= due
+            trials.begin(0)
+            role, verdict = play(trials, one, has_learned=False)
+            roles.append((role, verdict, due))
+        return roles
+
+    # the habit must be known before a clone is tried, and again after one that is no better; of what is nearly as good none is
+    assert quiet_ones(50.0, 60.0) == [("habit", None, False)] * 2
+    assert quiet_ones(10.0) == [("candidate", "rejected", True)]
+    assert quiet_ones(55.0) == [("habit", None, False)]
+    assert quiet_ones(95.0, 95.0) == [("candidate", None, True), ("candidate", "accepted", False)]
+    assert quiet_ones(70.0, 60.0) == [("habit", None, False)] * 2 and trials.n_clones == 0
+
+
+@pytest.mark.parametrize(
+    ("paid", "n_clones", "is_needed"), [(89.0, 1, True), (91.0, 1, False), (0.0, 1, True), (0.0, 0, False)]
+)
+def test_a_clone_is_needed_below_nine_tenths_of_what_is_imitated(paid, n_clones, is_needed):
+    trials = Trials(1, imitated_return=100.0, n_clones=n_clones, habit_returns=[paid, paid])
+    assert trials.needs_clone() == is_needed
+    trials.imitated_return = -100.0  # of demonstrations that were paid nothing, nothing follows
+    assert not trials.needs_clone()
+
+
+def test_once_something_is_learned_a_clone_is_tried_after_a_rejected_learner_and_then_the_learner_again():
+    trials = Trials(1, imitated_return=100.0, n_clones=2)
+    kinds = []
+    for _ in range(N_PROOFS):
+        play_quiet(trials, 50.0)  # the habit
+    for paid in (0.0, 0.0, 50.0, 0.0, 0.0):
+        trials.is_clone = trials.needs_clone()
+        trials.n_clones -= trials.is_clone
+        kinds.append(trials.is_clone)
+        verdict = None
+        while verdict is None:
+            role, verdict = play_quiet(trials, paid)
+            assert role == "candidate"
+        assert play_quiet(trials, 50.0)[0] == "habit"
+    # a rejected learner, a rejected clone, a learner's tie, another rejected learner, and the last clone
+    assert kinds == [False, True, False, False, True] and trials.n_clones == 0
 
 
 # ---------------------------------------------------------------------- the agent
@@ -348,7 +406,7 @@ def test_predict_is_the_warm_started_clone_until_a_candidate_is_accepted_and_the
 )
 def test_the_trust_region_is_resized_by_verdicts_once_something_is_learned(paid, verdict):
     """Where nothing is paid, a tie says nothing."""
-    model = imitating()
+    model = imitating(**ONE_CLONE)
     model.pretrain()
     habit_paid = float(any(paid))
     prove(model, *[0.0, habit_paid] * 4)  # before anything is learned: no candidate
@@ -360,6 +418,56 @@ def test_the_trust_region_is_resized_by_verdicts_once_something_is_learned(paid,
         prove(model, 0.0, one)
     factor = 1.0 if verdict is None else RADIUS_FACTORS[verdict]
     assert float(model.policy.trust_region.radius) == pytest.approx(factor * radius)
+
+
+@pytest.mark.parametrize(("late", "role"), [(0, "habit"), (1, "candidate")])
+def test_a_candidate_is_taken_once_the_critic_has_pressed_long_enough(late, role, monkeypatch):
+    monkeypatch.setattr(actpc_module, "CANDIDATE_AGE", 7)
+    model = imitating(**ONE_CLONE)
+    model.pretrain()
+    model._n_updates = model.critic_warmup + 7 + late
+    prove(model, 0.0, 1.0, 0.0, 1.0, 0.0)
+    assert model.trials.roles == [role]
+
+
+@pytest.mark.parametrize(("paid", "verdict"), [(1.0, "accepted"), (0.0, "rejected")])
+def test_a_clone_that_is_accepted_is_where_learning_begins(paid, verdict):
+    """Of other first synapses, trained as the warm start was; about the pressure its verdict says nothing."""
+    model = imitating()
+    model.learn(30)
+    model.trials = Trials(1, imitated_return=1.0, n_clones=3)
+    model._n_updates = 0
+    before = [weights_of(model.actor.habit), weights_of(model.actor.circuit)]
+    radius, n_actions = float(model.policy.trust_region.radius), len(model.replay_buffer.actions)
+    updates, model._warm_up_actor = [], lambda *given, own=model._warm_up_actor: (updates.append(given), own(*given))
+    prove(model, 0.0, 0.5, 0.0, 0.5, 0.0)  # noise, the habit, twice, and noise: now a clone is made
+    assert [progress for _, progress in updates] == [k / 5 for k in range(5)] and n_actions == len(model.replay_buffer.actions)
+    clone = weights_of(model.policy.candidate)
+    assert not differ(clone, weights_of(updates[-1][0])) and differ(clone, before[0])
+    assert not differ(before[1], weights_of(model.actor.circuit)) and model.trials.is_clone and model.trials.n_clones == 2
+    prove(model, paid, 0.0, paid)
+    expected = [clone] * 4 if verdict == "accepted" else [before[0], before[1]]
+    circuits = model.actor.habit, model.actor.circuit, model.actor_target, model.policy.actor_average
+    for circuit, weights in zip(circuits, expected, strict=False):
+        assert not differ(weights, weights_of(circuit))
+    assert bool(model.actor.circuit.optimizer.state) == (verdict == "rejected")
+    assert float(model.policy.trust_region.radius) == radius
+    if verdict == "accepted":
+        assert th.allclose(model.policy.spread, spread_of(model._imitation_residuals()), rtol=0.2)  # of other rows
+
+
+@pytest.mark.parametrize("weighting", ["returns", "uniform"])
+def test_what_is_imitated_is_paid_as_its_steps_are_drawn(weighting):
+    """And all the clones but the first may be tried once there is one."""
+    model = imitating(refresh_kwargs={"weighting": weighting, "n_clones": 3})
+    model.pretrain()
+    returns = model.expert.episodes.returns
+    weights = returns**4 if weighting == "returns" else np.ones_like(returns)
+    assert model.trials.imitated_return == pytest.approx((weights * returns).sum() / weights.sum())
+    assert model.trials.n_clones == 2
+    model = imitating(actor_warm_start=0)
+    model.pretrain()
+    assert model.trials.n_clones == 0
 
 
 class Roles(BaseCallback):
@@ -380,7 +488,7 @@ def test_quiet_episodes_are_exactly_the_habits_or_the_candidates_and_the_others_
     """Both are frozen until a verdict, and here is none: their actions can be worked out afterwards, from the buffer."""
     lengths = [(5, 9, 3, 12), (8, 4, 11)][:n_envs]
     env = DummyVecEnv([lambda one=one: Unpaid(one) for one in lengths])
-    model, roles = imitating(env, {"memory_history": history}), Roles()
+    model, roles = imitating(env, {"memory_history": history}, **ONE_CLONE), Roles()
     model.learn(240, callback=roles)
     n_rows = 240 // n_envs
     assert model.trials.generation == 0 and len(roles.rows) == n_rows
@@ -503,7 +611,7 @@ def test_noise_is_no_wider_than_the_demonstrations_around_the_warm_started_actor
     """Actions of one size around an actor that does nothing spread by that size; the least is a fiftieth of the box's half."""
     signs = np.random.default_rng(0).choice([-1.0, 1.0], size=(60, 2))
 
-    def do_nothing(model, progress):
+    def do_nothing(model, circuit, progress):
         for parameter in model.actor.circuit.parameters():
             parameter.zero_()
 
@@ -525,9 +633,10 @@ def test_without_a_warm_start_the_noise_is_as_asked_for():
 def test_the_warm_starts_rates_fall_geometrically_and_leave_nothing_behind(monkeypatch):
     seen, original = [], ActPC._refresh_changes
 
-    def watched(self, n):
-        seen.append((n, *(group["lr"] for group in self.actor.circuit.optimizer.param_groups)))
-        return original(self, n)
+    def watched(self, circuit, n):
+        assert circuit is self.actor.circuit
+        seen.append((n, *(group["lr"] for group in circuit.optimizer.param_groups)))
+        return original(self, circuit, n)
 
     monkeypatch.setattr(ActPC, "_refresh_changes", watched)
     model = imitating(policy_kwargs={"circuit_kwargs": {"feedback_rate": 0.9}}, actor_warm_start=10, learning_rate=8e-4)
