@@ -10,7 +10,7 @@ DEVIATION_RATE = 0.02  # of the running deviation, per update
 # of the multiplier's logarithm, per update: while nothing of the radius is used, and while twice of it is. A critic that has
 # just begun points anywhere, so that pressure comes slowly and goes at once
 RISE, FALL = 0.003, 0.01
-MULTIPLIERS = 0.02, 200.0
+MULTIPLIERS, FIRST_MULTIPLIER = (0.02, 200.0), 0.05
 RADII = 0.1, 1000.0  # below a third of a standard deviation nothing is learned
 # what a verdict about a candidate (:mod:`sb3_actpc.actpc.habit`) does to the radius
 RADIUS_FACTORS = {"accepted": 1.25, "tied": 2.0, "rejected": 0.7}
@@ -46,7 +46,7 @@ class TrustRegion(nn.Module):
         super().__init__()
         self.register_buffer("radius", th.tensor(float(radius)))
         self.register_buffer("deviation", th.tensor(0.0))
-        self.register_buffer("multiplier", th.tensor(1.0))
+        self.register_buffer("multiplier", th.tensor(FIRST_MULTIPLIER))
 
     def regulate(self, actions: th.Tensor, habit_actions: th.Tensor, values: th.Tensor, spread: th.Tensor) -> th.Tensor:
         """
