@@ -104,9 +104,7 @@ def test_envs_know_neither_torch_nor_the_agent(forbidden: str) -> None:
     assert [entry for entry in imports_in("sb3_actpc.envs") if is_within(entry.target, forbidden)] == []
 
 
-@pytest.mark.parametrize(
-    "forbidden", ["torch", "sb3_actpc.actpc", "sb3_actpc.experiments"]
-)
+@pytest.mark.parametrize("forbidden", ["torch", "sb3_actpc.actpc", "sb3_actpc.experiments"])
 def test_demonstrations_know_neither_torch_nor_the_agent(forbidden: str) -> None:
     assert [entry for entry in imports_in("sb3_actpc.demonstrations") if is_within(entry.target, forbidden)] == []
 

@@ -3,7 +3,7 @@
 The circuit that learns is pressed by a critic that can be wrong, so it does not act for others at once. A *candidate*, the
 slow average of the learning actor, is frozen and plays every second episode without exploration noise. When it is paid more
 than the habit, by more than chance would have it, it becomes the habit. The warm-started clone is the first habit: what the
-agent does is imitation until something better is proven. Before anything is learned that can be another clone.
+agent does is imitation until something better is proven; other clones can be candidates too.
 """
 
 from dataclasses import asdict, dataclass, field

@@ -68,7 +68,11 @@ def fit_demonstrations(
     :raises FileNotFoundError: when there is no such file
     :raises ValueError: when they are damaged, fewer than asked for, or of another task
     """
-    demonstrations = resolve(source, observation_space).select(n_episodes, n_transitions)
+    demonstrations = resolve(source, observation_space)
+    try:
+        demonstrations = demonstrations.select(n_episodes, n_transitions)
+    except ValueError as error:
+        raise ValueError(f"n_demonstrations={n_episodes}, n_demonstration_transitions={n_transitions}: {error}") from error
     env_id = None
     if env is not None:
         if env.has_attr("goal_demonstrations"):

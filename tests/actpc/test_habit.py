@@ -456,18 +456,23 @@ def test_a_clone_that_is_accepted_is_where_learning_begins(paid, verdict):
         assert th.allclose(model.policy.spread, spread_of(model._imitation_residuals()), rtol=0.2)  # of other rows
 
 
-@pytest.mark.parametrize("weighting", ["returns", "uniform"])
-def test_what_is_imitated_is_paid_as_its_steps_are_drawn(weighting):
-    """And all the clones but the first may be tried once there is one."""
-    model = imitating(refresh_kwargs={"weighting": weighting, "n_clones": 3})
-    model.pretrain()
-    returns = model.expert.episodes.returns
-    weights = returns**4 if weighting == "returns" else np.ones_like(returns)
-    assert model.trials.imitated_return == pytest.approx((weights * returns).sum() / weights.sum())
-    assert model.trials.n_clones == 2
-    model = imitating(actor_warm_start=0)
-    model.pretrain()
-    assert model.trials.n_clones == 0
+@pytest.mark.parametrize(
+    ("paid", "weighting", "imitated"),
+    [
+        ((2.0, 1.0), "returns", (16 * 2.0 + 1.0) / 17),
+        ((2.0, 1.0), "uniform", 1.5),
+        ((0.0, -1.0), "returns", -0.5),  # drawn alike
+    ],
+)
+def test_what_is_imitated_is_paid_as_its_steps_are_drawn(paid, weighting, imitated):
+    """Two episodes of five steps; and all the clones but the first may be tried once there is one."""
+    data = demonstrations(n_episodes=2, length=5)
+    data = dataclasses.replace(data, rewards=np.repeat(paid, 5).astype(np.float32) / 5)
+    for updates, expected in ((3, (pytest.approx(imitated), 2)), (0, (0.0, 0))):
+        settings = {"refresh_kwargs": {"weighting": weighting, "n_clones": 3}, "actor_warm_start": updates}
+        model = ActPC("MlpPolicy", CountingEnv(), demonstrations=data, **{**QUICK, **settings})
+        model.pretrain()
+        assert (model.trials.imitated_return, model.trials.n_clones) == expected
 
 
 class Roles(BaseCallback):

@@ -197,7 +197,7 @@ def test_the_shared_evaluation_carries_the_state() -> None:
         (BC, {"batch_size": 2.5}, "batch_size=2.5 must be a whole number"),
         (BC, {"input_noise": -1.0}, "input_noise=-1.0 must be at least 0"),
         (BC, {"weight_decay": float("nan")}, "weight_decay=nan must be a finite number"),
-        (BC, {"n_demonstrations": 99}, "n_episodes"),
+        (BC, {"n_demonstrations": 99}, "n_demonstrations=99.*: n_episodes must be"),
         (BCRNN, {"sequence_length": 0}, "sequence_length=0 must be at least 1"),
         (BCRNN, {"carry_state": 1}, "carry_state=1 must be True or False"),
         (BCRNN, {"policy_kwargs": {"cell": "elman"}}, "cell='elman' is unknown; choose one of"),

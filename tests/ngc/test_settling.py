@@ -20,9 +20,7 @@ def make(hidden=(12, 9), dtype=th.float64, **keywords) -> tuple[NGCCircuit, th.T
 def test_one_step_of_eq_1_is_minus_the_gradient_of_the_energy(activation, output_activation):
     """Settle k and k + 1 steps: every hidden state must have moved by β times minus ∂F/∂z, at a state with errors."""
     rate = 0.05
-    circuit, x, target = make(
-        activation=activation, output_activation=output_activation, settling_rate=rate, **ITERATIVE
-    )
+    circuit, x, target = make(activation=activation, output_activation=output_activation, settling_rate=rate, **ITERATIVE)
     circuit.n_settling_steps = 6
     before = circuit.settle(x, target)
     latents = [z.clone().requires_grad_() for z in before.latents[:-1]]
