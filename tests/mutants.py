@@ -374,12 +374,16 @@ MUTANTS = [
         f"{HABIT} -k plays_on",
     ),
     Mutant(
-        "candidates before anything is learned", TRIALS, "and (has_learned or self.needs_clone())", "", f"{HABIT} -k before"
+        "candidates before anything is learned",
+        TRIALS,
+        "(not self.tests_habit and (self.has_learned or self.needs_clone()))",
+        "not self.tests_habit",
+        f"{HABIT} -k late",
     ),
     Mutant(
         "a clone whatever the habit is paid",
         TRIALS,
-        " and self.habit_return < ENOUGH * self.imitated_return",
+        " and self.habit_return < least",
         "",
         f"{HABIT} -k clone",
     ),
@@ -394,8 +398,8 @@ MUTANTS = [
     Mutant(
         "the habit is not tested again",
         TRIALS,
-        'self.tests_habit = verdict != "accepted" or',
-        "self.tests_habit =",
+        'self.tests_habit = verdict != "accepted"',
+        "self.tests_habit = False",
         f"{HABIT} -k tested",
     ),
     Mutant(
@@ -426,7 +430,7 @@ MUTANTS = [
         "weights=None",
         f"{HABIT} -k paid_as",
     ),
-    Mutant("candidates at once", AGENT, "self.critic_warmup + CANDIDATE_AGE", "self.critic_warmup", f"{HABIT} -k long_enough"),
+    Mutant("candidates at once", AGENT, "pressed_since + CANDIDATE_AGE", "pressed_since", f"{HABIT} -k long_enough"),
     Mutant(
         "the spread of the habit does not count",
         TRIALS,

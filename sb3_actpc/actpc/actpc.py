@@ -66,7 +66,7 @@ WARM_START_RATES, WARM_START_BATCH = (1e-3, 5e-5), 256  # a precise clone: what 
 ACTOR_SLOWNESS = 4.0  # how much slower than the others the actor learns, after a warm start
 TARGET_NOISE_CLIP = 2.5  # standard deviations, as TD3's 0.5 for 0.2
 AVERAGING_RATE = 0.001  # per update, of the average of the actor that becomes the habit
-CANDIDATE_AGE = 2000  # updates with a critic's pressure before that average is a candidate: a critic that begins is wrong
+CANDIDATE_AGE = 2000  # updates of a pressing critic before that average is a candidate: one that begins is wrong
 
 
 class ActPC(OffPolicyAlgorithm):
@@ -127,15 +127,15 @@ class ActPC(OffPolicyAlgorithm):
         from ``WARM_START_RATES[0]`` to ``[1]``
     :param refresh_weight: weight of the actor's refresh from the demonstrations and its own best episodes
     :param refresh_kwargs: keywords of :class:`~sb3_actpc.actpc.self_imitation.Refresh`, for refresh and warm start:
-        ``weighting`` (by "returns"; the paper's is "uniform") and ``noise``
+        ``weighting`` (by "returns"; the paper's is "uniform"), ``noise`` and ``n_clones``
     :param demonstration_fraction: share of the critic's batch that comes from the demonstrations
     :param alpha_ep: weight of the epistemic signal
     :param alpha_in: weight of the instrumental signal
     :param alpha_ext: weight of the task's reward (the paper's is 0 with demonstrations)
     :param signal_kwargs: keywords of :class:`~sb3_actpc.actpc.reward_signals.InternalSignals`: ``normalizer``,
         ``normalization``, ``instrumental_form``, ``errors``; the defaults are the paper's
-    :param actor_pressure: weight of the critic's pressure on the actor, at first: with a habit a trust region
-        (:mod:`sb3_actpc.actpc.trust_region`) regulates it (``pressure`` is the present one). 0 leaves refresh alone (cloning)
+    :param actor_pressure: weight of the critic's pressure on the actor; with a habit a trust region multiplies it
+        (:mod:`sb3_actpc.actpc.trust_region`; ``pressure`` is the present product). 0 leaves refresh alone (cloning)
     :param scale_pressure: divide the pressure by the batch's mean absolute action-value (at least 1: one paid step)
     :param critic_warmup: updates before the critic's pressure reaches the actor
     :param bootstrap: "joint" (target critic at the target actor's next action, the appendix) or "literal" (at the action
@@ -301,6 +301,8 @@ class ActPC(OffPolicyAlgorithm):
         if self.policy.habit:
             self.trials = self.trials or Trials(self.n_envs)  # a loaded agent knows what its habit was paid
             self.trials.n_envs = self.n_envs
+            clones = self.refresh.n_clones - 1 if self.demonstrations is not None and self.actor_warm_start else 0
+            self.trials.n_clones = min(self.trials.n_clones, clones)
         self._setup_demonstrations()
         self.diagnostics = Diagnostics(self.policy)
         self._compiled: CompiledUpdate | None = None
@@ -377,6 +379,8 @@ class ActPC(OffPolicyAlgorithm):
             return  # a trained agent acts without them; ``learn`` says what is missing
         assert isinstance(self.action_space, spaces.Box)
         self.expert = DemonstrationReplay(demonstrations, self.observation_space, self.action_space, self.memory_history)
+        if self.trials is not None:
+            self.trials.imitated_return = self.expert.episodes.imitated_return(self.refresh.weighting)
         if self.observation_normalization == "demonstrations" and not self.pretrained:
             observations = self.inputs.observations(self.expert.episodes.observations)
             self.actor.normalizer.fit(self.inputs.features(observations))
@@ -400,9 +404,8 @@ class ActPC(OffPolicyAlgorithm):
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         super().set_env(env, force_reset)
-        # another environment may pay for other steps
-        if self.trials is not None:
-            self.trials = Trials(self.n_envs)
+        if self.trials is not None:  # another environment may pay for other steps
+            self.trials = Trials(self.n_envs, n_clones=self.trials.n_clones, begun_at=self.trials.begun_at)
         if self.demonstrations is not None:
             self._setup_demonstrations()
 
@@ -507,7 +510,6 @@ class ActPC(OffPolicyAlgorithm):
             self.n_pretraining_updates += 1
         self._start_from(self.actor.circuit)
         if self.actor_warm_start and self.trials is not None:
-            self.trials.imitated_return = self.expert.episodes.imitated_return(self.refresh.weighting)
             self.trials.n_clones = self.refresh.n_clones - 1
         self.pretrained = True
 
@@ -604,35 +606,36 @@ class ActPC(OffPolicyAlgorithm):
             self.trials.step(env, float(reward))
             if not done:
                 continue
-            verdict = self.trials.end(env, has_learned=self._n_updates > self.critic_warmup + CANDIDATE_AGE)
+            pressed_since = max(self.critic_warmup, self.trials.begun_at)
+            verdict = self.trials.end(env, has_learned=self._n_updates > pressed_since + CANDIDATE_AGE)
             region, is_paid = self.policy.trust_region, self.trials.habit_return != 0.0
             # nothing is proven where nothing is paid, and a clone proves nothing about the pressure
             if region is not None and verdict is not None and is_paid and not self.trials.is_clone:
                 region.resize(verdict)
             if verdict == "accepted":
                 self._accept_candidate()
-            if self.trials.needs_candidate(env):
-                self._take_candidate()
-            self.trials.begin(env)
+            if self.trials.begin(env):
+                self._make_candidate()
 
     def _accept_candidate(self) -> None:
         assert self.trials is not None and self.policy.candidate is not None
-        if self.trials.is_clone:
-            self._start_from(self.policy.candidate)
-        else:
+        if not self.trials.is_clone:
             _copy(self.policy.candidate, self.actor.habit)
+            return
+        self._start_from(self.policy.candidate)
+        self.trials.begun_at = self._n_updates
+        if self.policy.trust_region is not None:
+            self.policy.trust_region.begin()
 
-    def _take_candidate(self) -> None:
-        """The learning actor's average, or another clone: trained here and now, as the warm start was."""
+    def _make_candidate(self) -> None:
+        """The learning actor's average, or another clone of whatever is imitated: trained here and now, as in a warm start."""
         assert self.trials is not None
-        self.trials.is_clone = self.trials.needs_clone()
         if not self.trials.is_clone:
             _copy(self.policy.actor_average, self.policy.candidate)
             return
-        self.trials.n_clones -= 1
         if self.verbose:
             paid, imitated = self.trials.habit_return, self.trials.imitated_return
-            print(f"another clone: this one is paid {paid:.4g}, and what it imitates {imitated:.4g}")
+            print(f"another clone is tried: the habit is paid {paid:.4g}, what it imitates {imitated:.4g}")
         clone = self.policy.make_actor()
         for update in range(self.actor_warm_start):
             self._warm_up_actor(clone, update / self.actor_warm_start)
@@ -841,7 +844,8 @@ class ActPC(OffPolicyAlgorithm):
     def _refresh_changes(self, circuit: NGCCircuit, n: int) -> HebbianChanges:
         """Settle the actor, or a clone of the same imitated actions, on ``n`` of them."""
         state = circuit.settle(*self._sample_imitated(n))
-        self.diagnostics.settled("actor", state)
+        if circuit is self.actor.circuit:
+            self.diagnostics.settled("actor", state)
         return circuit.hebbian_update(state)
 
     def _sample_imitated(self, n: int) -> tuple[th.Tensor, th.Tensor, th.Tensor | None]:

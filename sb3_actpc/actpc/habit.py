@@ -18,7 +18,7 @@ N_PROOFS = 2  # episodes of a candidate at least, before it is accepted
 PROOF_STEPS, ENOUGH_PROOFS = 500, 10
 MOST_PROOF_STEPS = 2000  # that a candidate has for a proof
 KEPT_RETURNS = 20  # of the habit
-ENOUGH = 0.9  # of what the imitated episodes were paid: a clone that is paid less is no good one
+SHORTFALL = 0.1  # of what the imitated episodes were paid: a clone that is paid less by more is no good one
 SURE, LIKELY = 1.5, 0.5  # standard errors that a gain must pass: at any time, and after ``MOST_PROOF_STEPS``
 # shares of the habit's mean return: what counts as a gain or a loss, and with what loss a candidate is rejected at once
 SMALLEST_GAIN, GREAT_LOSS = 0.01, 0.2
@@ -35,7 +35,8 @@ class Trials:
     After a candidate that did not prove itself the habit plays again: what made it the habit was partly luck.
 
     Clones of the same demonstrations can do very differently, by their first synapses alone. So while the habit is paid less
-    than what it imitates, further clones are candidates: before anything is learned, and after a rejected learner.
+    than what it imitates, by more than ``SHORTFALL`` of it, further clones are candidates: before anything is learned, and
+    after a rejected learner. One that is accepted is where learning begins anew.
 
     :param n_envs: environments, each with an episode of its own
     """
@@ -53,10 +54,12 @@ class Trials:
     habit_steps: int = 0
     imitated_return: float = 0.0  # what the imitated episodes were paid
     n_clones: int = 0  # that may still be tried
-    is_clone: bool = False  # the candidate is one, not the learning actor's average
+    begun_at: int = 0  # update at which learning began with the present clone
+    on_trial: bool = False  # there is a candidate that is not judged yet
+    is_clone: bool = False  # it is one, not the learning actor's average
     has_learned: bool = False
-    learner_was_rejected: bool = False  # and no clone was tried since
-    tests_habit: bool = True  # the next quiet episode is the habit's: its return must be known, or known better
+    learner_was_rejected: bool = False  # the last candidate was one
+    tests_habit: bool = True  # before the next candidate: its return must be known, or known better
 
     def __post_init__(self) -> None:
         if not self.roles:
@@ -76,14 +79,8 @@ class Trials:
     def needs_clone(self) -> bool:
         """Whether the next candidate is a clone."""
         is_due = self.learner_was_rejected or not self.has_learned
-        return is_due and self.n_clones > 0 and self.habit_return < ENOUGH * self.imitated_return
-
-    def needs_candidate(self, env: int) -> bool:
-        """Whether the episode of ``env`` that begins now is the first of a new candidate: of a clone if one is needed, else of
-        the learning actor's average. To be asked after :meth:`end`."""
-        present = zip(self.roles, self.generations, strict=True)  # one that was judged meanwhile may still be playing
-        is_quiet = self.roles[env] == "actor"  # the one that has ended was noisy
-        return is_quiet and not (self.tests_habit or self.candidate_returns or ("candidate", self.generation) in present)
+        least = self.imitated_return - SHORTFALL * abs(self.imitated_return)
+        return is_due and self.n_clones > 0 and self.habit_return < least
 
     def step(self, env: int, reward: float) -> None:
         """:param env: which environment
@@ -107,18 +104,29 @@ class Trials:
             self.habit_returns = [*self.habit_returns, episode_return][-KEPT_RETURNS:]
             self.habit_proofs, self.habit_steps = self.habit_proofs + 1, self.habit_steps + length
             is_known = len(self.habit_returns) >= N_PROOFS and _is_tried(self.habit_proofs, self.habit_steps)
-            self.tests_habit = not (is_known and (has_learned or self.needs_clone()))
+            self.tests_habit = not (self.on_trial or (is_known and (has_learned or self.needs_clone())))
         if role != "candidate" or self.generations[env] != self.generation:
             return None
         self.candidate_returns.append(episode_return)
         self.candidate_steps += length
         return self._judge()
 
-    def begin(self, env: int) -> None:
-        """A new episode of ``env`` begins: noisy and quiet ones take turns."""
-        quiet: Role = "habit" if self.tests_habit else "candidate"
+    def begin(self, env: int) -> bool:
+        """
+        A new episode of ``env`` begins: noisy and quiet ones take turns.
+
+        :return: whether a new candidate plays it, which is to be made now: a clone where ``is_clone`` says so, else the
+            learning actor's average
+        """
+        has_candidate = self.on_trial or (not self.tests_habit and (self.has_learned or self.needs_clone()))
+        quiet: Role = "candidate" if has_candidate else "habit"
         self.roles[env] = quiet if self.roles[env] == "actor" else "actor"
         self.generations[env] = self.generation
+        if self.roles[env] != "candidate" or self.on_trial:
+            return False
+        self.on_trial, self.is_clone = True, self.needs_clone()
+        self.n_clones -= self.is_clone
+        return True
 
     def _judge(self) -> Verdict | None:
         own, n = self.candidate_returns, len(self.candidate_returns)
@@ -138,8 +146,8 @@ class Trials:
             # what the old habit has begun elsewhere is no return of the new one
             self.roles = ["actor" if role == "habit" else role for role in self.roles]
         self.learner_was_rejected = verdict == "rejected" and not self.is_clone
-        self.tests_habit = verdict != "accepted" or not (self.has_learned or self.needs_clone())
-        self.candidate_returns, self.candidate_steps = [], 0
+        self.tests_habit = verdict != "accepted"
+        self.candidate_returns, self.candidate_steps, self.on_trial = [], 0, False
         self.habit_proofs, self.habit_steps = 0, 0
         self.generation += 1
         return verdict

@@ -30,8 +30,9 @@ class Refresh:
         easy ones are imitated most
     :param noise: standard deviation of Gaussian noise on the features (normalised observations), not on the working memory's;
         against overfitting to few demonstrations. 0 for none (the paper)
-    :param n_clones: clones that are tried at most, before anything is learned, while the habit is paid less than what it
-        imitates (:mod:`sb3_actpc.actpc.habit`). 1 for the warm-started actor alone (the paper)
+    :param n_clones: clones that are tried at most, the first included, while the habit is paid less than nine tenths of what
+        it imitates (:mod:`sb3_actpc.actpc.habit`): returns of environment and demonstrations must be of one scale. 1 for the
+        warm-started actor alone (the paper); without a habit or a warm start there are no others
     :raises ValueError: for another value
     """
 

@@ -48,6 +48,11 @@ class TrustRegion(nn.Module):
         self.register_buffer("deviation", th.tensor(0.0))
         self.register_buffer("multiplier", th.tensor(FIRST_MULTIPLIER))
 
+    def begin(self) -> None:
+        """With an actor that does what its habit does."""
+        self.deviation.zero_()
+        self.multiplier.fill_(FIRST_MULTIPLIER)
+
     def regulate(self, actions: th.Tensor, habit_actions: th.Tensor, values: th.Tensor, spread: th.Tensor) -> th.Tensor:
         """
         :param actions: of the learning actor, (B, A)

@@ -25,7 +25,7 @@ from sb3_actpc.actpc.habit import (
     SURE,
     Trials,
 )
-from sb3_actpc.actpc.trust_region import RADIUS_FACTORS, spread_of
+from sb3_actpc.actpc.trust_region import FIRST_MULTIPLIER, RADIUS_FACTORS, spread_of
 from tests.actpc.agents import QUICK, differ, make, weights_of
 from tests.actpc.envs import CountingEnv, demonstrations
 from tests.checkpoints.runs import assert_same, learn_in_two, learn_straight
@@ -214,16 +214,15 @@ def test_a_habit_that_stays_is_tested_again_and_known_by_the_mean_of_its_last_re
 
 
 def test_a_new_candidate_is_taken_before_its_first_episode_and_not_between_its_episodes():
-    trials, asked = Trials(1, habit_returns=[100.0]), []
+    trials, taken = Trials(1, habit_returns=[100.0]), []
     for paid in (0.0, 100.0, 0.0, 100.0, 0.0, 100.0, 0.0):
         for _ in range(PROOF_STEPS):
             trials.step(0, paid / PROOF_STEPS)
         role = trials.roles[0]
         trials.end(0, True)
-        asked.append((role, trials.needs_candidate(0)))
-        trials.begin(0)
+        taken.append((role, trials.begin(0)))
     # at the end of: noise, habit, noise (here it is taken), candidate, noise, candidate (a tie), noise
-    assert asked == [
+    assert taken == [
         ("actor", False),
         ("habit", False),
         ("actor", True),
@@ -253,9 +252,8 @@ def test_a_candidate_that_still_plays_when_it_is_judged_does_not_keep_the_next_o
     play(trials, 0.0, env=0)
     assert play(trials, 100.0, env=0) == ("habit", None)
     trials.end(0, True)
-    assert trials.roles == ["actor", "candidate"] and trials.needs_candidate(0)
-    trials.begin(0)
-    assert trials.roles == ["candidate", "candidate"] and not trials.needs_candidate(0)
+    assert trials.roles == ["actor", "candidate"] and trials.begin(0)
+    assert trials.roles == ["candidate", "candidate"] and trials.on_trial
 
 
 def test_what_the_old_habit_has_begun_elsewhere_is_no_return_of_the_new_one():
@@ -292,55 +290,79 @@ def test_trials_that_were_stored_go_on_as_they_would_have():
     assert again == trials
 
 
+def play_clones(trials, *paid, has_learned=False):
+    """Quiet episodes with these returns: who played each, what followed, and whether a clone was to be made for it."""
+    played = []
+    for one in paid:
+        trials.end(0, has_learned)
+        clone = trials.begin(0) and trials.is_clone
+        played.append((*play(trials, one, has_learned=has_learned), clone))
+    return played
+
+
 def test_while_nothing_is_learned_and_the_habit_is_paid_less_than_what_it_imitates_clones_are_tried():
+    """The habit is known before a clone is tried, and better after one that is no better; none where it is nearly as good."""
     trials = Trials(1, imitated_return=100.0, n_clones=2)
-
-    def quiet_ones(*paid):
-        roles = []
-        for one in paid:
-            trials.end(0, False)
-            due = trials.needs_candidate(0)
-            assert not due or trials.needs_clone()
-            trials.n_clones -= due
-            trials.begin(0)
-            role, verdict = play(trials, one, has_learned=False)
-            roles.append((role, verdict, due))
-        return roles
-
-    # the habit must be known before a clone is tried, and again after one that is no better; of what is nearly as good none is
-    assert quiet_ones(50.0, 60.0) == [("habit", None, False)] * 2
-    assert quiet_ones(10.0) == [("candidate", "rejected", True)]
-    assert quiet_ones(55.0) == [("habit", None, False)]
-    assert quiet_ones(95.0, 95.0) == [("candidate", None, True), ("candidate", "accepted", False)]
-    assert quiet_ones(70.0, 60.0) == [("habit", None, False)] * 2 and trials.n_clones == 0
+    assert play_clones(trials, 50.0, 60.0) == [("habit", None, False)] * 2
+    assert play_clones(trials, 10.0) == [("candidate", "rejected", True)]
+    assert play_clones(trials, 55.0) == [("habit", None, False)]
+    assert play_clones(trials, 95.0, 95.0) == [("candidate", None, True), ("candidate", "accepted", False)]
+    assert play_clones(trials, 70.0, 60.0) == [("habit", None, False)] * 2 and trials.n_clones == 0
 
 
 @pytest.mark.parametrize(
-    ("paid", "n_clones", "is_needed"), [(89.0, 1, True), (91.0, 1, False), (0.0, 1, True), (0.0, 0, False)]
+    ("imitated", "paid", "n_clones", "is_needed"),
+    [
+        (100.0, 89.0, 1, True),
+        (100.0, 91.0, 1, False),
+        (100.0, 0.0, 1, True),
+        (100.0, 0.0, 0, False),
+        (0.0, 0.0, 1, False),
+        (-100.0, -111.0, 1, True),
+        (-100.0, -109.0, 1, False),
+    ],
 )
-def test_a_clone_is_needed_below_nine_tenths_of_what_is_imitated(paid, n_clones, is_needed):
-    trials = Trials(1, imitated_return=100.0, n_clones=n_clones, habit_returns=[paid, paid])
+def test_a_clone_is_needed_where_a_tenth_of_what_is_imitated_is_missing(imitated, paid, n_clones, is_needed):
+    trials = Trials(1, imitated_return=imitated, n_clones=n_clones, habit_returns=[paid, paid])
     assert trials.needs_clone() == is_needed
-    trials.imitated_return = -100.0  # of demonstrations that were paid nothing, nothing follows
-    assert not trials.needs_clone()
 
 
 def test_once_something_is_learned_a_clone_is_tried_after_a_rejected_learner_and_then_the_learner_again():
     trials = Trials(1, imitated_return=100.0, n_clones=2)
+    play_clones(trials, 50.0, 50.0, has_learned=True)  # the habit
     kinds = []
-    for _ in range(N_PROOFS):
-        play_quiet(trials, 50.0)  # the habit
     for paid in (0.0, 0.0, 50.0, 0.0, 0.0):
-        trials.is_clone = trials.needs_clone()
-        trials.n_clones -= trials.is_clone
-        kinds.append(trials.is_clone)
-        verdict = None
+        [(role, verdict, is_clone)] = play_clones(trials, paid, has_learned=True)
+        kinds.append(is_clone)
         while verdict is None:
-            role, verdict = play_quiet(trials, paid)
-            assert role == "candidate"
-        assert play_quiet(trials, 50.0)[0] == "habit"
+            [(role, verdict, again)] = play_clones(trials, paid, has_learned=True)
+            assert not again
+        assert role == "candidate"
+        assert play_clones(trials, 50.0, has_learned=True) == [("habit", None, False)]
     # a rejected learner, a rejected clone, a learner's tie, another rejected learner, and the last clone
     assert kinds == [False, True, False, False, True] and trials.n_clones == 0
+
+
+def test_a_clone_that_is_accepted_late_is_no_candidate_before_it_has_learned_again():
+    trials = Trials(1, imitated_return=100.0, n_clones=1)
+    assert play_clones(trials, 50.0, 50.0, 0.0, 50.0, has_learned=True)[-2][1] == "rejected"
+    assert [verdict for _, verdict, _ in play_clones(trials, 95.0, 95.0, has_learned=True)] == [None, "accepted"]
+    assert play_clones(trials, 95.0, 95.0, 95.0, has_learned=False) == [("habit", None, False)] * 3
+    assert play_clones(trials, 95.0, 95.0, has_learned=True) == [("habit", None, False), ("candidate", None, False)]
+
+
+def test_what_the_habit_is_paid_elsewhere_meanwhile_does_not_stop_the_trial_of_a_clone():
+    trials = Trials(2, imitated_return=100.0, n_clones=1)
+    for _ in range(2):
+        assert play(trials, 0.0, 3, 0, False)[0] == "actor"
+        assert play(trials, 50.0, env=0, has_learned=False) == ("habit", None)
+    play(trials, 0.0, 3, 1, False)  # its quiet episode is the clone's
+    assert trials.roles == ["actor", "candidate"] and trials.is_clone
+    trials.roles[0] = "habit"  # as if it had begun before
+    assert play(trials, 50.0, env=0, has_learned=False) == ("habit", None)
+    assert play(trials, 90.0, env=1, has_learned=False) == ("candidate", None)
+    play(trials, 0.0, 3, 1, False)
+    assert play(trials, 90.0, env=1, has_learned=False) == ("candidate", "accepted")
 
 
 # ---------------------------------------------------------------------- the agent
@@ -357,7 +379,8 @@ def imitating(env=CountingEnv, policy_kwargs=None, **keywords):
     """The constructor's defaults but for sizes: with demonstrations there is a habit."""
     env = env if isinstance(env, VecEnv) else DummyVecEnv([env])
     policy_kwargs = {"net_arch": [16, 16], **(policy_kwargs or {})}
-    return ActPC("MlpPolicy", env, demonstrations=demonstrations(), **{**QUICK, **keywords, "policy_kwargs": policy_kwargs})
+    keywords = {"demonstrations": demonstrations(), **QUICK, **keywords, "policy_kwargs": policy_kwargs}
+    return ActPC("MlpPolicy", env, **keywords)
 
 
 def actions_of(model, circuit):
@@ -421,11 +444,13 @@ def test_the_trust_region_is_resized_by_verdicts_once_something_is_learned(paid,
 
 
 @pytest.mark.parametrize(("late", "role"), [(0, "habit"), (1, "candidate")])
-def test_a_candidate_is_taken_once_the_critic_has_pressed_long_enough(late, role, monkeypatch):
+@pytest.mark.parametrize("begun_at", [0, 100])
+def test_a_candidate_is_taken_once_the_critic_has_pressed_long_enough(begun_at, late, role, monkeypatch):
     monkeypatch.setattr(actpc_module, "CANDIDATE_AGE", 7)
     model = imitating(**ONE_CLONE)
     model.pretrain()
-    model._n_updates = model.critic_warmup + 7 + late
+    model.trials.begun_at = begun_at  # with a clone that was accepted late
+    model._n_updates = max(model.critic_warmup, begun_at) + 7 + late
     prove(model, 0.0, 1.0, 0.0, 1.0, 0.0)
     assert model.trials.roles == [role]
 
@@ -436,12 +461,16 @@ def test_a_clone_that_is_accepted_is_where_learning_begins(paid, verdict):
     model = imitating()
     model.learn(30)
     model.trials = Trials(1, imitated_return=1.0, n_clones=3)
-    model._n_updates = 0
+    model._n_updates = 3
     before = [weights_of(model.actor.habit), weights_of(model.actor.circuit)]
-    radius, n_actions = float(model.policy.trust_region.radius), len(model.replay_buffer.actions)
+    region, n_stored = model.policy.trust_region, model.replay_buffer.size()
+    radius = float(region.radius)
+    region.multiplier.fill_(0.7)
+    region.deviation.fill_(0.3)
+    model.policy.spread.fill_(7.0)
     updates, model._warm_up_actor = [], lambda *given, own=model._warm_up_actor: (updates.append(given), own(*given))
     prove(model, 0.0, 0.5, 0.0, 0.5, 0.0)  # noise, the habit, twice, and noise: now a clone is made
-    assert [progress for _, progress in updates] == [k / 5 for k in range(5)] and n_actions == len(model.replay_buffer.actions)
+    assert [progress for _, progress in updates] == [k / 5 for k in range(5)] and n_stored == model.replay_buffer.size() == 30
     clone = weights_of(model.policy.candidate)
     assert not differ(clone, weights_of(updates[-1][0])) and differ(clone, before[0])
     assert not differ(before[1], weights_of(model.actor.circuit)) and model.trials.is_clone and model.trials.n_clones == 2
@@ -451,9 +480,13 @@ def test_a_clone_that_is_accepted_is_where_learning_begins(paid, verdict):
     for circuit, weights in zip(circuits, expected, strict=False):
         assert not differ(weights, weights_of(circuit))
     assert bool(model.actor.circuit.optimizer.state) == (verdict == "rejected")
-    assert float(model.policy.trust_region.radius) == radius
+    assert float(region.radius) == radius
     if verdict == "accepted":
         assert th.allclose(model.policy.spread, spread_of(model._imitation_residuals()), rtol=0.2)  # of other rows
+        assert (float(region.multiplier), float(region.deviation)) == (pytest.approx(FIRST_MULTIPLIER), 0.0)
+        assert model.trials.begun_at == model._n_updates
+    else:
+        assert float(region.multiplier) == pytest.approx(0.7) and model.trials.begun_at == 0
 
 
 @pytest.mark.parametrize(
@@ -468,11 +501,11 @@ def test_what_is_imitated_is_paid_as_its_steps_are_drawn(paid, weighting, imitat
     """Two episodes of five steps; and all the clones but the first may be tried once there is one."""
     data = demonstrations(n_episodes=2, length=5)
     data = dataclasses.replace(data, rewards=np.repeat(paid, 5).astype(np.float32) / 5)
-    for updates, expected in ((3, (pytest.approx(imitated), 2)), (0, (0.0, 0))):
+    for updates, n_clones in ((3, 2), (0, 0)):
         settings = {"refresh_kwargs": {"weighting": weighting, "n_clones": 3}, "actor_warm_start": updates}
         model = ActPC("MlpPolicy", CountingEnv(), demonstrations=data, **{**QUICK, **settings})
         model.pretrain()
-        assert (model.trials.imitated_return, model.trials.n_clones) == expected
+        assert (model.trials.imitated_return, model.trials.n_clones) == (pytest.approx(imitated), n_clones)
 
 
 class Roles(BaseCallback):
@@ -533,7 +566,22 @@ def test_another_environment_may_pay_otherwise():
     assert model.trials.habit_returns
     habit = weights_of(model.actor.habit)
     model.set_env(DummyVecEnv([CountingEnv]))
-    assert model.trials == Trials(1) and not differ(habit, weights_of(model.actor.habit))
+    assert model.trials == Trials(1, imitated_return=model.trials.imitated_return, n_clones=3)
+    assert not differ(habit, weights_of(model.actor.habit))
+
+
+def test_a_loaded_agent_tries_as_many_clones_as_are_left_and_asked_for(tmp_path):
+    model = imitating(refresh_kwargs={"n_clones": 4})
+    model.pretrain()
+    model.trials.n_clones = 2
+    model.save(tmp_path / "agent")
+    left = []
+    for settings in ({}, ONE_CLONE, {"refresh_kwargs": {"n_clones": 9}}, {"actor_warm_start": 0}):
+        again = ActPC.load(tmp_path / "agent", **settings)
+        again.set_env(DummyVecEnv([CountingEnv]))
+        left.append(again.trials.n_clones)
+        assert again.trials.imitated_return == model.trials.imitated_return > 0.0
+    assert left == [2, 0, 2, 0]
 
 
 def test_save_and_load_keep_the_habit_and_what_is_known_of_it(tmp_path):
@@ -596,16 +644,21 @@ def test_random_actions_prove_nothing():
 
 
 @pytest.mark.parametrize("n_envs", [1, 2])
-def test_a_run_stopped_between_verdicts_is_the_run_never_stopped(n_envs, tmp_path, monkeypatch):
+@pytest.mark.parametrize("n_clones", [1, 4])
+def test_a_run_stopped_between_verdicts_is_the_run_never_stopped(n_clones, n_envs, tmp_path, monkeypatch):
+    """Demonstrations that were paid more than the task pays have clones tried."""
     monkeypatch.setattr(habit_module, "PROOF_STEPS", 1)  # every few episodes a verdict
     monkeypatch.setattr(habit_module, "MOST_PROOF_STEPS", 1)
+    data = demonstrations()
+    data = dataclasses.replace(data, rewards=5.0 * data.rewards)
+    settings = {"demonstrations": data, "refresh_kwargs": {"n_clones": n_clones}, "buffer_size": 200}
 
     def make_agent():
-        return imitating(DummyVecEnv([CountingEnv] * n_envs), {"memory_history": 3}, buffer_size=200)
+        return imitating(DummyVecEnv([CountingEnv] * n_envs), {"memory_history": 3}, **settings)
 
     straight = learn_straight(make_agent, tmp_path / "straight", 150)
     resumed = learn_in_two(make_agent, tmp_path / "resumed", 150, stop_at=53)
-    assert straight.trials.generation >= 2
+    assert straight.trials.generation >= 2 and straight.trials.n_clones < n_clones
     assert_same(straight, resumed)
 
 
