@@ -104,7 +104,7 @@ class Trials:
             self.habit_returns = [*self.habit_returns, episode_return][-KEPT_RETURNS:]
             self.habit_proofs, self.habit_steps = self.habit_proofs + 1, self.habit_steps + length
             is_known = len(self.habit_returns) >= N_PROOFS and _is_tried(self.habit_proofs, self.habit_steps)
-            self.tests_habit = not (self.on_trial or (is_known and (has_learned or self.needs_clone())))
+            self.tests_habit = not (is_known and (has_learned or self.needs_clone()))
         if role != "candidate" or self.generations[env] != self.generation:
             return None
         self.candidate_returns.append(episode_return)
