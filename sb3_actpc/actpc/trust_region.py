@@ -46,7 +46,8 @@ class TrustRegion(nn.Module):
         super().__init__()
         self.register_buffer("radius", th.tensor(float(radius)))
         self.register_buffer("deviation", th.tensor(0.0))
-        self.register_buffer("multiplier", th.tensor(FIRST_MULTIPLIER))
+        self.register_buffer("multiplier", th.tensor(0.0))
+        self.begin()
 
     def begin(self) -> None:
         """With an actor that does what its habit does."""
