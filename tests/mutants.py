@@ -426,8 +426,8 @@ MUTANTS = [
     Mutant(
         "what is imitated is paid alike",
         IMITATION,
-        "weights=self.weights if by_return else None",
-        "weights=None",
+        "if is_by_return(parts, weighting) else None",
+        "if False else None",
         f"{HABIT} -k paid_as",
     ),
     Mutant(
@@ -611,8 +611,8 @@ MUTANTS = [
     Mutant(
         "an equally good episode does not enter",
         IMITATION,
-        "episode_return >= self.best_return",
-        "episode_return > self.best_return",
+        "or episode_return >= self.best_return",
+        "or episode_return > self.best_return",
         f"{STORES} -k enters",
     ),
     Mutant("refresh squares returns", IMITATION, "** RETURN_EXPONENT", "** 2", f"{STORES} -k paid"),

@@ -46,7 +46,15 @@ from sb3_actpc.actpc.features import Batch, CircuitInputs
 from sb3_actpc.actpc.habit import Trials
 from sb3_actpc.actpc.policies import POLICIES, ActPCActor, ActPCPolicy, Critics, check_policy, check_policy_kwargs
 from sb3_actpc.actpc.reward_signals import InternalSignals, summed_squared_errors
-from sb3_actpc.actpc.self_imitation import Episodes, Observations, Refresh, map_observations, sample_union
+from sb3_actpc.actpc.self_imitation import (
+    Episodes,
+    Observations,
+    Refresh,
+    imitated_return,
+    is_by_return,
+    map_observations,
+    sample_union,
+)
 from sb3_actpc.actpc.trust_region import spread_of
 from sb3_actpc.checkpoints import Restored, between_updates, load_checkpoint, load_weights, save_weights
 from sb3_actpc.demonstrations import fit_demonstrations
@@ -379,8 +387,6 @@ class ActPC(OffPolicyAlgorithm):
             return  # a trained agent acts without them; ``learn`` says what is missing
         assert isinstance(self.action_space, spaces.Box)
         self.expert = DemonstrationReplay(demonstrations, self.observation_space, self.action_space, self.memory_history)
-        if self.trials is not None:
-            self.trials.imitated_return = self.expert.episodes.imitated_return(self.refresh.weighting)
         if self.observation_normalization == "demonstrations" and not self.pretrained:
             observations = self.inputs.observations(self.expert.episodes.observations)
             self.actor.normalizer.fit(self.inputs.features(observations))
@@ -439,6 +445,9 @@ class ActPC(OffPolicyAlgorithm):
         result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
         self._check_observations(self._last_obs)
         self._follow_demonstrations()
+        memory = None if self.replay_buffer is None else self.replay_buffer.self_imitation
+        if memory is not None:
+            memory.takes_all = self.expert is not None and is_by_return([self.expert.episodes], self.refresh.weighting)
         if self.verbose:
             print(self.describe())
         self.pretrain(between_updates(result[1]), progress_bar)
@@ -606,6 +615,8 @@ class ActPC(OffPolicyAlgorithm):
             self.trials.step(env, float(reward))
             if not done:
                 continue
+            if self.trials.n_clones:
+                self.trials.imitated_return = imitated_return(self._imitated(), self.refresh.weighting)
             pressed_since = max(self.critic_warmup, self.trials.begun_at)
             verdict = self.trials.end(env, has_learned=self._n_updates > pressed_since + CANDIDATE_AGE)
             region, is_paid = self.policy.trust_region, self.trials.habit_return != 0.0

@@ -98,11 +98,6 @@ class Episodes:
         weights = np.add.reduceat(self.weights, np.unique(self.starts))
         return float(weights.sum() ** 2 / max((weights**2).sum(), np.finfo(float).tiny))
 
-    def imitated_return(self, weighting: Weighting) -> float:
-        """Mean return of the episodes that steps are drawn from."""
-        by_return = weighting == "returns" and self.weights.any()
-        return float(np.average(self.returns, weights=self.weights if by_return else None))
-
     def __len__(self) -> int:
         return len(self.actions)
 
@@ -146,11 +141,14 @@ class SelfImitationMemory:
     An episode enters when its sparse return is positive and at least the best return now stored; the oldest leave when the
     capacity is passed. A task that pays negative rewards alone never gets one in: the memory warns of it, once.
 
+    Beside demonstrations that are imitated by returns every paid episode enters (``takes_all``): its return says how often it
+    is imitated. What a clone does from where its own mistakes have led, no demonstration shows.
+
     :param capacity: most transitions kept (an episode longer than that is not stored)
     """
 
     def __init__(self, capacity: int = 100_000) -> None:
-        self.capacity = capacity
+        self.capacity, self.takes_all = capacity, False
         self.returns: list[float] = []
         self.lengths: list[int] = []
         self.episodes: Episodes | None = None
@@ -174,7 +172,8 @@ class SelfImitationMemory:
                 "with replay_buffer_kwargs=dict(self_imitation_size=0)",
                 stacklevel=2,
             )
-        return episode_return > 0.0 and episode_return >= self.best_return and length <= self.capacity
+        is_good = self.takes_all or episode_return >= self.best_return
+        return episode_return > 0.0 and is_good and length <= self.capacity
 
     def store(self, observations: Observations, actions: np.ndarray, episode_return: float) -> None:
         """One whole episode: observations (T, *obs_shape) or a dict of such, actions (T, A), and its sparse return."""
@@ -209,10 +208,23 @@ class SelfImitationMemory:
         self.episodes = None if state["episodes"] is None else Episodes(**state["episodes"])
 
 
+def is_by_return(parts: list[Episodes], weighting: Weighting) -> bool:
+    """Whether steps of the union of ``parts`` are drawn by returns: where the first are not paid, one own episode that is
+    would end their imitation."""
+    return weighting == "returns" and bool(parts[0].cumulative_weights[-1] > 0.0)
+
+
+def imitated_return(parts: list[Episodes], weighting: Weighting) -> float:
+    """Mean return of the episodes that steps of the union of ``parts`` are drawn from."""
+    returns = np.concatenate([part.returns for part in parts])
+    weights = np.concatenate([part.weights for part in parts]) if is_by_return(parts, weighting) else None
+    return float(np.average(returns, weights=weights))
+
+
 def sample_union(parts: list[Episodes], n: int, history: int = 0, weighting: Weighting = "uniform") -> ImitationSamples:
     """``n`` rows drawn from the union of ``parts`` (global NumPy generator, as SB3's buffers); see :class:`Refresh`."""
     parts = [part for part in parts if len(part)]
-    by_return = weighting == "returns" and parts[0].cumulative_weights[-1] > 0.0  # or one own episode would end imitation
+    by_return = is_by_return(parts, weighting)
     if by_return:
         weights = [part.cumulative_weights for part in parts]
         ends = np.cumsum([running[-1] for running in weights])

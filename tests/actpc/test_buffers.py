@@ -119,6 +119,14 @@ def test_an_episode_enters_when_its_return_is_positive_and_at_least_the_best():
     assert list(memory.returns) == [2.0, 2.0, 3.0] and memory.best_return == 3.0 and len(memory) == 15
 
 
+def test_beside_demonstrations_imitated_by_returns_every_paid_episode_enters():
+    memory = SelfImitationMemory(8)
+    memory.takes_all = True
+    assert [offer(memory, 4, paid) for paid in (3.0, 0.0, -1.0, 1.0)] == [True, False, False, True]
+    assert not offer(memory, 9, 5.0) and list(memory.returns) == [3.0, 1.0]
+    assert list(memory.episodes.weights) == [81.0] * 4 + [1.0] * 4  # and the poor one is seldom imitated
+
+
 def test_the_oldest_episodes_leave_when_the_memory_is_full():
     memory = SelfImitationMemory(12)
     for episode_return in (1.0, 2.0, 3.0):

@@ -25,6 +25,7 @@ from sb3_actpc.actpc.habit import (
     SURE,
     Trials,
 )
+from sb3_actpc.actpc.self_imitation import imitated_return
 from sb3_actpc.actpc.trust_region import FIRST_MULTIPLIER, RADIUS_FACTORS, spread_of
 from tests.actpc.agents import QUICK, differ, make, weights_of
 from tests.actpc.envs import CountingEnv, demonstrations
@@ -327,25 +328,22 @@ def test_a_clone_is_needed_where_a_tenth_of_what_is_imitated_is_missing(imitated
     assert trials.needs_clone() == is_needed
 
 
-def test_once_something_is_learned_a_clone_is_tried_after_a_rejected_learner_and_then_the_learner_again():
+def test_clones_come_before_the_learning_actor_as_long_as_one_is_needed():
+    """Whatever was learned; one that is no better costs nothing but its episodes, and then it is the learning actor's turn."""
     trials = Trials(1, imitated_return=100.0, n_clones=2)
     play_clones(trials, 50.0, 50.0, has_learned=True)  # the habit
     kinds = []
-    for paid in (0.0, 0.0, 50.0, 0.0, 0.0):
-        [(role, verdict, is_clone)] = play_clones(trials, paid, has_learned=True)
-        kinds.append(is_clone)
-        while verdict is None:
-            [(role, verdict, again)] = play_clones(trials, paid, has_learned=True)
-            assert not again
-        assert role == "candidate"
+    for _ in range(4):
+        [(role, verdict, is_clone)] = play_clones(trials, 0.0, has_learned=True)
+        assert (role, verdict) == ("candidate", "rejected")
         assert play_clones(trials, 50.0, has_learned=True) == [("habit", None, False)]
-    # a rejected learner, a rejected clone, a learner's tie, another rejected learner, and the last clone
-    assert kinds == [False, True, False, False, True] and trials.n_clones == 0
+        kinds.append(is_clone)
+    assert kinds == [True, True, False, False] and trials.n_clones == 0
 
 
 def test_a_clone_that_is_accepted_late_is_no_candidate_before_it_has_learned_again():
     trials = Trials(1, imitated_return=100.0, n_clones=1)
-    assert play_clones(trials, 50.0, 50.0, 0.0, 50.0, has_learned=True)[-2][1] == "rejected"
+    play_clones(trials, 50.0, 50.0, has_learned=True)  # the habit
     assert [verdict for _, verdict, _ in play_clones(trials, 95.0, 95.0, has_learned=True)] == [None, "accepted"]
     assert play_clones(trials, 95.0, 95.0, 95.0, has_learned=False) == [("habit", None, False)] * 3
     assert play_clones(trials, 95.0, 95.0, has_learned=True) == [("habit", None, False), ("candidate", None, False)]
@@ -505,7 +503,38 @@ def test_what_is_imitated_is_paid_as_its_steps_are_drawn(paid, weighting, imitat
         settings = {"refresh_kwargs": {"weighting": weighting, "n_clones": 3}, "actor_warm_start": updates}
         model = ActPC("MlpPolicy", CountingEnv(), demonstrations=data, **{**QUICK, **settings})
         model.pretrain()
-        assert (model.trials.imitated_return, model.trials.n_clones) == (pytest.approx(imitated), n_clones)
+        assert imitated_return(model._imitated(), weighting) == pytest.approx(imitated)
+        assert model.trials.n_clones == n_clones
+
+
+def test_what_is_imitated_counts_own_episodes_too():
+    """As soon as one has ended: the demonstrated ones are paid 1 each, the agent's own of nine steps 3."""
+    model = imitating(lambda: CountingEnv(returns=(0.0, 3.0)))
+    model.learn(14)  # episodes of five and nine steps
+    demonstrated, own = (part.returns for part in model._imitated())
+    assert set(own) == {3.0} and len(own) == 9 and set(demonstrated) == {1.0}
+    expected = (len(demonstrated) * 1.0 + 9 * 3.0**5) / (len(demonstrated) * 1.0 + 9 * 3.0**4)
+    assert model.trials.imitated_return == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(
+    ("paid", "weighting", "takes_all"), [(1.0, "returns", True), (0.0, "returns", False), (1.0, "uniform", False)]
+)
+def test_every_paid_episode_enters_where_imitation_goes_by_returns(paid, weighting, takes_all):
+    """Elsewhere all steps count alike, and the best alone are worth it (the paper)."""
+    data = demonstrations(n_episodes=2, length=5)
+    data = dataclasses.replace(data, rewards=np.full(10, paid, np.float32))
+    model = ActPC("MlpPolicy", CountingEnv(), demonstrations=data, **{**QUICK, "refresh_kwargs": {"weighting": weighting}})
+    model.learn(60)  # episodes paid 0, 1, 0 and 2 in turn
+    memory = model.replay_buffer.self_imitation
+    assert memory.takes_all == takes_all
+    assert (1.0 in memory.returns[1:]) == takes_all
+
+
+def test_without_demonstrations_the_best_own_episodes_alone_are_imitated():
+    model = ActPC("MlpPolicy", CountingEnv(), **{k: v for k, v in QUICK.items() if k != "actor_warm_start"})
+    model.learn(20)
+    assert not model.replay_buffer.self_imitation.takes_all
 
 
 class Roles(BaseCallback):
@@ -580,7 +609,6 @@ def test_a_loaded_agent_tries_as_many_clones_as_are_left_and_asked_for(tmp_path)
         again = ActPC.load(tmp_path / "agent", **settings)
         again.set_env(DummyVecEnv([CountingEnv]))
         left.append(again.trials.n_clones)
-        assert again.trials.imitated_return == model.trials.imitated_return > 0.0
     assert left == [2, 0, 2, 0]
 
 
