@@ -116,7 +116,7 @@ class ActPC(OffPolicyAlgorithm):
     :param action_noise: SB3's exploration noise, in the place of ``exploration_noise``
     :param replay_buffer_class: None, or one of SB3's classes or its name (its ActPC counterpart is used)
     :param replay_buffer_kwargs: keywords of the buffer: ``combined`` (True: the newest transition of every environment is in
-        every batch) and ``self_imitation_size`` (100,000 transitions in the memory of the agent's own best episodes; 0 for
+        every batch) and ``self_imitation_size`` (100,000 transitions in the memory of the agent's own good episodes; 0 for
         none), and those of SB3's class
     :param optimize_memory_usage: as in SB3
     :param n_steps: length of n-step returns; 1 by default where they cannot be had (hindsight, ``optimize_memory_usage``)
@@ -133,9 +133,9 @@ class ActPC(OffPolicyAlgorithm):
     :param prior_updates: updates of the prior on the demonstrations before learning starts; then it is frozen
     :param actor_warm_start: updates of the actor on the demonstrations before learning starts, with learning rates that fall
         from ``WARM_START_RATES[0]`` to ``[1]``
-    :param refresh_weight: weight of the actor's refresh from the demonstrations and its own best episodes
+    :param refresh_weight: weight of the actor's refresh from the demonstrations and its own good episodes
     :param refresh_kwargs: keywords of :class:`~sb3_actpc.actpc.self_imitation.Refresh`, for refresh and warm start:
-        ``weighting`` (by "returns"; the paper's is "uniform"), ``noise`` and ``n_clones``
+        ``weighting`` (by "returns"; the paper's is "uniform"), ``own_episodes``, ``noise`` and ``n_clones``
     :param demonstration_fraction: share of the critic's batch that comes from the demonstrations
     :param alpha_ep: weight of the epistemic signal
     :param alpha_in: weight of the instrumental signal
@@ -447,7 +447,8 @@ class ActPC(OffPolicyAlgorithm):
         self._follow_demonstrations()
         memory = None if self.replay_buffer is None else self.replay_buffer.self_imitation
         if memory is not None:
-            memory.takes_all = self.expert is not None and is_by_return([self.expert.episodes], self.refresh.weighting)
+            is_weighted = self.expert is not None and is_by_return([self.expert.episodes], self.refresh.weighting)
+            memory.takes_all = is_weighted and self.refresh.own_episodes == "paid"
         if self.verbose:
             print(self.describe())
         self.pretrain(between_updates(result[1]), progress_bar)

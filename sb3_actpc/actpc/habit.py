@@ -35,8 +35,8 @@ class Trials:
     After a candidate that did not prove itself the habit plays again: what made it the habit was partly luck.
 
     Clones of the same demonstrations can do very differently, by their first synapses alone. So while the habit is paid less
-    than what it imitates, by more than ``SHORTFALL`` of it, further clones are candidates: before anything is learned, and
-    after a rejected learner. One that is accepted is where learning begins anew.
+    than what it imitates, by more than ``SHORTFALL`` of it, further clones are candidates, and the learning actor waits. One
+    that is accepted is where learning begins anew.
 
     :param n_envs: environments, each with an episode of its own
     """

@@ -30,6 +30,9 @@ class Refresh:
         easy ones are imitated most
     :param noise: standard deviation of Gaussian noise on the features (normalised observations), not on the working memory's;
         against overfitting to few demonstrations. 0 for none (the paper)
+    :param own_episodes: which of them are imitated too: "paid" (every one, as often as its return says; "best" where steps are
+        not drawn by returns, or nothing is demonstrated) or "best" (those that are paid at least what the best one was: the
+        paper)
     :param n_clones: clones that are tried at most, the first included, while the habit is paid less than nine tenths of what
         it imitates (:mod:`sb3_actpc.actpc.habit`): returns of environment and demonstrations must be of one scale. 1 for the
         warm-started actor alone (the paper); without a habit or a warm start there are no others
@@ -41,9 +44,10 @@ class Refresh:
         self,
         weighting: Weighting = "returns",
         noise: Weight = 0.0,
+        own_episodes: Literal["paid", "best"] = "paid",
         n_clones: Annotated[int, Between(1)] = 4,
     ) -> None:
-        self.weighting, self.noise, self.n_clones = weighting, noise, n_clones
+        self.weighting, self.noise, self.own_episodes, self.n_clones = weighting, noise, own_episodes, n_clones
 
 
 class ImitationSamples(NamedTuple):

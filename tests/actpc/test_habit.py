@@ -518,13 +518,19 @@ def test_what_is_imitated_counts_own_episodes_too():
 
 
 @pytest.mark.parametrize(
-    ("paid", "weighting", "takes_all"), [(1.0, "returns", True), (0.0, "returns", False), (1.0, "uniform", False)]
+    ("paid", "refresh", "takes_all"),
+    [
+        (1.0, {}, True),
+        (0.0, {}, False),
+        (1.0, {"weighting": "uniform"}, False),
+        (1.0, {"own_episodes": "best"}, False),
+    ],
 )
-def test_every_paid_episode_enters_where_imitation_goes_by_returns(paid, weighting, takes_all):
+def test_every_paid_episode_enters_where_imitation_goes_by_returns(paid, refresh, takes_all):
     """Elsewhere all steps count alike, and the best alone are worth it (the paper)."""
     data = demonstrations(n_episodes=2, length=5)
     data = dataclasses.replace(data, rewards=np.full(10, paid, np.float32))
-    model = ActPC("MlpPolicy", CountingEnv(), demonstrations=data, **{**QUICK, "refresh_kwargs": {"weighting": weighting}})
+    model = ActPC("MlpPolicy", CountingEnv(), demonstrations=data, **{**QUICK, "refresh_kwargs": refresh})
     model.learn(60)  # episodes paid 0, 1, 0 and 2 in turn
     memory = model.replay_buffer.self_imitation
     assert memory.takes_all == takes_all
