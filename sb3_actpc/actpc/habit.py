@@ -35,8 +35,8 @@ class Trials:
     After a candidate that did not prove itself the habit plays again: what made it the habit was partly luck.
 
     Clones of the same demonstrations can do very differently, by their first synapses alone. So while the habit is paid less
-    than what it imitates, by more than ``SHORTFALL`` of it, further clones are candidates, and the learning actor waits. One
-    that is accepted is where learning begins anew.
+    than what it imitates, by more than ``SHORTFALL`` of it, further clones are candidates: before anything is learned, and
+    after a rejected learner. One that is accepted is where learning begins anew.
 
     :param n_envs: environments, each with an episode of its own
     """
@@ -58,6 +58,7 @@ class Trials:
     on_trial: bool = False  # there is a candidate that is not judged yet
     is_clone: bool = False  # it is one, not the learning actor's average
     has_learned: bool = False
+    learner_was_rejected: bool = False  # the last candidate was one
     tests_habit: bool = True  # before the next candidate: its return must be known, or known better
 
     def __post_init__(self) -> None:
@@ -77,8 +78,9 @@ class Trials:
 
     def needs_clone(self) -> bool:
         """Whether the next candidate is a clone."""
+        is_due = self.learner_was_rejected or not self.has_learned
         least = self.imitated_return - SHORTFALL * abs(self.imitated_return)
-        return self.n_clones > 0 and self.habit_return < least
+        return is_due and self.n_clones > 0 and self.habit_return < least
 
     def step(self, env: int, reward: float) -> None:
         """:param env: which environment
@@ -143,6 +145,7 @@ class Trials:
             verdict, self.habit_returns = "accepted", own[-KEPT_RETURNS:]
             # what the old habit has begun elsewhere is no return of the new one
             self.roles = ["actor" if role == "habit" else role for role in self.roles]
+        self.learner_was_rejected = verdict == "rejected" and not self.is_clone
         self.tests_habit = verdict != "accepted"
         self.candidate_returns, self.candidate_steps, self.on_trial = [], 0, False
         self.habit_proofs, self.habit_steps = 0, 0

@@ -45,7 +45,7 @@ class Refresh:
         weighting: Weighting = "returns",
         noise: Weight = 0.0,
         own_episodes: Literal["paid", "best"] = "paid",
-        n_clones: Annotated[int, Between(1)] = 4,
+        n_clones: Annotated[int, Between(1)] = 6,
     ) -> None:
         self.weighting, self.noise, self.own_episodes, self.n_clones = weighting, noise, own_episodes, n_clones
 

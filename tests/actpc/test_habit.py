@@ -328,22 +328,25 @@ def test_a_clone_is_needed_where_a_tenth_of_what_is_imitated_is_missing(imitated
     assert trials.needs_clone() == is_needed
 
 
-def test_clones_come_before_the_learning_actor_as_long_as_one_is_needed():
-    """Whatever was learned; one that is no better costs nothing but its episodes, and then it is the learning actor's turn."""
+def test_once_something_is_learned_a_clone_is_tried_after_a_rejected_learner_and_then_the_learner_again():
     trials = Trials(1, imitated_return=100.0, n_clones=2)
     play_clones(trials, 50.0, 50.0, has_learned=True)  # the habit
     kinds = []
-    for _ in range(4):
-        [(role, verdict, is_clone)] = play_clones(trials, 0.0, has_learned=True)
-        assert (role, verdict) == ("candidate", "rejected")
-        assert play_clones(trials, 50.0, has_learned=True) == [("habit", None, False)]
+    for paid in (0.0, 0.0, 50.0, 0.0, 0.0):
+        [(role, verdict, is_clone)] = play_clones(trials, paid, has_learned=True)
         kinds.append(is_clone)
-    assert kinds == [True, True, False, False] and trials.n_clones == 0
+        while verdict is None:
+            [(role, verdict, again)] = play_clones(trials, paid, has_learned=True)
+            assert not again
+        assert role == "candidate"
+        assert play_clones(trials, 50.0, has_learned=True) == [("habit", None, False)]
+    # a rejected learner, a rejected clone, a learner's tie, another rejected learner, and the last clone
+    assert kinds == [False, True, False, False, True] and trials.n_clones == 0
 
 
 def test_a_clone_that_is_accepted_late_is_no_candidate_before_it_has_learned_again():
     trials = Trials(1, imitated_return=100.0, n_clones=1)
-    play_clones(trials, 50.0, 50.0, has_learned=True)  # the habit
+    assert play_clones(trials, 50.0, 50.0, 0.0, 50.0, has_learned=True)[-2][1] == "rejected"
     assert [verdict for _, verdict, _ in play_clones(trials, 95.0, 95.0, has_learned=True)] == [None, "accepted"]
     assert play_clones(trials, 95.0, 95.0, 95.0, has_learned=False) == [("habit", None, False)] * 3
     assert play_clones(trials, 95.0, 95.0, has_learned=True) == [("habit", None, False), ("candidate", None, False)]
@@ -601,7 +604,7 @@ def test_another_environment_may_pay_otherwise():
     assert model.trials.habit_returns
     habit = weights_of(model.actor.habit)
     model.set_env(DummyVecEnv([CountingEnv]))
-    assert model.trials == Trials(1, imitated_return=model.trials.imitated_return, n_clones=3)
+    assert model.trials == Trials(1, imitated_return=model.trials.imitated_return, n_clones=5)
     assert not differ(habit, weights_of(model.actor.habit))
 
 
