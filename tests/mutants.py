@@ -615,6 +615,21 @@ MUTANTS = [
         "or episode_return > self.best_return",
         f"{STORES} -k enters",
     ),
+    Mutant("own episodes below the best stay out", IMITATION, "self.takes_all or ", "", f"{STORES} -k enters"),
+    Mutant(
+        "own episodes count for nothing",
+        AGENT,
+        "imitated_return(self._imitated(), ",
+        "imitated_return(self._imitated()[:1], ",
+        f"{HABIT} -k own_episodes_too",
+    ),
+    Mutant(
+        "poor own episodes are imitated like good ones",
+        AGENT,
+        "memory.takes_all = is_weighted and",
+        "memory.takes_all = is_weighted or",
+        f"{HABIT} -k every_paid",
+    ),
     Mutant("refresh squares returns", IMITATION, "** RETURN_EXPONENT", "** 2", f"{STORES} -k paid"),
     Mutant("lost returns weigh", IMITATION, "np.maximum(self.returns, 0.0)", "np.abs(self.returns)", f"{STORES} -k paid"),
     Mutant(
