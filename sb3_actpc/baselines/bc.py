@@ -1,7 +1,5 @@
 """Behaviour cloning, with and without a memory, as Stable-Baselines3 algorithms."""
 
-from __future__ import annotations
-
 from typing import Any, ClassVar
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The networks of behaviour cloning: normalised observations in, actions out, with or without a memory."""
 
-from __future__ import annotations
-
 from abc import abstractmethod
 from typing import Annotated, Any, Literal
 

@@ -1,7 +1,5 @@
 """What baselines share: demonstrations that fit the task, and, off policy, a share of them in every batch."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """SB3's replay buffers with a share of demonstrations in every batch, for any SB3 off-policy algorithm."""
 
-from __future__ import annotations
-
 from operator import itemgetter
 from typing import Any, ClassVar
 

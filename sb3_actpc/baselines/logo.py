@@ -1,7 +1,5 @@
 """LOGO: TRPO on the sparse reward, then a second trust-region step towards the demonstrations."""
 
-from __future__ import annotations
-
 import copy
 from collections import deque
 from functools import partial

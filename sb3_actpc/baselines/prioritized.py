@@ -1,7 +1,5 @@
 """Hindsight replay with priorities (Schaul et al., arXiv 1511.05952; Andrychowicz et al., arXiv 1707.01495)."""
 
-from __future__ import annotations
-
 from typing import Any, ClassVar
 
 import numpy as np

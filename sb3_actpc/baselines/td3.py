@@ -1,7 +1,5 @@
 """TD3 and DDPG with demonstrations; actor and critic have rates, optimisers and target rates of their own, as in the paper."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Iterable
 from typing import Any

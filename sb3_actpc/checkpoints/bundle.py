@@ -1,7 +1,5 @@
 """The folder of a checkpoint: written under a temporary name, hashed, renamed when whole, checked when read."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

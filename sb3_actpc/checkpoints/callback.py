@@ -1,7 +1,5 @@
 """Checkpoints while an SB3 algorithm learns, and going on from them."""
 
-from __future__ import annotations
-
 import os
 import tempfile
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Plain values to JSON and arrays, and back: what a checkpoint can hold without running code when it is read."""
 
-from __future__ import annotations
-
 import math
 import random
 import types

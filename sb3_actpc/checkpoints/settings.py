@@ -1,7 +1,5 @@
 """Constructor settings as plain values. Classes go by their names; reading one runs no code and imports nothing."""
 
-from __future__ import annotations
-
 import os
 import sys
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """Environments in the middle of an episode: simulator, wrappers' counters and generators, as plain data."""
 
-from __future__ import annotations
-
 import importlib
 from typing import Any
 

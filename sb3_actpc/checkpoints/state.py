@@ -1,7 +1,5 @@
 """What a checkpoint holds of an SB3 algorithm, and how it is put back."""
 
-from __future__ import annotations
-
 import inspect
 import random
 import warnings

@@ -1,7 +1,5 @@
 """The command ``sb3-actpc``. Sub-commands import what they need when they run, so that ``--help`` is quick."""
 
-from __future__ import annotations
-
 import argparse
 import importlib
 import pkgutil

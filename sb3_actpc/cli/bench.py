@@ -1,8 +1,6 @@
 """``sb3-actpc bench``: what one update costs, as ratios to SB3's TD3 and to the matrix products alone; by choice also what a
 step of training or acting costs, and growth with sizes; with ``--robosuite``, robosuite tasks over robosuite's own loop."""
 
-from __future__ import annotations
-
 import argparse
 import json
 from pathlib import Path

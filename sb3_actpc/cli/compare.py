@@ -1,7 +1,5 @@
 """``sb3-actpc compare``: many runs, brought to their end however often they are stopped."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 from pathlib import Path
@@ -13,7 +11,7 @@ if TYPE_CHECKING:
     from sb3_actpc.experiments.comparison.schedule import Summary
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
     """Add the sub-command."""
     parser = subparsers.add_parser(
         "compare",
@@ -72,7 +70,7 @@ def _given(args: argparse.Namespace) -> dict[str, Any]:
     return {**from_file, **options}
 
 
-def _conclude(summary: Summary, folder: Path) -> int:
+def _conclude(summary: "Summary", folder: Path) -> int:
     """The last lines, and the exit code."""
     from sb3_actpc.checkpoints import EXIT_STOPPED
 

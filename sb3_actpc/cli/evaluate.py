@@ -1,12 +1,10 @@
 """``sb3-actpc evaluate``: replay a trained agent, with a video where the machine can render."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
     """Add the sub-command."""
     parser = subparsers.add_parser(
         "evaluate",

@@ -1,12 +1,10 @@
 """``sb3-actpc examine``: whether the critic of a trained agent is worth following."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
     """Add the sub-command."""
     parser = subparsers.add_parser(
         "examine",

@@ -1,13 +1,11 @@
 """``sb3-actpc report``: what a comparison has come to."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 from pathlib import Path
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
     """Add the sub-command."""
     parser = subparsers.add_parser(
         "report",

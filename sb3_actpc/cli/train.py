@@ -1,7 +1,5 @@
 """``sb3-actpc train``: train an agent and watch it being evaluated."""
 
-from __future__ import annotations
-
 import argparse
 import shlex
 import sys
@@ -14,7 +12,7 @@ if TYPE_CHECKING:
     from sb3_actpc.experiments.runs import Run
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
     """Add the sub-command."""
     parser = subparsers.add_parser(
         "train",
@@ -77,7 +75,7 @@ def _check_only_resume(args: argparse.Namespace) -> None:
         raise ValueError(f"{option} cannot be given with --resume: the run goes on with its own settings, leave it out")
 
 
-def _run(args: argparse.Namespace) -> Run:
+def _run(args: argparse.Namespace) -> "Run":
     from sb3_actpc.experiments.runs import Run
     from sb3_actpc.experiments.runs.presets import parse_assignments
 

@@ -18,8 +18,6 @@ rl_zoo3 gives its training and its evaluation environments one seed, so that an 
 trained on; here the evaluation has another, as in ``sb3-actpc train``.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import sys
@@ -47,7 +45,7 @@ LOG_FOLDER = "logs"  # rl_zoo3's own default when it trains
 NET_ARCHS = {"small": [64, 64], "medium": [256, 256], "big": [400, 300]}
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
     """Add the sub-command."""
     parser = subparsers.add_parser(
         "zoo",

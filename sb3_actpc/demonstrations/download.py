@@ -1,7 +1,5 @@
 """Fetching robomimic's human demonstrations."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Demonstrations as an environment would have shown them, and as the rows of a buffer."""
 
-from __future__ import annotations
-
 import dataclasses
 import os
 import re
@@ -52,7 +50,7 @@ def _here(path: Path) -> Path:
 
 def fit_demonstrations(
     source: str | os.PathLike[str] | Demonstrations,
-    env: VecEnv | None,
+    env: "VecEnv | None",
     observation_space: spaces.Space[Any],
     action_space: spaces.Space[Any],
     n_episodes: int | None = None,

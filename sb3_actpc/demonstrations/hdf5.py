@@ -1,7 +1,5 @@
 """Opening other projects' HDF5 files so that every mistake in them is named: file, demonstration, key."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

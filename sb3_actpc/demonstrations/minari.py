@@ -1,7 +1,5 @@
 """Exchange with Minari, the Farama Foundation's format of offline data sets; episodes as arrays, in and out."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any

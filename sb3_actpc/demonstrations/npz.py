@@ -1,7 +1,5 @@
 """The ``.npz`` file format of demonstrations: compressed, without pickles, every mistake in a file named."""
 
-from __future__ import annotations
-
 import io
 import json
 import os

@@ -4,8 +4,6 @@ Layout: ``data`` (attribute ``env_args``, JSON), ``data/demo_i/{actions,rewards,
 and ``mask/<filter key>``, the names of some of the demonstrations.
 """
 
-from __future__ import annotations
-
 import io
 import json
 import os

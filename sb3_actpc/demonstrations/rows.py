@@ -1,7 +1,5 @@
 """Between the observations of an environment and rows of numbers; how a wrong field of demonstrations is named."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -4,8 +4,6 @@
 six people, two worse, two okay and two better, 50 demonstrations each) can be made.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass
@@ -85,7 +83,7 @@ class Skill:
     tolerance: float
 
     @classmethod
-    def of(cls, proficiency: float) -> Skill:
+    def of(cls, proficiency: float) -> "Skill":
         """Of a proficiency in [0, 1]."""
         if isinstance(proficiency, bool) or not isinstance(proficiency, int | float) or not 0.0 <= proficiency <= 1.0:
             raise ValueError(f"proficiency={proficiency!r} must be a number from 0 (clumsy) to 1 (sure), or 'mixed'")

@@ -9,8 +9,6 @@ the control step (robosuite's lag behind by one simulation step, 2 ms, and the c
 step); the random numbers are Gymnasium's.
 """
 
-from __future__ import annotations
-
 import logging
 import os
 from collections.abc import Iterator

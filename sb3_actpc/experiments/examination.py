@@ -5,8 +5,6 @@ respect to the action, against it, at random, or towards the action of the neare
 then played without noise. A critic that is worth following ranks the moved actions as the returns do.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """What ``sb3-actpc bench`` measures, as ratios: updates, a settling, steps of training, acting, growth with sizes, memory."""
 
-from __future__ import annotations
-
 import copy
 import json
 import statistics

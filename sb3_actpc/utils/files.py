@@ -1,7 +1,5 @@
 """Writing files so that a reader never meets half of one."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import uuid

@@ -1,7 +1,5 @@
 """Virtual environments of packages that pin other versions than this one does: ``sb3-actpc baselines install NAME``."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -1,7 +1,5 @@
 """A program of :mod:`sb3_actpc.baselines.offline.servers`, in its own virtual environment, asked through a pipe."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import tempfile

@@ -5,8 +5,6 @@ packages pin other versions than this one. Demonstrations go in and actions come
 (:mod:`sb3_actpc.baselines.offline.servers.frames`), so the episodes are played here, in our environments.
 """
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
@@ -34,7 +32,7 @@ class ServedPolicy(BasePolicy):
     """A policy whose actions another process chooses. ``predict`` takes and returns that process's state as SB3's recurrent
     ``state``, arrays with a row for each environment; None where the method has none."""
 
-    owner: ServedAlgorithm
+    owner: "ServedAlgorithm"
 
     def __init__(self, observation_space: spaces.Space, action_space: spaces.Box, lr_schedule: Schedule) -> None:
         super().__init__(observation_space, action_space, squash_output=True)

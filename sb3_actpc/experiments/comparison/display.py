@@ -1,7 +1,5 @@
 """How a comparison goes on, live in a terminal, line by line elsewhere; and what it consists of."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from statistics import median
 
@@ -32,7 +30,7 @@ class Display:
         self._bars: dict[str, TaskID] = {}
         self._steps: dict[str, int] = {}  # done by this command or before
 
-    def __enter__(self) -> Display:
+    def __enter__(self) -> "Display":
         self.progress.start()
         return self
 

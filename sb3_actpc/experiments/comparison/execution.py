@@ -1,7 +1,5 @@
 """One run of a comparison in the present process: begun, gone on with, or found finished; and what came of it."""
 
-from __future__ import annotations
-
 import errno
 import json
 import time

@@ -1,7 +1,5 @@
 """From tasks, algorithms and seeds to a list of runs, each with an id made from its content and a folder of its own."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any

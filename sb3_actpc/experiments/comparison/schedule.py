@@ -1,7 +1,5 @@
 """From the table to finished runs: which are begun, gone on with, tried again or left alone."""
 
-from __future__ import annotations
-
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field

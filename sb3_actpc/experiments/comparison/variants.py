@@ -1,7 +1,5 @@
 """Named ways of running an algorithm: each is a part of a :class:`~sb3_actpc.experiments.runs.Run`."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What each part of ActPC is worth: the base with every part beside the runs without each in turn."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

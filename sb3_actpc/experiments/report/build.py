@@ -1,7 +1,5 @@
 """The report of a comparison: tables, figures and a CSV file made from the folders of its runs, without any training."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from itertools import combinations
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A comparison in a few small files."""
 
-from __future__ import annotations
-
 import gzip
 import json
 from pathlib import Path

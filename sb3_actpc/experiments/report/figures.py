@@ -1,7 +1,5 @@
 """The figures of a report: curves with 95 % intervals, profiles, bars. Every legend stands beside the axes or below them."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any

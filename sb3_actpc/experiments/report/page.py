@@ -1,7 +1,5 @@
 """A report as a list of sections, written as Markdown and as one HTML file that needs nothing else."""
 
-from __future__ import annotations
-
 import base64
 from collections.abc import Sequence
 from dataclasses import dataclass

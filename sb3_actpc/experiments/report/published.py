@@ -22,8 +22,6 @@ runs from a source tree with uncommitted changes. The variants ``demonstrators``
 everywhere.
 """
 
-from __future__ import annotations
-
 import re
 from functools import cache
 from pathlib import Path

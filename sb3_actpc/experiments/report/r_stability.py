@@ -10,8 +10,6 @@ What follows from the formula, and is not mended here: it divides by the best re
 beside a best of -2 gives 3). A poor agent that is always equally poor gets a good value.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

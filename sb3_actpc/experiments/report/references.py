@@ -3,8 +3,6 @@
 ``python benchmarks/reference_scores.py`` measures the latter two again.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What the runs of a comparison have measured, as tables: read from their folders, or from the small files of an export."""
 
-from __future__ import annotations
-
 import io
 import math
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """Tables as Markdown, and numbers as their cells."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The algorithms by name, and what their constructors take."""
 
-from __future__ import annotations
-
 import importlib
 from collections.abc import Mapping
 from typing import Any

@@ -1,7 +1,5 @@
 """``episodes.csv``: every episode of the training, written as it ends."""
 
-from __future__ import annotations
-
 import csv
 import zlib
 from collections.abc import Callable

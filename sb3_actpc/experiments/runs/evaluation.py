@@ -1,7 +1,5 @@
 """Playing whole episodes with a trained policy, and doing so every so often while it is trained."""
 
-from __future__ import annotations
-
 import csv
 import time
 from collections import Counter

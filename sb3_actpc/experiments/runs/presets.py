@@ -1,7 +1,5 @@
 """Files of settings, and what they make of a run: everything that is not said comes from the preset."""
 
-from __future__ import annotations
-
 import copy
 import re
 from collections.abc import Iterable, Mapping

@@ -1,7 +1,5 @@
 """The two JSON files of a run folder: ``config.json``, the run itself, and ``result.json``, written last."""
 
-from __future__ import annotations
-
 import csv
 import json
 from pathlib import Path

@@ -1,7 +1,5 @@
 """One training run and its folder, and the replay of a finished one."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Sequence
 from contextlib import ExitStack

@@ -5,8 +5,6 @@ among others, and the filled one is what ``config.json`` holds, what goes to a w
 A part of a run (an entry of a comparison's file, say) is a :class:`Run` too; :func:`merged` puts parts together.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """A video of one episode, or a strip of pictures, where the machine can render."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """BCQ and CQL by d3rlpy, in d3rlpy's own virtual environment (see :mod:`sb3_actpc.baselines.offline.served`)."""
 
-from __future__ import annotations
-
 import io
 import random
 import sys

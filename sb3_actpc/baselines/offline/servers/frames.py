@@ -3,8 +3,6 @@
 Nothing is unpickled. The standard library and numpy are enough to read it.
 """
 
-from __future__ import annotations
-
 import io
 import json
 import sys

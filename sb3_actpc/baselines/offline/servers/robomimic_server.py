@@ -4,8 +4,6 @@ The observation is one low-dimensional key, ``flat``. Sequences are drawn as rob
 any transition on, the last one repeated beyond the end of the episode.
 """
 
-from __future__ import annotations
-
 import io
 import random
 import sys

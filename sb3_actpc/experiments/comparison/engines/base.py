@@ -1,7 +1,5 @@
 """What every engine does."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Protocol
 

@@ -1,7 +1,5 @@
 """Runs as tasks of a Ray cluster (extra ``ray``); their folders end up on this machine, shared or not."""
 
-from __future__ import annotations
-
 import io
 import os
 import socket

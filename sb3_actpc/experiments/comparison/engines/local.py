@@ -1,7 +1,5 @@
 """Runs in processes of this machine, each with its own interpreter."""
 
-from __future__ import annotations
-
 import json
 import os
 import queue
