@@ -90,13 +90,14 @@ class Bundle:
         """Environment steps of the run until then."""
         return int(self.manifest["num_timesteps"])
 
-    def verify(self) -> None:
-        """:raises DamagedCheckpoint: naming the first file that is missing or not what was written"""
+    def verify(self) -> "Bundle":
+        """The checkpoint itself; DamagedCheckpoint names the first file that is missing or not what was written."""
         for name, digest in self.manifest["files"].items():
             if not (self.path / name).is_file():
                 raise DamagedCheckpoint(f"{self.path}: {name} is missing")
             if _hash_file(self.path / name) != digest:
                 raise DamagedCheckpoint(f"{self.path}: {name} does not have the recorded SHA-256")
+        return self
 
     def read_bytes(self, name: str) -> bytes:
         """A file's content."""
@@ -132,13 +133,13 @@ def write_bundle(folder: Path, num_timesteps: int, keep: int, manifest: Mapping[
             writer.add_json(MANIFEST, {**record, "sha256": _manifest_hash(record)})
             writer.files()
         _sync_folder(temporary)
-        numbers = [number for number, _ in _list(folder)]
-        os.replace(temporary, folder / f"{max(numbers, default=0) + 1:06d}_step_{num_timesteps}")
+        number = 1 + max(map(_number, list_bundles(folder)), default=0)
+        os.replace(temporary, folder / f"{number:06d}_step_{num_timesteps}")
         _sync_folder(folder)
     except BaseException:
         shutil.rmtree(temporary, ignore_errors=True)
         raise
-    for _, old in _list(folder)[:-keep]:  # renamed first: a bundle never has its name while half of it is gone
+    for old in list_bundles(folder)[:-keep]:  # renamed first: a bundle never has its name while half of it is gone
         doomed = folder / f"{_TEMPORARY}{uuid.uuid4().hex[:12]}"
         os.replace(old, doomed)
         shutil.rmtree(doomed, ignore_errors=True)
@@ -146,7 +147,8 @@ def write_bundle(folder: Path, num_timesteps: int, keep: int, manifest: Mapping[
 
 def list_bundles(folder: str | os.PathLike[str]) -> list[Path]:
     """Folders of all checkpoints of a run, oldest first; empty when there are none."""
-    return [path for _, path in _list(Path(folder))]
+    found = Path(folder).glob("*_step_*")
+    return sorted((path for path in found if _NAME.fullmatch(path.name) and path.is_dir()), key=_number)
 
 
 def find_bundle(path: str | os.PathLike[str], report: Report = warn) -> Bundle:
@@ -162,30 +164,21 @@ def find_bundle(path: str | os.PathLike[str], report: Report = warn) -> Bundle:
     path = Path(path)
     bundles = list_bundles(path)
     if not bundles and (path / MANIFEST).exists():
-        return _verified(path)
+        return Bundle(path).verify()
     if not bundles:
         if _NAME.fullmatch(path.name) and path.is_dir():
             raise DamagedCheckpoint(f"{path}: {MANIFEST} is missing")
         raise FileNotFoundError(f"no checkpoint in {path}")
     for candidate in reversed(bundles):
         try:
-            return _verified(candidate)
+            return Bundle(candidate).verify()
         except DamagedCheckpoint as error:
             report(f"damaged checkpoint skipped: {error}")
     raise DamagedCheckpoint(f"{path}: all of its {len(bundles)} checkpoints are damaged")
 
 
-def _verified(path: Path) -> Bundle:
-    bundle = Bundle(path)
-    bundle.verify()
-    return bundle
-
-
-def _list(folder: Path) -> list[tuple[int, Path]]:
-    if not folder.is_dir():
-        return []
-    matches = [(_NAME.fullmatch(entry.name), entry) for entry in folder.iterdir()]
-    return sorted((int(match.group(1)), entry) for match, entry in matches if match and entry.is_dir())
+def _number(path: Path) -> int:
+    return int(path.name.partition("_")[0])
 
 
 def _read_manifest(path: Path) -> dict[str, Any]:

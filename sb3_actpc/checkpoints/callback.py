@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EventCallback
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.type_aliases import MaybeCallback
@@ -212,15 +212,12 @@ def continue_learning(restored: Restored, callback: MaybeCallback = None, **opti
 
 def callback_tree(callback: Any) -> list[BaseCallback]:
     """A callback and all in it, lists left out, in the order in which they are called."""
-    if callback is None or not isinstance(callback, BaseCallback):
+    if isinstance(callback, CallbackList):
+        return [one for child in callback.callbacks for one in callback_tree(child)]
+    if not isinstance(callback, BaseCallback):
         return []
-    children = callback.callbacks if isinstance(callback, CallbackList) else []
-    if isinstance(callback, EventCallback) and callback.callback is not None:
-        children = [callback.callback]
-    # SB3's EvalCallback has two
-    after = getattr(callback, "callback_on_new_best", None)
-    own = [] if isinstance(callback, CallbackList) else [callback]
-    return [*own, *(one for child in [*children, after] for one in callback_tree(child))]
+    children = [getattr(callback, name, None) for name in ("callback", "callback_on_new_best")]  # SB3's EvalCallback has both
+    return [callback, *(one for child in children for one in callback_tree(child))]
 
 
 def check_writable(folder: Path) -> None:

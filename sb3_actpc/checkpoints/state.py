@@ -120,13 +120,8 @@ def check_weights(model: BaseAlgorithm) -> None:
 
 def named(callbacks: Sequence[BaseCallback]) -> list[tuple[str, BaseCallback]]:
     """Each callback with its class's name and its number among those of that class."""
-    seen: dict[str, int] = {}
-    result = []
-    for callback in callbacks:
-        kind = type(callback).__qualname__
-        seen[kind] = seen.get(kind, 0) + 1
-        result.append((f"{kind}{seen[kind]}", callback))
-    return result
+    kinds = [type(callback).__qualname__ for callback in callbacks]
+    return [(f"{kind}{1 + kinds[:index].count(kind)}", callbacks[index]) for index, kind in enumerate(kinds)]
 
 
 def _generators(model: BaseAlgorithm) -> dict[str, Any]:
@@ -136,23 +131,14 @@ def _generators(model: BaseAlgorithm) -> dict[str, Any]:
     return states
 
 
-def _restore_generators(model: BaseAlgorithm, states: dict[str, Any]) -> None:
-    random.setstate(states["python"])
-    np.random.set_state(states["numpy"])
-    th.set_rng_state(states["torch"])
-    if "cuda" in states and model.device.type == "cuda":
-        th.cuda.set_rng_state(states["cuda"], model.device)
-
-
 def _capture_torch(model: BaseAlgorithm, encoder: Encoder) -> dict[str, Any]:
     dicts, variables = model._get_torch_save_params()
-    record = {
+    matrices = _noise_matrices(model)
+    return {
         "dicts": {name: encoder.encode(dict(recursive_getattr(model, name).state_dict()), name) for name in dicts},
         "variables": {name: encoder.encode(recursive_getattr(model, name), name) for name in variables},
+        "noise": {name: encoder.encode(getattr(matrices, name), name) for name in _NOISE_MATRICES if matrices},
     }
-    matrices = _noise_matrices(model)
-    record["noise"] = {name: encoder.encode(getattr(matrices, name), name) for name in _NOISE_MATRICES if matrices}
-    return record
 
 
 def _noise_matrices(model: BaseAlgorithm) -> Any:
@@ -390,7 +376,12 @@ def _restore_noise(model: BaseAlgorithm, node: Any, decoder: Decoder) -> None:
 
 def _restore_random(model: BaseAlgorithm, state: dict[str, Any], decoder: Decoder) -> None:
     decoder.decode(state["spaces"], [model.action_space, model.observation_space])
-    _restore_generators(model, decoder.decode(state["generators"]))
+    states = decoder.decode(state["generators"])
+    random.setstate(states["python"])
+    np.random.set_state(states["numpy"])
+    th.set_rng_state(states["torch"])
+    if "cuda" in states and model.device.type == "cuda":
+        th.cuda.set_rng_state(states["cuda"], model.device)
 
 
 def _start_episodes_again(model: BaseAlgorithm, lost: list[tuple[int, str]], report: Report) -> None:

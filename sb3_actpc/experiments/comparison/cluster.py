@@ -11,7 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from sb3_actpc.experiments.comparison.engines.base import Event
+from sb3_actpc.experiments.comparison.engines import Engine, Event
 from sb3_actpc.experiments.comparison.execution import LOCK, LOG, LOST, STOPPED, Outcome, execute_run
 from sb3_actpc.experiments.runs import Run
 from sb3_actpc.utils.extras import import_extra
@@ -20,7 +20,7 @@ CONNECTION_TIME = 10.0  # seconds
 _PROBE = ".shared-"  # a file by which a node sees whether it shares the folders
 
 
-class RayEngine:
+class RayEngine(Engine):
     """A Ray task for each run. A run whose node dies ends as lost, and is begun again, or gone on with, elsewhere.
 
     A node that sees this machine's folders (a network file system, or the same machine) works in them, checkpoints and all.
@@ -56,7 +56,6 @@ class RayEngine:
         return max(1, fitting if self.n_workers is None else min(fitting, self.n_workers))
 
     def start(self, run: Run) -> None:
-        """Begin, or go on with, a run."""
         run.folder.mkdir(parents=True, exist_ok=True)
         folder = run.folder.absolute()
         run = run.model_copy(update={"output": str(folder)})
@@ -66,7 +65,6 @@ class RayEngine:
         self._tasks[self._task.remote(run.model_dump_json(), str(probe), packed, self._board)] = run
 
     def poll(self, timeout: float) -> list[Event]:
-        """News, after some seconds at most."""
         if not self._tasks:
             threading.Event().wait(timeout)
             return []

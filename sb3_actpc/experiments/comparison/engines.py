@@ -1,4 +1,4 @@
-"""Runs in processes of this machine, each with its own interpreter."""
+"""Where runs are executed: processes of this machine, each with its own interpreter, or a Ray cluster."""
 
 import json
 import os
@@ -6,17 +6,74 @@ import queue
 import subprocess
 import sys
 import threading
+from abc import ABC, abstractmethod
 from contextlib import suppress
+from dataclasses import dataclass
 
-from sb3_actpc.experiments.comparison.engines.base import Event
 from sb3_actpc.experiments.comparison.execution import LOG, LOST, STOPPED, Outcome
 from sb3_actpc.experiments.runs import Run
 
+ENGINES = ("local", "ray")
 SAVING_TIME = 60.0  # seconds that a worker gets to save its checkpoint
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMEXPR_NUM_THREADS")
 
 
-class LocalEngine:
+@dataclass(frozen=True)
+class Event:
+    """News of a run: how many steps it has done, or, where there is an outcome, that it has ended."""
+
+    run_id: str
+    steps: int | None = None
+    outcome: Outcome | None = None
+
+
+class Engine(ABC):
+    """Executes runs, each in a process of its own with :func:`~sb3_actpc.experiments.comparison.execution.execute_run`."""
+
+    @abstractmethod
+    def capacity(self) -> int:
+        """How many runs can be executed at a time, now."""
+
+    @abstractmethod
+    def start(self, run: Run) -> None:
+        """Begin, or go on with, a run that is not under way."""
+
+    @abstractmethod
+    def poll(self, timeout: float) -> list[Event]:
+        """What has happened since the last call, waiting for it some seconds; each run that was started ends in exactly one
+        event with an outcome."""
+
+    @abstractmethod
+    def stop(self) -> None:
+        """Ask every run under way to save a checkpoint and end; their ends still come as events."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Leave nothing running."""
+
+
+def make_engine(name: str, n_workers: int | None, threads: int, address: str | None = None) -> Engine:
+    """:param name: one of ``ENGINES``
+    :param n_workers: runs at a time; by default one for each core (of the cluster) and ``threads``
+    :param threads: of each run
+    :param address: of a Ray cluster; by default one is started on this machine
+    :raises ValueError: for another name, a number below 1, or an address that the engine has no use for
+    :raises ImportError: when Ray is not installed
+    """
+    if name not in ENGINES:
+        raise ValueError(f"engine={name!r} is unknown: choose one of {', '.join(ENGINES)}")
+    if n_workers is not None and n_workers < 1:
+        raise ValueError(f"workers={n_workers} must be at least 1: give the number of runs at a time")
+    if name == "ray":
+        from sb3_actpc.experiments.comparison.cluster import RayEngine
+
+        return RayEngine(n_workers, threads, address)
+    if address is not None:
+        raise ValueError(f"address={address!r} is of no use to the local engine: add --engine ray, or leave it out")
+    return LocalEngine(n_workers, threads)
+
+
+class LocalEngine(Engine):
     """A process for each run. A process that dies, whatever the reason, takes no other with it; all save and end when this one
     dies.
 
@@ -32,11 +89,9 @@ class LocalEngine:
         self._is_stopping = False
 
     def capacity(self) -> int:
-        """See :class:`~sb3_actpc.experiments.comparison.engines.Engine`, as for the others."""
         return self.n_workers
 
     def start(self, run: Run) -> None:
-        """Begin, or go on with, a run."""
         run.folder.mkdir(parents=True, exist_ok=True)
         environment = {**os.environ, **dict.fromkeys(_THREAD_VARIABLES, str(self.threads))}
         with open(run.folder / LOG, "a", encoding="utf-8") as log:
@@ -56,7 +111,6 @@ class LocalEngine:
         threading.Thread(target=self._listen, args=(run.id, worker), daemon=True).start()
 
     def poll(self, timeout: float) -> list[Event]:
-        """News, after some seconds at most."""
         events = []
         try:
             events.append(self._events.get(timeout=timeout))
