@@ -23,20 +23,13 @@ _NETS = ("discriminator", "guidance_value", "discriminator_optimizer", "guidance
 
 
 class Guidance(NamedTuple):
-    """What the guidance step needs of one iteration: N = n_steps x n_envs transitions, those of the first environment first.
+    """What the guidance step needs of one iteration: N = n_steps x n_envs transitions, the first environment's first."""
 
-    :param observations: (N, *obs_shape)
-    :param actions: (N, A)
-    :param log_probs: (N,), of the policy that acted
-    :param advantages: (N,), of the discriminator's reward, mean 0 and standard deviation 1
-    :param returns: (N,), targets of the guidance value net
-    """
-
-    observations: th.Tensor
-    actions: th.Tensor
-    log_probs: th.Tensor
-    advantages: th.Tensor
-    returns: th.Tensor
+    observations: th.Tensor  # (N, *obs_shape)
+    actions: th.Tensor  # (N, A)
+    log_probs: th.Tensor  # (N,), of the policy that acted
+    advantages: th.Tensor  # (N,), of the discriminator's reward, mean 0 and standard deviation 1
+    returns: th.Tensor  # (N,), targets of the guidance value net
 
 
 class LOGO(LearnsFromDemonstrations, TRPO):

@@ -14,17 +14,10 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
         "nothing; can be given while the comparison goes on.",
     )
     parser.add_argument("folder", metavar="DIR", nargs="?", help="folder of sb3-actpc compare, or of an export")
-    parser.add_argument(
-        "--export",
-        metavar="TARGET",
-        help="write instead what is worth keeping: results.csv, curves.csv.gz, settings.json and a figure for each task",
-    )
-    parser.add_argument(
-        "--tables",
-        metavar="FILE",
-        nargs="+",
-        help="write the tables between the markers of Markdown files, from the exports that the markers name",
-    )
+    kept = "write instead what is worth keeping: results.csv, curves.csv.gz, settings.json and a figure for each task"
+    parser.add_argument("--export", metavar="TARGET", help=kept)
+    tables = "write the tables between the markers of Markdown files, from the exports that the markers name"
+    parser.add_argument("--tables", metavar="FILE", nargs="+", help=tables)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -56,7 +49,6 @@ def _idle_parts(folder: Path) -> int:
     results = load_results(folder)
     idle = {task: names for task in results.finished["task"].unique() if (names := without_effect(results, task))}
     for task, names in idle.items():
-        print(
-            f"sb3-actpc: error: {task}: not one action changed in {', '.join(names)}: the part does nothing", file=sys.stderr
-        )
+        message = f"{task}: not one action changed in {', '.join(names)}: the part does nothing"
+        print(f"sb3-actpc: error: {message}", file=sys.stderr)
     return 1 if idle else 0

@@ -21,23 +21,17 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
     )
     task = parser.add_mutually_exclusive_group(required=True)
     task.add_argument("--env", help="Gymnasium id, such as SparseHalfCheetah-v5")
-    task.add_argument(
-        "--resume",
-        metavar="DIR",
-        help="go on with the run in this folder, with its settings; a finished one with --steps MORE",
-    )
-    parser.add_argument("--algo", help="algorithm (default: actpc)")
-    parser.add_argument("--preset", metavar="NAME", help="file of hyperparams/, or a path ending in .yml (default: ALGO)")
-    parser.add_argument(
-        "--set",
-        action="append",
-        metavar="KEY=VALUE",
-        help="replace a setting of the preset, such as gamma=0.98 or policy_kwargs.net_arch=[64,64]",
-    )
-    parser.add_argument("--env-kwarg", action="append", metavar="KEY=VALUE", help="keyword of the environment")
-    parser.add_argument("--seed", type=int, help="seed (default: 0)")
-    parser.add_argument("--output", metavar="DIR", help="run folder (default: runs/ENV/ALGO_PRESET_seedSEED)")
-    parser.add_argument("--n-envs", type=int, metavar="N", help="parallel environments (default: the preset's, or 1)")
+    going_on = "go on with the run in this folder, with its settings; a finished one with --steps MORE"
+    task.add_argument("--resume", metavar="DIR", help=going_on)
+    add = parser.add_argument
+    add("--algo", help="algorithm (default: actpc)")
+    add("--preset", metavar="NAME", help="file of hyperparams/, or a path ending in .yml (default: ALGO)")
+    setting = "replace a setting of the preset, such as gamma=0.98 or policy_kwargs.net_arch=[64,64]"
+    add("--set", action="append", metavar="KEY=VALUE", help=setting)
+    add("--env-kwarg", action="append", metavar="KEY=VALUE", help="keyword of the environment")
+    add("--seed", type=int, help="seed (default: 0)")
+    add("--output", metavar="DIR", help="run folder (default: runs/ENV/ALGO_PRESET_seedSEED)")
+    add("--n-envs", type=int, metavar="N", help="parallel environments (default: the preset's, or 1)")
     add_run_options(parser, eval_episodes=5)
 
 

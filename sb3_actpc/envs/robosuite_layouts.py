@@ -29,14 +29,11 @@ ACTION_DIM = 7
 
 @dataclass(frozen=True)
 class RobosuiteTask:
-    """:param env_id: Gymnasium id
-    :param name: robosuite's name
-    :param object_parts: the parts of the object's state, in order, and their sizes
-    """
+    """What a task's observations hold, and when it is solved."""
 
-    env_id: str
-    name: str
-    object_parts: dict[str, int]
+    env_id: str  # Gymnasium id
+    name: str  # robosuite's
+    object_parts: dict[str, int]  # the parts of the object's state, in order, and their sizes
 
     @property
     def object_dim(self) -> int:

@@ -28,13 +28,10 @@ REPORT_INTERVAL = 1.0  # seconds between two reports of the steps done
 
 @dataclass(frozen=True)
 class Outcome:
-    """:param status: ``"finished"``, ``"failed"``, ``"stopped"`` (by a signal, saved), ``"lost"`` (the process ended without a
-        word) or ``"disk full"``
-    :param message: what went wrong, one line
-    """
+    """What has become of a run."""
 
-    status: str
-    message: str = ""
+    status: str  # "finished", "failed", "stopped" (by a signal, saved), "lost" (its process ended without a word), "disk full"
+    message: str = ""  # what went wrong, one line
 
 
 class FolderBusy(ValueError):

@@ -14,23 +14,14 @@ OWN_KEYS = ("envs", "algos", "ablate", "seeds", "first_seed", "output")
 
 
 class Comparison(Schema):
-    """Which runs are compared: every task with every variant and every seed.
+    """Which runs are compared: every task with every variant and every seed. ValueError for a wrong number of seeds."""
 
-    :param tasks: parts of runs, with ``env``
-    :param variants: parts of runs, with a name and an algorithm
-    :param seeds: how many seeds
-    :param first_seed: the first of them; settings that were chosen on some seeds are to be shown on others
-    :param shared: what holds for all runs; a task's own comes first, and a variant's before that
-    :param output: folder of the comparison
-    :raises ValueError: for a wrong number of seeds
-    """
-
-    tasks: tuple[Run, ...]
-    variants: tuple[Run, ...]
-    seeds: Count = 3
-    first_seed: Seed = 0
-    shared: Run = Run()
-    output: str = "runs/comparison"
+    tasks: tuple[Run, ...]  # parts of runs, with ``env``
+    variants: tuple[Run, ...]  # parts of runs, with a name and an algorithm
+    seeds: Count = 3  # how many
+    first_seed: Seed = 0  # settings that were chosen on some seeds are to be shown on others
+    shared: Run = Run()  # what holds for all runs; a task's own comes first, and a variant's before that
+    output: str = "runs/comparison"  # folder
 
 
 def read_comparison(given: Mapping[str, Any]) -> Comparison:

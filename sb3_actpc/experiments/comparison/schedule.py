@@ -19,20 +19,13 @@ POLL = 0.5  # seconds
 
 @dataclass
 class Summary:
-    """What a command has come to.
+    """What a command has come to."""
 
-    :param finished: runs that are done, the ones done before among them
-    :param failed: runs that failed, now or before, with their errors
-    :param unfinished: runs that were not begun or not brought to their end
-    :param stopped_by: name of the signal that ended the command, or ``"disk full"``; None when it came to its end
-    :param message: of the full disk
-    """
-
-    finished: list[Run] = field(default_factory=list)
-    failed: list[tuple[Run, str]] = field(default_factory=list)
-    unfinished: list[Run] = field(default_factory=list)
-    stopped_by: str | None = None
-    message: str = ""
+    finished: list[Run] = field(default_factory=list)  # the ones done before among them
+    failed: list[tuple[Run, str]] = field(default_factory=list)  # now or before, with their errors
+    unfinished: list[Run] = field(default_factory=list)  # not begun, or not brought to their end
+    stopped_by: str | None = None  # name of the signal that ended the command, or ``"disk full"``
+    message: str = ""  # of the full disk
 
 
 def run_comparison(

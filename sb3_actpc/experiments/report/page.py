@@ -15,22 +15,14 @@ from sb3_actpc.utils.files import atomic_write
 
 @dataclass(frozen=True)
 class Section:
-    """What a report says about one thing, in this order; each part may be missing.
-
-    :param title: heading
-    :param text: a plain paragraph
-    :param table: of texts
-    :param picture: name of a PNG file beside the report
-    :param caption: what the picture shows
-    :param level: of the heading, 1 for that of the report
-    """
+    """What a report says about one thing, in this order; each part may be missing."""
 
     title: str = ""
-    text: str = ""
-    table: pd.DataFrame | None = None
-    picture: str = ""
-    caption: str = ""
-    level: int = 2
+    text: str = ""  # a plain paragraph
+    table: pd.DataFrame | None = None  # of texts
+    picture: str = ""  # name of a PNG file beside the report
+    caption: str = ""  # what the picture shows
+    level: int = 2  # of the heading, 1 for that of the report
 
 
 def write_pages(sections: Sequence[Section], folder: Path) -> list[Path]:

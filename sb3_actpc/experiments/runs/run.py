@@ -167,7 +167,7 @@ def _train(
     since = f" from step {model.num_timesteps}" if goes_on else ""
     report(f"{run.env}: {run.algo}, {run.n_timesteps} steps{since}, into {folder}")
     if not goes_on:
-        episodes.begin()
+        episodes.begin_file()
         evaluation.begin(model)
     saver = None
     if run.checkpoint_freq:
