@@ -4,10 +4,9 @@ import io
 import os
 import socket
 import tempfile
-import threading
+import time
 import uuid
 import zipfile
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -66,7 +65,7 @@ class RayEngine(Engine):
 
     def poll(self, timeout: float) -> list[Event]:
         if not self._tasks:
-            threading.Event().wait(timeout)
+            time.sleep(timeout)
             return []
         ended, _ = self.ray.wait(list(self._tasks), num_returns=1, timeout=timeout)
         return [*self._progress(), *(self._end(reference) for reference in ended)]
@@ -130,29 +129,20 @@ class StepBoard:
 
 
 def _execute(job: str, probe: str, packed: bytes, board: Any) -> tuple[str, str, bytes | None]:
-    """On a node: bring a run, given as JSON, to its end. Where it sees the probe file it works in the run's folder, else in
-    a copy of it, which is sent back with status and message of the outcome."""
-    run = Run.model_validate_json(job)
+    """On a node: bring a run to its end, in its folder where that is seen; else in a copy, which is sent back."""
+    run, is_shared = Run.model_validate_json(job), Path(probe).is_file()
 
     def on_steps(steps: int) -> None:
         if board is not None:
             board.write.remote(run.id, steps)
 
-    if Path(probe).is_file():
-        outcome = _execute_with_log(run, on_steps)
-        return outcome.status, outcome.message, None
     with tempfile.TemporaryDirectory() as temporary:
-        folder = Path(temporary)
-        unpack_folder(packed, folder)
-        local = run.model_copy(update={"output": str(folder)})
-        outcome = _execute_with_log(local, on_steps)
-        return outcome.status, outcome.message, pack_folder(folder)
-
-
-def _execute_with_log(run: Run, on_steps: Callable[[int], None]) -> Outcome:
-    """With what it reports in the run's folder, as the local engine has it."""
-    with open(run.folder / LOG, "a", encoding="utf-8") as log:
-        return execute_run(run, lambda line: print(line, file=log, flush=True), on_steps)
+        if not is_shared:
+            unpack_folder(packed, Path(temporary))
+            run = run.model_copy(update={"output": temporary})
+        with open(run.folder / LOG, "a", encoding="utf-8") as log:  # as the local engine has it
+            outcome = execute_run(run, lambda line: print(line, file=log, flush=True), on_steps)
+        return outcome.status, outcome.message, None if is_shared else pack_folder(run.folder)
 
 
 def pack_folder(folder: Path) -> bytes:

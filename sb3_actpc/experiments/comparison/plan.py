@@ -88,8 +88,7 @@ def _fill(shared: Run, task: Run, variant: Run) -> Run:
 
 
 def _parse_task(entry: Any) -> Run:
-    if isinstance(entry, str):
-        return Run(env=entry)
+    entry = {"env": entry} if isinstance(entry, str) else entry
     if not isinstance(entry, Mapping) or "env" not in entry:
         raise ValueError(f"expected a Gymnasium id or a mapping with env, found {entry!r}")
     return part_of_run({str(key): value for key, value in entry.items()})

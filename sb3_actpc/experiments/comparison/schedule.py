@@ -9,7 +9,7 @@ from sb3_actpc.checkpoints import StopSignals
 from sb3_actpc.experiments.comparison import execution
 from sb3_actpc.experiments.comparison.display import Display
 from sb3_actpc.experiments.comparison.engines import Engine, Event
-from sb3_actpc.experiments.comparison.execution import FAILED, FINISHED, Outcome, folder_lock, is_disk_full, run_status
+from sb3_actpc.experiments.comparison.execution import FAILED, FINISHED, folder_lock, is_disk_full, run_status
 from sb3_actpc.experiments.runs import Run
 
 MAX_LOSSES = 3  # times that the process of one run may die before the run counts as failed
@@ -52,14 +52,10 @@ def run_comparison(
         summary = Summary()
         if to_do:
             _Scheduler(make_engine(), display, to_do, summary).run()
-        for run in runs:
-            status = run_status(run.folder)
-            if status == FINISHED:
-                summary.finished.append(run)
-            elif status == FAILED:
-                summary.failed.append((run, execution.read_error(run.folder)))
-            else:
-                summary.unfinished.append(run)
+        ends = [(run, run_status(run.folder)) for run in runs]
+        summary.finished = [run for run, status in ends if status == FINISHED]
+        summary.failed = [(run, execution.read_error(run.folder)) for run, status in ends if status == FAILED]
+        summary.unfinished = [run for run, status in ends if status not in (FINISHED, FAILED)]
         return summary
 
 
@@ -112,15 +108,11 @@ class _Scheduler:
         if event.outcome.status == execution.DISK_FULL:
             self._stop(execution.DISK_FULL, event.outcome.message)
         elif event.outcome.status in (execution.LOST, execution.STOPPED) and self.summary.stopped_by is None:
-            self._try_again(run, event.outcome)
-
-    def _try_again(self, run: Run, outcome: Outcome) -> None:
-        """Somebody ended the run's process, not the run."""
-        self.losses[run.id] += 1
-        if self.losses[run.id] < MAX_LOSSES:
-            self.waiting.appendleft(run)
-        else:
-            execution.write_error(run.folder, f"given up after {MAX_LOSSES} times: {outcome.message}")
+            self.losses[run.id] += 1  # somebody ended the run's process, not the run
+            if self.losses[run.id] < MAX_LOSSES:
+                self.waiting.appendleft(run)
+            else:
+                execution.write_error(run.folder, f"given up after {MAX_LOSSES} times: {event.outcome.message}")
 
     def _stop(self, reason: str, message: str = "") -> None:
         if self.summary.stopped_by is None:
