@@ -20,12 +20,7 @@ LARGEST_INPUT = 10.0  # as in SB3's VecNormalize
 
 class CloningPolicy(BasePolicy):
     """What both policies share: the normalisation of observations, the optimiser, and actions cut to [-1, 1] before they are
-    given the environment's units.
-
-    The parameters are SB3's.
-
-    :raises ValueError: for observations that are no Box
-    """
+    given the environment's units. The parameters are SB3's; ValueError for observations that are no Box."""
 
     mean: th.Tensor
     spread: th.Tensor
@@ -155,10 +150,7 @@ class BCRNNPolicy(CloningPolicy):
         deterministic: bool = False,
     ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
         """As SB3's: actions in the environment's units, and the next state, which begins anew where ``episode_start``, (n,),
-        is true; ``deterministic`` has no effect.
-
-        :raises ValueError: when the state is not that of n episodes of this network
-        """
+        is true; ``deterministic`` has no effect. ValueError when the state is not that of n episodes of this network."""
         self.set_training_mode(False)
         rows, is_batch = self.obs_to_tensor(observation)
         assert isinstance(rows, th.Tensor)

@@ -115,10 +115,8 @@ class Bundle:
 @contextmanager
 def write_bundle(folder: Path, num_timesteps: int, keep: int, manifest: Mapping[str, Any]) -> Iterator[BundleWriter]:
     """Write a checkpoint; it appears in ``folder``, that of a run's checkpoints, only when the block and everything after it
-    has worked. ``keep`` of them stay; ``manifest`` holds what else to record, plain values.
-
-    :raises OSError: when the disk is full or the folder cannot be written; nothing is left behind then
-    """
+    has worked. ``keep`` of them stay; ``manifest`` holds what else to record, plain values. OSError when the disk is full or
+    the folder cannot be written; nothing is left behind then."""
     folder.mkdir(parents=True, exist_ok=True)
     for left in folder.glob(f"{_TEMPORARY}*"):  # of a killed process
         shutil.rmtree(left, ignore_errors=True)

@@ -50,10 +50,8 @@ class Encoder:
         self._open: set[int] = set()
 
     def encode(self, value: Any, where: str) -> Any:
-        """JSON of a value; its path names the arrays in it.
-
-        :raises OpaqueValue: when it, or something in it, is of another kind or contains itself
-        """
+        """JSON of a value; its path names the arrays in it. OpaqueValue when it, or something in it, is of another kind or
+        contains itself."""
         if value is None or isinstance(value, (bool, str)) or type(value) is int:
             return value
         if type(value) is float:
@@ -129,10 +127,8 @@ class Decoder:
 
     def decode(self, node: Any, existing: Any = None) -> Any:
         """The value of JSON that :meth:`Encoder.encode` returned, new where it can be; of ``existing``, the value that is
-        there now, generators, spaces and objects are changed in place.
-
-        :raises ValueError: when the JSON is of another form, or the existing value of another kind
-        """
+        there now, generators, spaces and objects are changed in place. ValueError for JSON of another form, or an existing
+        value of another kind."""
         if not isinstance(node, (dict, list)):
             return node
         if isinstance(node, list):

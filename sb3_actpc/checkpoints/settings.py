@@ -55,10 +55,7 @@ def constructor_settings(model: BaseAlgorithm) -> dict[str, Any]:
 
 def read_settings(record: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
     """Keywords of the constructor, ``policy`` among them, from what :func:`constructor_settings` returned; ``overrides``
-    replace them.
-
-    :raises ValueError: when a value has no name in this version, or a keyword that could not be stored is not given
-    """
+    replace them. ValueError when a value has no name in this version, or a keyword that could not be stored is not given."""
     missing = [name for name in record["unnamed"] if name not in overrides]
     if missing:
         raise ValueError(f"{', '.join(missing)} could not be stored as plain values: pass the same again, {missing[0]}=...")
@@ -111,10 +108,8 @@ def _name_object(value: Any) -> dict[str, Any]:
 
 
 def read_value(node: Any) -> Any:
-    """The value of one keyword as :func:`constructor_settings` stored it.
-
-    :raises ValueError: for a class, a schedule or a noise that is not allowed
-    """
+    """The value of one keyword as :func:`constructor_settings` stored it; ValueError for a class, schedule or noise not
+    allowed."""
     if isinstance(node, list):
         return [read_value(part) for part in node]
     if not isinstance(node, dict):

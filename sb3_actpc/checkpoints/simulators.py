@@ -64,11 +64,8 @@ def capture_vec_env(env: VecEnv, encoder: Encoder, where: str) -> dict[str, Any]
 
 
 def restore_vec_env(env: VecEnv, record: dict[str, Any], decoder: Decoder) -> list[tuple[int, str]]:
-    """Put back what :func:`capture_vec_env` returned into an environment made as the captured one was.
-
-    :return: (index, reason) of each environment whose episode must start again
-    :raises ValueError: when the environment is wrapped in another way
-    """
+    """Put back what :func:`capture_vec_env` returned into an environment made as the captured one was: (index, reason) of each
+    environment whose episode must start again. ValueError when it is wrapped in another way."""
     *wrappers, innermost = vec_env_layers(env)
     kinds, stored = [type(wrapper).__qualname__ for wrapper in wrappers], [entry["class"] for entry in record["wrappers"]]
     if kinds != stored or len(record["envs"]) != env.num_envs:

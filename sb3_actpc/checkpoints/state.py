@@ -63,10 +63,7 @@ class Restored:
 
 def capture_model(model: BaseAlgorithm, callbacks: Sequence[BaseCallback], writer: BundleWriter) -> None:
     """Write everything that the rest of the training depends on, between two rollouts, or between two updates before the
-    first.
-
-    :raises ValueError: when a weight is not finite
-    """
+    first; ValueError when a weight is not finite."""
     check_weights(model)
     encoder = Encoder()
     assert model.env is not None
@@ -290,11 +287,9 @@ def _restore_logger(model: BaseAlgorithm, record: dict[str, Any], decoder: Decod
 
 
 def restore_model(model: BaseAlgorithm, bundle: Bundle, report: Report) -> Restored:
-    """Put everything back into an agent that was made with the same settings. Nothing is changed when the two do not fit.
-
-    :return: the agent, and what :func:`restore_learning` puts back once ``learn(..., reset_num_timesteps=False)`` has begun
-    :raises ValueError: when the checkpoint is of another algorithm, task, network or buffer
-    """
+    """Put everything back into an agent that was made with the same settings, but for what :func:`restore_learning` puts back
+    once ``learn(..., reset_num_timesteps=False)`` has begun. ValueError, and nothing is changed, when the checkpoint is of
+    another algorithm, task, network or buffer."""
     assert model.env is not None
     state, buffer = bundle.read_json("state.json"), replay_buffer(model)
     _check_fit(describe_model(model, env_name(model.env))["agent"], bundle)

@@ -32,12 +32,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def build_parser() -> argparse.ArgumentParser:
-    """The parser with all its sub-commands: the modules of this package.
-
-    Each has ``add_parser(subparsers)`` and ``run(args)``, which returns the exit code or raises one of :func:`user_errors`.
-
-    :return: the parser; the parsed ``command`` is the name of the sub-command's module
-    """
+    """The parser with all its sub-commands: the modules of this package, whose names are then its ``command``. Each has
+    ``add_parser(subparsers)`` and ``run(args)``, which returns the exit code or raises one of :func:`user_errors`."""
     parser = argparse.ArgumentParser(prog="sb3-actpc", description="Active predictive coding for Stable-Baselines3.")
     parser.add_argument("--version", action="version", version=f"sb3-actpc {__version__}")
     parser.add_argument("--debug", action="store_true", help="show where an error came from")

@@ -27,12 +27,8 @@ def download_robomimic(
     env_id: str, path: str | os.PathLike[str], url: str, obs: str = "paper", report: Report = silent
 ) -> Demonstrations:
     """Download a robomimic file (http or https) to a path, unless it is there already, and read it, see
-    :func:`~sb3_actpc.demonstrations.read_robomimic`. The file appears under its name only when it is whole.
-
-    :raises OSError: when it cannot be fetched
-    :raises ValueError: when what arrived is not such a file
-    :raises ImportError: when h5py is not installed
-    """
+    :func:`~sb3_actpc.demonstrations.read_robomimic`. The file appears under its name only when it is whole. OSError when it
+    cannot be fetched, ValueError when what arrived is not such a file, ImportError when h5py is not installed."""
     import pooch
 
     import_extra("h5py", "robosuite")  # before the long part

@@ -132,10 +132,8 @@ class SparseRobosuiteEnv(gym.Env[np.ndarray, np.ndarray], utils.EzPickle):
         return self._observe()
 
     def render(self) -> np.ndarray | None:
-        """The camera's view, (height, width, 3) uint8; None without a render mode.
-
-        :raises RuntimeError: (or what the OpenGL library raises) when the machine cannot render
-        """
+        """The camera's view, (height, width, 3) uint8; None without a render mode. RuntimeError (or what the OpenGL library
+        raises) when the machine cannot render."""
         if self.render_mode is None:
             return None
         if self._renderer is None:

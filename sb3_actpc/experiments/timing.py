@@ -251,10 +251,8 @@ def memory_ratio() -> float:
 
 
 def robosuite(rounds: int) -> Iterator[str]:
-    """A line for each task: steps and resets, interleaved with those of robosuite's own environment at its defaults.
-
-    :raises ImportError: when robosuite is not installed
-    """
+    """A line for each task: steps and resets, interleaved with those of robosuite's own environment at its defaults;
+    ImportError when robosuite is not installed."""
     for env_id, task in ROBOSUITE_TASKS.items():
         times = _interleave(_robosuite_entries(env_id, task.name), rounds, lambda: None)
         medians = {name: statistics.median(seconds) for name, seconds in times.items()}

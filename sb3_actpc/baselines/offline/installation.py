@@ -44,10 +44,7 @@ def environments_folder() -> Path:
 
 
 def environment_python(name: str, folder: Path | None = None) -> Path:
-    """The interpreter of the whole environment of a package.
-
-    :raises ImportError: when there is none; the message says how to make it
-    """
+    """The interpreter of the whole environment of a package; ImportError, which says how to make it, when there is none."""
     place = (environments_folder() if folder is None else folder) / name
     if not _is_complete(name, place):
         raise ImportError(f"{name} is not installed in {place}: run sb3-actpc baselines install {name}")

@@ -51,11 +51,8 @@ class ServerProcess:
             theirs.close()
 
     def ask(self, what: str, arrays: Arrays | None = None, **values: Any) -> tuple[Values, Arrays]:
-        """Values and arrays of the answer to a question of this name, with these arrays and plain values.
-
-        :raises ServerFailed: when there is none; the process is then ended
-        :raises ValueError: when the answer is that the question was wrong; likewise
-        """
+        """Values and arrays of the answer to a question of this name, with these arrays and plain values; ServerFailed when
+        there is none, ValueError when it is that the question was wrong, and the process is then ended."""
         if self._channel.closed:
             raise ServerFailed(f"{self.name} has ended before: close() the agent, which starts it again as it was last saved")
         is_answered = False

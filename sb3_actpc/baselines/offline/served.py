@@ -198,10 +198,7 @@ class ServedAlgorithm(OfflineAlgorithm):
         self, observations: np.ndarray, starts: np.ndarray, state: tuple[np.ndarray, ...] | None
     ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
         """Actions (n, A), about in [-1, 1], and the next state, for observations (n, obs_dim); ``starts`` (n,) is true where
-        an episode begins.
-
-        :raises OSError: when the other process has failed
-        """
+        an episode begins. OSError when the other process has failed."""
         arrays = {"observations": self._normalized(observations), "episode_starts": starts}
         if state is not None:
             arrays |= dict(zip(self._state_names, state, strict=True))

@@ -40,11 +40,8 @@ class FolderBusy(ValueError):
 
 @contextmanager
 def folder_lock(folder: Path, wait: float, report: Callable[[str], None] = lambda line: None) -> Iterator[None]:
-    """Hold a folder, made when it does not exist; another process that holds it is waited for some seconds. The lock is the
-    operating system's: it is gone with the process that held it, however that ended.
-
-    :raises FolderBusy: when the other still holds it then
-    """
+    """Hold a folder, made when it does not exist; another process that holds it is waited for some seconds, then FolderBusy is
+    raised. The lock is the operating system's: it is gone with the process that held it, however that ended."""
     folder.mkdir(parents=True, exist_ok=True)
     lock = FileLock(folder / LOCK)
     try:

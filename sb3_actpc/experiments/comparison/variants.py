@@ -45,10 +45,8 @@ def parse_variant(entry: Any) -> Run:
 
 
 def part_of_run(entry: Mapping[str, Any], also: Sequence[str] = ()) -> Run:
-    """A part of a run from its keys, with the nearest known one in the error; ``also`` are keys that stand beside them.
-
-    :raises ValueError: for an unknown key, a wrong value, or a key that the comparison itself decides
-    """
+    """A part of a run from its keys; ``also`` are keys that stand beside them. ValueError for an unknown key, with the nearest
+    known one, a wrong value, or a key that the comparison itself decides."""
     known = sorted({*also, *Run.known_keys()} - set(PLANNED))
     for key, value in entry.items():
         if key in PLANNED:

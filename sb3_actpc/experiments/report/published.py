@@ -53,11 +53,8 @@ def write_tables(path: Path) -> bool:
 
 
 def fill_tables(text: str, folder: Path) -> str:
-    """A Markdown text with its tables written anew; ``folder`` is its own.
-
-    :raises ValueError: when a marker is not closed, or says something unknown
-    :raises FileNotFoundError: when the YAML file or an export is missing
-    """
+    """A Markdown text with its tables written anew; ``folder`` is its own. ValueError when a marker is not closed, or says
+    something unknown, FileNotFoundError when the YAML file or an export is missing."""
     found = len(_MARKER.findall(text))
     if not found == text.count("<!-- table:") == text.count("<!-- /table -->"):
         raise ValueError(

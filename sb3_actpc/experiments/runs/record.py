@@ -21,11 +21,8 @@ def write_config(run: Run) -> None:
 
 
 def read_config(folder: Path) -> dict[str, Any]:
-    """The content of ``config.json``, of whatever version.
-
-    :raises FileNotFoundError: when there is none
-    :raises ValueError: when it is not JSON or lacks what identifies a run
-    """
+    """The content of ``config.json``, of whatever version; FileNotFoundError when there is none, ValueError when it is not
+    JSON or lacks what identifies a run."""
     if not (folder / CONFIG).is_file():
         raise FileNotFoundError(f"no run in {folder}: {CONFIG} is missing")
     record, needed = _read_json(folder / CONFIG), {"env", "env_kwargs", "algo", "seed"}
@@ -35,11 +32,8 @@ def read_config(folder: Path) -> dict[str, Any]:
 
 
 def read_run(folder: Path) -> Run:
-    """The run in a folder.
-
-    :raises FileNotFoundError: when there is no ``config.json``
-    :raises ValueError: when it is damaged, or of another version
-    """
+    """The run in a folder; FileNotFoundError when there is no ``config.json``, ValueError when it is damaged, or of another
+    version."""
     record = read_config(folder)
     version = record.pop("schema", 1)
     if version != VERSION:
@@ -96,11 +90,7 @@ def write_result(folder: Path) -> dict[str, Any]:
 
 
 def read_result(folder: Path) -> dict[str, Any]:
-    """The content of ``result.json``.
-
-    :raises FileNotFoundError: when there is none: the run is not finished
-    :raises ValueError: when it is damaged
-    """
+    """The content of ``result.json``; FileNotFoundError when the run is not finished, ValueError when the file is damaged."""
     if not (folder / RESULT).is_file():
         raise FileNotFoundError(f"no result in {folder}: the run is not finished")
     result = _read_json(folder / RESULT)

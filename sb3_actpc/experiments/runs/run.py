@@ -257,10 +257,7 @@ def load_run(folder: Path) -> tuple[Run, Predictor]:
 
 def run_folder(run: Run) -> Path:
     """``run.output``, or ``runs/<env>/<algo>_<preset>_seed<seed>`` with ``_2``, ``_3``, … when it holds a result or
-    checkpoints.
-
-    :raises ValueError: when ``run.output`` holds a finished run, or one that can be resumed
-    """
+    checkpoints. ValueError when ``run.output`` holds a finished run, or one that can be resumed."""
     if run.output is not None:
         if (run.folder / RESULT).exists():
             raise ValueError(f"{run.output} already holds a finished run: choose another folder")

@@ -150,10 +150,8 @@ def parts_of(memory: Any) -> tuple[Any, ...]:
 
 
 def update(config: Any, values: dict[str, Any], where: str) -> None:
-    """Change values, mappings in mappings, in a part of robomimic's config, which the user calls ``where``.
-
-    :raises ValueError: for a key that it does not have
-    """
+    """Change values, mappings in mappings, in a part of robomimic's config, which the user calls ``where``; ValueError for a
+    key that it does not have."""
     for key, value in values.items():
         if key not in config:
             raise ValueError(f"{where} has no setting {key!r}: choose one of {', '.join(sorted(config))}")
