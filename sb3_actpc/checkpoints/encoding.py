@@ -111,7 +111,9 @@ class Encoder:
         if isinstance(value, bytes):
             return {"bytes": value.hex()}
         if isinstance(value, spaces.Space):
-            return {"space": self.encode(space_generators(value), where)}
+            generators = [part._np_random for part in _subspaces(value)]  # None where it has not been used
+            states = [None if one is None else dict(one.bit_generator.state) for one in generators]
+            return {"space": self.encode(states, where)}
         if isinstance(value, _LEFT_ALONE) or f"{type(value).__module__}.{type(value).__qualname__}" in _LEFT_ALONE_NAMES:
             return {"left": type(value).__qualname__}
         if isinstance(value, _TRANSPARENT):
@@ -181,7 +183,9 @@ class Decoder:
 
     def _space(self, node: dict[str, Any], existing: Any) -> Any:
         if isinstance(existing, spaces.Space):
-            restore_space_generators(existing, self.decode(node["space"]))
+            for part, state in zip(_subspaces(existing), self.decode(node["space"]), strict=True):
+                if state is not None:
+                    part.np_random.bit_generator.state = state
         return existing
 
     def _object(self, node: dict[str, Any], existing: Any) -> Any:
@@ -211,15 +215,3 @@ def _subspaces(space: spaces.Space) -> list[spaces.Space]:
     parts: Any = space.spaces if isinstance(space, (spaces.Dict, spaces.Tuple, spaces.OneOf)) else ()
     parts = parts.values() if isinstance(space, spaces.Dict) else parts
     return [space, *(inner for part in parts for inner in _subspaces(part))]
-
-
-def space_generators(space: spaces.Space) -> list[dict[str, Any] | None]:
-    """The state of the generator of a space and of each space in it, None where it has not been used."""
-    return [None if part._np_random is None else dict(part._np_random.bit_generator.state) for part in _subspaces(space)]
-
-
-def restore_space_generators(space: spaces.Space, states: list[dict[str, Any] | None]) -> None:
-    """Put back what :func:`space_generators` returned, into a space of the same form."""
-    for part, state in zip(_subspaces(space), states, strict=True):
-        if state is not None:
-            part.np_random.bit_generator.state = state

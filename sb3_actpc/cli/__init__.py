@@ -13,11 +13,8 @@ RUN_OPTIONS = ("steps", "demonstrations", "gym_packages", "eval_freq", "eval_epi
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line.
-
-    :param argv: arguments, by default those of the process
-    :return: exit code: 0, or 2 for a mistake of the user's (one line on stderr says which), or 130 when interrupted
-    """
+    """Run the command line, by default that of the process. The exit code is 0, or 2 for a mistake of the user's (one line on
+    stderr says which), or 130 when interrupted."""
     args = build_parser().parse_args(argv)
     try:
         return int(importlib.import_module(f"{__name__}.{args.command}").run(args))

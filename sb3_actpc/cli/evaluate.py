@@ -12,7 +12,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
         description="Play episodes with the agent of a run folder. Its model.zip is unpickled: open only runs you trust.",
     )
     add = parser.add_argument
-    add("folder", metavar="RUN", help="run folder, as written by sb3-actpc train")
+    add("folder", type=Path, metavar="RUN", help="run folder, as written by sb3-actpc train")
     add("--episodes", type=int, default=10, metavar="N", help="episodes to play (default: %(default)s)")
     add("--seed", type=int, default=0, help="seed of the first episode (default: %(default)s)")
     add("--video", metavar="FILE", help="video of the first episode, .mp4 or .gif, or a .png strip (default: RUN/video.mp4)")
@@ -26,10 +26,12 @@ def run(args: argparse.Namespace) -> int:
     """Play, print the table, record; a machine that cannot render is no error."""
     from sb3_actpc.experiments.runs.video import check_video_path, choose_gl_backend
 
-    folder = Path(args.folder)
+    folder = args.folder
     video = None if args.no_video else Path(args.video or folder / "video.mp4")
     if video is not None:
-        _check_video_options(args)
+        for option, value in (("--frames", args.frames), ("--size", args.size)):
+            if value is not None and value < 1:
+                raise ValueError(f"{option} must be at least 1, found {value}")
         check_video_path(video)
         choose_gl_backend()  # before MuJoCo is imported
 
@@ -42,13 +44,6 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _check_video_options(args: argparse.Namespace) -> None:
-    """:raises ValueError: when a number is too small"""
-    for option, value in (("--frames", args.frames), ("--size", args.size)):
-        if value is not None and value < 1:
-            raise ValueError(f"{option} must be at least 1, found {value}")
-
-
 def _record(folder: Path, video: Path, args: argparse.Namespace) -> None:
     from sb3_actpc.demonstrations import resolve
     from sb3_actpc.experiments.runs.presets import find_demonstrations
@@ -57,13 +52,12 @@ def _record(folder: Path, video: Path, args: argparse.Namespace) -> None:
 
     run, model = load_run(folder)
     size = {} if args.size is None else {"width": args.size, "height": args.size}
-    demonstrations = None
+    env_kwargs, demonstrations = {**run.env_kwargs, **size}, None
     if args.beside_demonstrator:
         source = find_demonstrations(run.env, run.demonstrations)
         if source is None:
             raise ValueError(f"{folder} was trained without demonstrations: leave --beside-demonstrator out")
         demonstrations = resolve(source)
-    env_kwargs = {**run.env_kwargs, **size}
     try:
         n_frames = record_video(model, run.env, env_kwargs, video, args.seed, args.frames, demonstrations)
     except RenderingUnavailable as error:

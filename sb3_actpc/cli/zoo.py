@@ -47,11 +47,14 @@ NET_ARCHS = {"small": [64, 64], "medium": [256, 256], "big": [400, 300]}
 
 def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
     """Add the sub-command."""
+    commands = "\n".join(f"  {name:15s} {about}" for name, (_, about) in SCRIPTS.items())
     parser = subparsers.add_parser(
         "zoo",
         help="train, enjoy, optimize and plot with rl-zoo3",
         formatter_class=argparse.RawDescriptionHelpFormatter,
-        description=_description(),
+        description="rl-zoo3's scripts with this package's algorithms, settings and tasks:\n\n"
+        f"{commands}\n\nEvery option of theirs works: sb3-actpc zoo train --help.\n"
+        "rl-zoo3 unpickles models and evaluates settings: use it on runs that you trust.",
         usage="sb3-actpc zoo COMMAND ...",
     )
     parser.add_argument("zoo_command", metavar="COMMAND", choices=SCRIPTS, help=argparse.SUPPRESS)
@@ -70,15 +73,6 @@ def run(args: argparse.Namespace) -> int:
         return _run(SCRIPTS[command][0], _playing_arguments(arguments))
     with tempfile.TemporaryDirectory(prefix="sb3_actpc_zoo_") as folder:
         return _run(SCRIPTS[command][0], _training_arguments(arguments, Path(folder), optimize=command == "optimize"))
-
-
-def _description() -> str:
-    commands = "\n".join(f"  {name:15s} {about}" for name, (_, about) in SCRIPTS.items())
-    return (
-        "rl-zoo3's scripts with this package's algorithms, settings and tasks:\n\n"
-        f"{commands}\n\nEvery option of theirs works: sb3-actpc zoo train --help.\n"
-        "rl-zoo3 unpickles models and evaluates settings: use it on runs that you trust."
-    )
 
 
 def register_algorithms() -> None:
@@ -104,7 +98,7 @@ def register_algorithms() -> None:
 
 
 def _evaluate_on_other_seeds(manager: Any) -> None:
-    """:param manager: rl_zoo3's class, whose method that makes environments is replaced"""
+    """Replace the method of rl_zoo3's class that makes environments."""
     from sb3_actpc.experiments.runs.run import EVALUATION_SEED_OFFSET
 
     create_envs = manager.create_envs
@@ -121,7 +115,7 @@ def _evaluate_on_other_seeds(manager: Any) -> None:
 
 
 def _keep_the_best_trial(manager: Any) -> None:
-    """:param manager: as :func:`_evaluate_on_other_seeds`'s; its search then also writes a preset"""
+    """Let the search of rl_zoo3's class also write a preset."""
     from sb3_actpc.experiments.runs.presets import load_preset
 
     search = manager.hyperparameters_optimization

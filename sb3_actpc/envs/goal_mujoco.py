@@ -90,10 +90,8 @@ class GoalTask(gym.Wrapper[Any, np.ndarray, Any, np.ndarray]):
 
 
 class GoalReacher(GoalTask):
-    """Goals are positions of the fingertip in the plane, in metres, (2,).
-
-    :param env: a sparse Reacher; its threshold and ``miss_reward`` count
-    """
+    """Goals are positions of the fingertip in the plane, in metres, (2,); the sparse Reacher's threshold and ``miss_reward``
+    count."""
 
     def __init__(self, env: gym.Env[np.ndarray, np.ndarray]) -> None:
         super().__init__(env, len(_REACHER_OWN), 2)

@@ -91,12 +91,9 @@ class SparseRobosuiteEnv(gym.Env[np.ndarray, np.ndarray], utils.EzPickle):
         self._stage = 0
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
-        """Start an episode: the arm near its rest pose, the object at a random place.
-
-        :param seed: of the generator; the same seed gives the same state bit for bit, None goes on with the generator
-        :param options: not used
-        :return: observation (obs_dim,) and ``{"is_success": False, "stage": "start"}``
-        """
+        """Start an episode: the arm near its rest pose, the object at a random place; the same seed gives the same state bit
+        for bit, None goes on with the generator. ``options`` are not used; the info is ``{"is_success": False, "stage":
+        "start"}``."""
         super().reset(seed=seed)
         share_generator(self._simulation, self.np_random)
         self._randomize_model()

@@ -124,13 +124,9 @@ def examine(
 
 
 def examine_run(folder: Path, **options: Any) -> Examination:
-    """Examine the agent of a run and write the table into its folder, as ``examination.csv``.
-
-    The run's ``model.zip`` is unpickled: open only runs that you trust.
-
-    :param options: keywords of :func:`examine`
-    :raises ValueError: when its agent is not an ActPC, or learned from ``VecNormalize``
-    """
+    """Examine the agent of a run, with keywords of :func:`examine`, and write the table into its folder, as
+    ``examination.csv``. The run's ``model.zip`` is unpickled: open only runs that you trust. ValueError when its agent is not
+    an ActPC, or learned from ``VecNormalize``."""
     from sb3_actpc.actpc import ActPC
     from sb3_actpc.experiments.runs.environments import make_env
     from sb3_actpc.experiments.runs.run import load_run

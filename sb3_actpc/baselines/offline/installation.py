@@ -53,12 +53,8 @@ def environment_python(name: str, folder: Path | None = None) -> Path:
 
 def install(name: str, folder: Path | None = None, report: Callable[[str], None] = lambda line: None) -> Path:
     """Make the environment of a package; one that is there and whole stays as it is, any other is made anew, under another
-    name, and renamed when everything in it runs, so that a stopped command leaves no half of one.
-
-    :return: the environment's folder
-    :raises ValueError: when there is no such name
-    :raises OSError: when a step fails (no network, a full disk); the message is the last thing that it said
-    """
+    name, and renamed when everything in it runs, so that a stopped command leaves no half of one. Its folder; ValueError when
+    there is no such name, OSError, with the last thing that it said, when a step fails (no network, a full disk)."""
     if name not in RECIPES:
         raise ValueError(f"no recipe for {name!r}: choose one of {', '.join(sorted(RECIPES))}")
     folder = environments_folder() if folder is None else folder.absolute()

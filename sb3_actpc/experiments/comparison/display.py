@@ -14,11 +14,8 @@ _WORDS = {LOST: "lost, will go on", STOPPED: "stopped, will go on", DISK_FULL: "
 
 
 class Display:
-    """A line for every run that begins or ends; in a terminal, bars of the runs under way and of the steps of all.
-
-    :param bars: False for lines alone
-    :param console: of rich
-    """
+    """A line for every run that begins or ends; in a terminal, and with ``bars``, also bars of the runs under way and of the
+    steps of all. ``console`` is rich's."""
 
     def __init__(self, bars: bool = True, console: Console | None = None) -> None:
         self.console = console or Console()

@@ -53,13 +53,9 @@ class Engine(ABC):
 
 
 def make_engine(name: str, n_workers: int | None, threads: int, address: str | None = None) -> Engine:
-    """:param name: one of ``ENGINES``
-    :param n_workers: runs at a time; by default one for each core (of the cluster) and ``threads``
-    :param threads: of each run
-    :param address: of a Ray cluster; by default one is started on this machine
-    :raises ValueError: for another name, a number below 1, or an address that the engine has no use for
-    :raises ImportError: when Ray is not installed
-    """
+    """One of ``ENGINES``, for ``n_workers`` runs at a time (by default one for each core, of the cluster, and ``threads``) of
+    so many threads; ``address`` is a Ray cluster's, by default one is started on this machine. ValueError for another name, a
+    number below 1, or an address that the engine has no use for, ImportError when Ray is not installed."""
     if name not in ENGINES:
         raise ValueError(f"engine={name!r} is unknown: choose one of {', '.join(ENGINES)}")
     if n_workers is not None and n_workers < 1:
@@ -74,15 +70,12 @@ def make_engine(name: str, n_workers: int | None, threads: int, address: str | N
 
 
 class LocalEngine(Engine):
-    """A process for each run. A process that dies, whatever the reason, takes no other with it; all save and end when this one
-    dies.
-
-    :param n_workers: runs at a time; by default the number of usable cores divided by ``threads``
-    :param threads: of each run
-    """
+    """A process for each run, at most ``n_workers`` at a time, by default as many as there are usable cores for their
+    ``threads``. A process that dies, whatever the reason, takes no other with it; all save and end when this one dies."""
 
     def __init__(self, n_workers: int | None = None, threads: int = 1) -> None:
-        self.n_workers = max(1, usable_cores() // threads) if n_workers is None else n_workers
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        self.n_workers = max(1, cores // threads) if n_workers is None else n_workers
         self.threads = threads
         self.workers: dict[str, subprocess.Popen[str]] = {}
         self._events: queue.Queue[Event] = queue.Queue()
@@ -154,11 +147,6 @@ class LocalEngine(Engine):
         if outcome is None:
             outcome = Outcome(STOPPED) if self._is_stopping else Outcome(LOST, _describe_exit(code))
         self._events.put(Event(run_id, outcome=outcome))
-
-
-def usable_cores() -> int:
-    """How many cores this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _describe_exit(code: int) -> str:

@@ -60,15 +60,10 @@ def read_comparison_file(path: Path) -> dict[str, Any]:
 
 
 def plan_runs(comparison: Comparison, folder: Path | None = None) -> list[Run]:
-    """Fill in and check every run before any is begun.
-
-    :param comparison: which runs
-    :param folder: where their folders go, as ``<task>/<variant>/seed<seed>_<id>``; by default the comparison's
-    :return: the runs: the first seed of everything, then the second, ...
-    :raises ValueError: when a name or a setting is unknown or wrong
-    :raises FileNotFoundError: when a preset or a demonstrations file does not exist
-    :raises gymnasium.error.Error: when a task is unknown
-    """
+    """Fill in and check every run before any is begun: the first seed of everything, then the second, ... Their folders are
+    ``<task>/<variant>/seed<seed>_<id>`` in ``folder``, by default the comparison's. ValueError when a name or a setting is
+    unknown or wrong, FileNotFoundError when a preset or a demonstrations file does not exist, gymnasium.error.Error when a
+    task is unknown."""
     folder = Path(comparison.output) if folder is None else folder
     filled = [_fill(comparison.shared, task, variant) for task in comparison.tasks for variant in comparison.variants]
     seeds = range(comparison.first_seed, comparison.first_seed + comparison.seeds)

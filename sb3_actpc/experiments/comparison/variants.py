@@ -25,11 +25,8 @@ def find_variant(name: str) -> Run:
 
 
 def parse_variant(entry: Any) -> Run:
-    """:param entry: a name, or a mapping with some of the keys of :class:`~sb3_actpc.experiments.runs.Run`; ``base`` names the
-        variant that it starts from
-    :return: the variant
-    :raises ValueError: when it is neither, or has an unknown key or a wrong value
-    """
+    """The variant of a name, or of a mapping with some of the keys of :class:`~sb3_actpc.experiments.runs.Run`, where ``base``
+    names the variant that it starts from; ValueError when it is neither, or has an unknown key or a wrong value."""
     if isinstance(entry, str):
         return find_variant(entry)
     if not isinstance(entry, Mapping):

@@ -44,16 +44,12 @@ _NOTE = (
 
 
 def write_report(folder: Path) -> list[Path]:
-    """Write ``report.md``, ``report.html`` (one file, which opens without a network), ``results.csv`` and figures.
-
-    :param folder: of a comparison, or of an export
-    :raises FileNotFoundError: when there are no runs
-    """
+    """Write ``report.md``, ``report.html`` (one file, which opens without a network), ``results.csv`` and figures into the
+    folder of a comparison, or of an export; FileNotFoundError when there are no runs."""
     results = load_results(folder)
     tasks = list(results.finished["task"].unique())
     sections = [Section(f"Comparison {folder.name}", _overview(results.runs), level=1)]
-    for task in tasks:
-        sections.append(_task_section(results, task, folder))
+    sections += [_task_section(results, task, folder) for task in tasks]
     if tasks:
         sections.append(Section(text=_NOTE))
     sections += _aggregate_sections(results, folder)
@@ -61,7 +57,9 @@ def write_report(folder: Path) -> list[Path]:
         sections += ablation_sections(results, task, folder)
     for task in tasks:
         sections += _diagnostic_section(results, task, folder)
-    sections += _open_run_section(results.runs)
+    missing = results.runs.loc[results.runs["status"] != FINISHED, ["task", "variant", "seed", "status", "steps", "error"]]
+    if len(missing):
+        sections.append(Section("Runs that are not in the tables", table=missing.astype(str)))
     files = [*write_pages(sections, folder), write_runs(results, folder)]
     return [*files, *(folder / section.picture for section in sections if section.picture)]
 
@@ -185,7 +183,7 @@ def _improvement_section(scores: Mapping[str, Scores]) -> list[Section]:
     return [Section("Probability of improvement", table=table, level=3)] if rows else []
 
 
-# ------------------------------------------------------------------ inside the agent, and what is missing
+# ------------------------------------------------------------------ inside the agent
 
 
 def _diagnostic_section(results: Results, task: str, folder: Path) -> list[Section]:
@@ -195,8 +193,3 @@ def _diagnostic_section(results: Results, task: str, folder: Path) -> list[Secti
         return []
     caption = f"{task}: signals, energies, action-values, self-imitation memory"
     return [Section(f"Inside ActPC: {task}", picture=picture, caption=caption)]
-
-
-def _open_run_section(runs: pd.DataFrame) -> list[Section]:
-    rows = runs.loc[runs["status"] != FINISHED, ["task", "variant", "seed", "status", "steps", "error"]]
-    return [] if rows.empty else [Section("Runs that are not in the tables", table=rows.astype(str))]

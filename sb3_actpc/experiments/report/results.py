@@ -2,7 +2,6 @@
 
 import io
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -136,6 +135,7 @@ def _run_row(folder: Path, evaluations: pd.DataFrame, episodes: pd.DataFrame) ->
         config, error = {}, read_error(folder) or str(problem)
     task, variant = folder.parent.parent.name, folder.parent.name
     steps = evaluations["timesteps"].iloc[-1] if len(evaluations) else 0
+    versions = dict(config.get("versions", {}))
     return {
         "task": task,
         "variant": variant,
@@ -149,18 +149,11 @@ def _run_row(folder: Path, evaluations: pd.DataFrame, episodes: pd.DataFrame) ->
         "episodes": len(episodes),
         **run_measures(task, evaluations, episodes),
         "demonstrators_return": np.nan if config.get("demonstrators_return") is None else config["demonstrators_return"],
-        **_provenance(config),
-        "error": error,
-    }
-
-
-def _provenance(config: Mapping[str, Any]) -> dict[str, Any]:
-    versions = dict(config.get("versions", {}))
-    return {
         "version": versions.pop("sb3-actpc", ""),
         "versions": ", ".join(f"{name} {version}" for name, version in versions.items()),
         "commit": (config.get("git_commit") or "")[:10],
         "dirty": bool(config.get("dirty")),
+        "error": error,
     }
 
 

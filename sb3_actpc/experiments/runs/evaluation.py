@@ -41,11 +41,8 @@ class Predictor(Protocol):
 
 
 class NormalizedPredictor:
-    """A policy that learned from the observations of SB3's ``VecNormalize``, for those of the bare environment.
-
-    :param model: the policy
-    :param normalize: normalises n observations, (n, obs_dim)
-    """
+    """A policy that learned from the observations of SB3's ``VecNormalize``, for those of the bare environment: ``normalize``
+    is a function of n of them, (n, obs_dim)."""
 
     FILE = "normalization.npz"  # in a run's folder
 

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 from sb3_actpc.experiments.runs.evaluation import PROGRESS
-from sb3_actpc.experiments.runs.presets import demonstrations_hash
 from sb3_actpc.experiments.runs.schema import VERSION, Run
 from sb3_actpc.utils.files import atomic_write
 
@@ -45,15 +44,6 @@ def read_run(folder: Path) -> Run:
         return Run(**record, output=str(folder))
     except ValueError as error:
         raise ValueError(f"{folder / CONFIG}: {error}") from error
-
-
-def check_demonstrations(run: Run) -> None:
-    """Check that the demonstrations of a run that goes on are those that it began with."""
-    if demonstrations_hash(run) != run.demonstrations_sha256:
-        raise ValueError(
-            f"{run.folder}: the demonstrations ({run.demonstrations}) are not those that the run began with: put them back, "
-            "or start the run again in another folder"
-        )
 
 
 def write_result(folder: Path) -> dict[str, Any]:

@@ -16,12 +16,17 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_actpc.checkpoints import CheckpointCallback, DamagedCheckpoint, list_bundles, restore, why_no_checkpoints
 from sb3_actpc.demonstrations import resolve as resolve_demonstrations
 from sb3_actpc.demonstrations.recording import Report, silent
-from sb3_actpc.experiments.runs import record
 from sb3_actpc.experiments.runs.algorithms import load_algorithm
 from sb3_actpc.experiments.runs.environments import check_env_id, make_eval_envs, make_train_env
 from sb3_actpc.experiments.runs.episode_log import EpisodeLog
 from sb3_actpc.experiments.runs.evaluation import PROGRESS, EvaluationCallback, NormalizedPredictor, Predictor, play_episodes
-from sb3_actpc.experiments.runs.presets import agent_keywords, find_demonstrations, fitting_policy, resolve
+from sb3_actpc.experiments.runs.presets import (
+    agent_keywords,
+    demonstrations_hash,
+    find_demonstrations,
+    fitting_policy,
+    resolve,
+)
 from sb3_actpc.experiments.runs.provenance import git_state, package_versions
 from sb3_actpc.experiments.runs.record import CONFIG, RESULT, read_result, read_run, write_config, write_result
 from sb3_actpc.experiments.runs.schema import Run, content_id
@@ -78,7 +83,11 @@ def resume_run(
             f"the run in {folder} is finished and kept no checkpoint to go on from: train another with more --steps"
         )
     check_env_id(run.env, run.gym_packages)
-    record.check_demonstrations(run)
+    if demonstrations_hash(run) != run.demonstrations_sha256:
+        raise ValueError(
+            f"{folder}: the demonstrations ({run.demonstrations}) are not those that the run began with: put them back, "
+            "or start the run again in another folder"
+        )
     if more_steps:
         run = run.model_copy(update={"n_timesteps": (run.n_timesteps or 0) + more_steps})
         write_config(run)
@@ -151,9 +160,7 @@ def _train(
 ) -> dict[str, Any]:
     folder, checkpoints = run.folder, run.folder / CHECKPOINTS
     goes_on = resumes and bool(list_bundles(checkpoints))
-    restored = None
-    if goes_on:  # before any file of the run is touched
-        restored = restore(model, checkpoints, report)
+    restored = restore(model, checkpoints, report) if goes_on else None  # before any file of the run is touched
     folder.mkdir(parents=True, exist_ok=True)
     if not resumes:
         run = _begun(run, model)
@@ -240,13 +247,9 @@ def evaluate_run(folder: Path, n_episodes: int = 10, seed: int = 0) -> dict[str,
 
 
 def load_run(folder: Path) -> tuple[Run, Predictor]:
-    """A run and its model. The model is unpickled: open only runs that you trust.
-
-    :return: the run, and the model on the CPU, with its normalisation of observations where it has one
-    :raises FileNotFoundError: when the folder, ``config.json`` or ``model.zip`` does not exist
-    :raises ValueError: when one of the two cannot be read
-    :raises gymnasium.error.Error: when its environment is unknown
-    """
+    """A run and its model, on the CPU, with its normalisation of observations where it has one. The model is unpickled: open
+    only runs that you trust. FileNotFoundError when the folder, ``config.json`` or ``model.zip`` does not exist, ValueError
+    when one of the two cannot be read, gymnasium.error.Error when its environment is unknown."""
     run = read_run(folder)
     if not (folder / "model.zip").is_file():
         raise FileNotFoundError(f"no run in {folder}: model.zip is missing")

@@ -80,7 +80,9 @@ def record_video(
     path.parent.mkdir(parents=True, exist_ok=True)
     if path.suffix.lower() == ".png":
         with atomic_write(path) as file:
-            file.write(imageio.imwrite("<bytes>", picture_strip(frames), format="png"))
+            chosen = np.linspace(0, len(frames) - 1, STRIP_LENGTH).round().astype(int)
+            strip = np.concatenate([frames[index][::2, ::2] for index in chosen], axis=1)
+            file.write(imageio.imwrite("<bytes>", strip, format="png"))
         return len(frames)
     temporary = path.with_name(f".{path.name}{path.suffix}")  # the suffix tells imageio the format
     if path.suffix.lower() == ".gif":
@@ -91,13 +93,6 @@ def record_video(
         imageio.mimsave(temporary, frames, fps=frames_per_second, macro_block_size=2)
     temporary.replace(path)
     return len(frames)
-
-
-def picture_strip(frames: list[np.ndarray]) -> np.ndarray:
-    """``STRIP_LENGTH`` of frames (height, width, 3) from the first to the last, side by side, (height / 2, STRIP_LENGTH *
-    width / 2, 3)."""
-    chosen = np.linspace(0, len(frames) - 1, STRIP_LENGTH).round().astype(int)
-    return np.concatenate([frames[index][::2, ::2] for index in chosen], axis=1)
 
 
 @contextlib.contextmanager
