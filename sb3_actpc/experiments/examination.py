@@ -354,11 +354,9 @@ def _roll_out(
 def _memories(starts: Sequence[_Start]) -> tuple[tuple[np.ndarray, ...] | None, np.ndarray]:
     """The agent's recurrent states at the starts, and where they are to be emptied."""
     held = [start.memory for start in starts]
-    template = next((memory for memory in held if memory is not None), None)
-    if template is None:
-        return None, np.ones(len(starts), dtype=bool)
-    stacked = zip(*(template if memory is None else memory for memory in held), strict=True)
-    return tuple(np.stack(parts) for parts in stacked), np.array([memory is None for memory in held])
+    template = next((memory for memory in held if memory is not None), ())  # stands in where one is to be emptied
+    parts = [np.stack(rows) for rows in zip(*(template if memory is None else memory for memory in held), strict=True)]
+    return tuple(parts) or None, np.array([memory is None for memory in held])
 
 
 # ------------------------------------------------------------------ judging

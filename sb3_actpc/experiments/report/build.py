@@ -67,7 +67,7 @@ def write_report(folder: Path) -> list[Path]:
 def _overview(runs: pd.DataFrame) -> str:
     counts = runs["status"].value_counts().sort_index()
     begun = runs[runs["version"] != ""]
-    commits = begun["commit"].where(begun["commit"] != "", "an installed package")
+    commits = begun["commit"].replace("", "an installed package")
     return (
         f"{len(runs)} runs: {', '.join(f'{count} {status}' for status, count in counts.items())}. Environment steps: "
         f"{', '.join(f'{count:,}' for count in sorted(begun['planned_steps'].unique())) or 'none'}. sb3_actpc "
@@ -119,9 +119,8 @@ def task_table(results: Results, task: str) -> pd.DataFrame:
             row |= papers(by_algo[first["algorithm"]]) if first["algorithm"] in by_algo else {}
         rows.append(row)
     rows += _reference_rows(results, task)
-    rows += [
-        {("", "variant"): f"{row.algorithm} (paper only)", **papers(row)} for algo, row in by_algo.items() if algo not in shown
-    ]
+    only = [row for algo, row in by_algo.items() if algo not in shown]
+    rows += [{("", "variant"): f"{row.algorithm} (paper only)", **papers(row)} for row in only]
     table = pd.DataFrame(rows, columns=pd.MultiIndex.from_tuples(columns)).fillna("")
     return table.loc[:, (table != "").any()]
 
@@ -147,15 +146,12 @@ def _aggregate_sections(results: Results, folder: Path) -> list[Section]:
     scored = results.finished.dropna(subset="normalized")
     tasks = list(scored["task"].unique())
     by_label = {label: dict(tuple(runs.groupby("task")["normalized"])) for label, runs in scored.groupby("label")}
-    whole = {
-        str(label): [parts[task].to_numpy() for task in tasks] for label, parts in by_label.items() if len(parts) == len(tasks)
-    }
+    on_all = {str(label): parts for label, parts in by_label.items() if len(parts) == len(tasks)}
+    whole = {label: [parts[task].to_numpy() for task in tasks] for label, parts in on_all.items()}
     if not whole:
         return []
-    means = {
-        name: (statistics.interquartile_mean(scores), statistics.interquartile_mean_interval(scores))
-        for name, scores in whole.items()
-    }
+    mean, mean_interval = statistics.interquartile_mean, statistics.interquartile_mean_interval
+    means = {name: (mean(scores), mean_interval(scores)) for name, scores in whole.items()}
     figures.draw_aggregates(means, whole, folder / "aggregates.png")
     left_out = sorted(set(map(str, by_label)) - set(whole))
     missing = f" Left out, because not run on every one: {', '.join(left_out)}." if left_out else ""
