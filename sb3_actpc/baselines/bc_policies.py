@@ -130,11 +130,9 @@ class BCRNNPolicy(CloningPolicy):
         :param hidden: of the cells, each (n_layers, B, hidden_size); None for zeros
         :return: actions, (B, T, A), not cut to [-1, 1], and the hidden state after the last
         """
-        if hidden is None:
-            outputs, after = self.memory(inputs)
-        else:
-            outputs, after = self.memory(inputs, hidden if self.cell == "lstm" else hidden[0])
-        return self.head(outputs), after if self.cell == "lstm" else (after,)
+        is_lstm = self.cell == "lstm"
+        outputs, after = self.memory(inputs, hidden if hidden is None or is_lstm else hidden[0])
+        return self.head(outputs), after if is_lstm else (after,)
 
     def initial_state(self, n: int) -> tuple[np.ndarray, ...]:
         """The state before the first step of n episodes side by side."""
@@ -155,9 +153,7 @@ class BCRNNPolicy(CloningPolicy):
         rows, is_batch = self.obs_to_tensor(observation)
         assert isinstance(rows, th.Tensor)
         *hidden, steps = self._state_of(len(rows), state)
-        begins = np.zeros(len(rows), dtype=bool)
-        if episode_start is not None:
-            begins = np.asarray(episode_start, dtype=bool).reshape(-1)
+        begins = np.zeros(len(rows), dtype=bool) if episode_start is None else np.ravel(episode_start).astype(bool)
         if len(begins) != len(rows):
             raise ValueError(f"episode_start has {len(begins)} entries for {len(rows)} observations")
         if self.restart_every is not None:

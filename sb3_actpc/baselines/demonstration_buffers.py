@@ -125,10 +125,10 @@ def demonstration_buffer_class(
     is_dict = isinstance(observation_space, spaces.Dict)
     if n_steps > 1 and (is_dict or given is not None):
         raise ValueError(f"n_steps={n_steps} works with vector observations and replay_buffer_class=None alone; use n_steps=1")
+    if n_steps > 1:
+        return DemonstrationNStepReplayBuffer
     if given is None:
-        if is_dict:
-            return DemonstrationDictReplayBuffer
-        return DemonstrationNStepReplayBuffer if n_steps > 1 else DemonstrationReplayBuffer
+        given = DictReplayBuffer if is_dict else ReplayBuffer
     if isinstance(given, type) and issubclass(given, WithDemonstrations):
         return given
     same: dict[Any, type[WithDemonstrations]] = {
@@ -146,11 +146,10 @@ def demonstration_buffer_class(
 def join_batches(own: Any, shown: Any) -> Any:
     """Two batches of SB3's, named tuples of tensors (B, ...) and (C, ...), as one, (B + C, ...); fields that SB3 leaves at
     None stay None."""
-    columns: dict[str, Any] = {}
-    for name, mine in own._asdict().items():
-        theirs = getattr(shown, name)
+
+    def join(mine: Any, theirs: Any) -> Any:
         if isinstance(mine, dict):
-            columns[name] = {key: th.cat([part, theirs[key]]) for key, part in mine.items()}
-        else:
-            columns[name] = None if mine is None else th.cat([mine, theirs])
-    return own._replace(**columns)
+            return {key: th.cat([part, theirs[key]]) for key, part in mine.items()}
+        return None if mine is None else th.cat([mine, theirs])
+
+    return own._replace(**{name: join(mine, getattr(shown, name)) for name, mine in own._asdict().items()})

@@ -3,7 +3,7 @@
 import argparse
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from sb3_actpc.cli import add_run_options, given
 
@@ -41,9 +41,14 @@ def run(args: argparse.Namespace) -> int:
     from sb3_actpc.experiments.comparison import plan_runs, read_comparison
     from sb3_actpc.experiments.comparison.display import Display, describe_runs
     from sb3_actpc.experiments.comparison.engines import make_engine
+    from sb3_actpc.experiments.comparison.plan import read_comparison_file
     from sb3_actpc.experiments.comparison.schedule import run_comparison
 
-    comparison = read_comparison(_given(args))
+    from_file = {} if args.file is None else read_comparison_file(Path(args.file))
+    options = given(args, "envs", "algos", "ablate", "seeds", "first_seed", "output")
+    if "steps" in options:  # a file may call them n_timesteps
+        from_file.pop("n_timesteps", None)
+    comparison = read_comparison({**from_file, **options})
     runs, folder = plan_runs(comparison), Path(comparison.output)
     if args.dry_run:
         print(describe_runs(runs))
@@ -58,16 +63,6 @@ def run(args: argparse.Namespace) -> int:
             args.retry_failed,
         )
     return _conclude(summary, folder)
-
-
-def _given(args: argparse.Namespace) -> dict[str, Any]:
-    from sb3_actpc.experiments.comparison.plan import read_comparison_file
-
-    from_file = {} if args.file is None else read_comparison_file(Path(args.file))
-    options = given(args, "envs", "algos", "ablate", "seeds", "first_seed", "output")
-    if "steps" in options:  # a file may call them n_timesteps
-        from_file.pop("n_timesteps", None)
-    return {**from_file, **options}
 
 
 def _conclude(summary: "Summary", folder: Path) -> int:

@@ -83,23 +83,16 @@ class Demonstrations:
         object.__setattr__(self, "metadata", self._json_metadata())
 
     def __len__(self) -> int:
-        """Number of transitions N."""
         return len(self.observations)
 
     def __repr__(self) -> str:
-        """What there is, in one line."""
         returns = f"mean return {self.episode_returns.mean():.1f}"
         if self.dense_returns is not None:
             returns += f" (dense {self.dense_returns.mean():.1f})"
-        parts = [
-            f"{self.n_episodes} episodes",
-            f"{len(self)} transitions",
-            f"observations of {self.observations.shape[1]}",
-            f"actions of {self.actions.shape[1]}",
-            returns,
-            *([f"from {self.source}"] if self.source else []),
-        ]
-        return f"Demonstrations({self.env_id}: {', '.join(parts)})"
+        sizes = f"observations of {self.observations.shape[1]}, actions of {self.actions.shape[1]}"
+        source = f", from {self.source}" if self.source else ""
+        counts = f"{self.n_episodes} episodes, {len(self)} transitions"
+        return f"Demonstrations({self.env_id}: {counts}, {sizes}, {returns}{source})"
 
     @property
     def n_episodes(self) -> int:
@@ -265,7 +258,12 @@ class Demonstrations:
             raise self._error("actions", "a Box action space", repr(action_space))
         if self.actions.shape[1] != flat_size(action_space):
             raise self._error("actions", f"{flat_size(action_space)} values a row", f"{self.actions.shape[1]}")
-        self._check_action_bounds(action_space.low.reshape(-1), action_space.high.reshape(-1))
+        low, high, actions = action_space.low.ravel(), action_space.high.ravel(), self.actions.astype(np.float64)
+        outside = (actions < low - ACTION_TOLERANCE) | (actions > high + ACTION_TOLERANCE)
+        if outside.any():
+            row, column = (int(index) for index in np.argwhere(outside)[0])
+            expected = f"values in [{low[column]}, {high[column]}] in column {column}"
+            raise self._error("actions", expected, f"{self.actions[row, column]} at transition {row}")
 
     def rewarded_by(self, env: VecEnv) -> Demonstrations:
         """The same transitions with the rewards that ``env`` gives for them, under its own condition and threshold, by its
@@ -382,14 +380,6 @@ class Demonstrations:
         if not is_whole or not 1 <= count <= available:
             prefix = f"{self.source}: " if self.source else ""
             raise ValueError(f"{prefix}{name} must be a whole number from 1 to {available}, found {count!r}")
-
-    def _check_action_bounds(self, low: np.ndarray, high: np.ndarray) -> None:
-        actions = self.actions.astype(np.float64)
-        outside = (actions < low - ACTION_TOLERANCE) | (actions > high + ACTION_TOLERANCE)
-        if outside.any():
-            row, column = (int(index) for index in np.argwhere(outside)[0])
-            expected = f"values in [{low[column]}, {high[column]}] in column {column}"
-            raise self._error("actions", expected, f"{self.actions[row, column]} at transition {row}")
 
 
 def shipped_demonstrations(env_id: str, weak: bool = False) -> Path:

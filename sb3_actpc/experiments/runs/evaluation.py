@@ -254,7 +254,11 @@ class EvaluationCallback(CsvCallback):
                 self.logger.record(f"eval/{name}", self.last_summary[name])
         self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
         self.logger.dump(self.num_timesteps)  # a row of the agent's own figures beside each evaluation
-        self.report(_evaluation_line(self.num_timesteps, self.last_summary))
+        summary, success = self.last_summary, self.last_summary["success_rate"]
+        self.report(
+            f"step {self.num_timesteps:>8}  dense return {summary['dense_return']:9.1f} ± {summary['dense_return_std']:<7.1f} "
+            f"sparse return {summary['sparse_return']:7.1f}  success {'n/a' if success is None else f'{success:.2f}'}"
+        )
 
     def _keep_model(self, dense_return: float) -> None:
         if not self.keeps_best or dense_return >= self.best_return:
@@ -262,11 +266,3 @@ class EvaluationCallback(CsvCallback):
             with atomic_write(self.folder / "model.zip") as file:
                 self.model.save(cast(BufferedIOBase, file))
         self.best_return = max(self.best_return, dense_return)
-
-
-def _evaluation_line(timesteps: int, summary: dict[str, float | None]) -> str:
-    success = summary["success_rate"]
-    return (
-        f"step {timesteps:>8}  dense return {summary['dense_return']:9.1f} ± {summary['dense_return_std']:<7.1f} "
-        f"sparse return {summary['sparse_return']:7.1f}  success {'n/a' if success is None else f'{success:.2f}'}"
-    )
