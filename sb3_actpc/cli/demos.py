@@ -211,7 +211,7 @@ def _read_hdf5(args: argparse.Namespace) -> "Demonstrations":
 
 
 def _download(args: argparse.Namespace) -> int:
-    from sb3_actpc.demonstrations.download import download_robomimic, robomimic_url
+    from sb3_actpc.demonstrations.robomimic import download_robomimic, robomimic_url
 
     url = args.url or robomimic_url(args.env, args.kind)
     output = args.output or _default_output(args.env, f"_{args.kind}")

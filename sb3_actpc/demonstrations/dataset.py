@@ -223,13 +223,9 @@ class Demonstrations:
             yield {name: column[start:end] for name, column in columns.items()}
 
     def select(self, n_episodes: int | None = None, n_transitions: int | None = None) -> Demonstrations:
-        """The first episodes, or the first transitions; the last episode is then cut short where the limit falls.
-
-        :param n_episodes: how many episodes to keep, or None for all
-        :param n_transitions: how many transitions to keep of those, or None for all
-        :return: the selection (its arrays are views)
-        :raises ValueError: when a number is not a whole number of at least 1, or is more than there is
-        """
+        """The first ``n_episodes``, or of those the first ``n_transitions`` (None for all): the last episode is then cut short
+        where the limit falls, and the arrays are views. ValueError when a number is not a whole one of at least 1, or is more
+        than there is."""
         end = len(self)
         if n_episodes is not None:
             self._check_count("n_episodes", n_episodes, self.n_episodes)
@@ -279,12 +275,9 @@ class Demonstrations:
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Demonstrations:
-        """Read a file written by :meth:`save`, bit for bit as it was; never unpickles.
-
-        :raises FileNotFoundError: when there is no such file
-        :raises ValueError: when the file is empty, cut short, damaged, lacks a field, holds one of a wrong type, or has a
-            newer format; the message names the file and the field
-        """
+        """Read a file written by :meth:`save`, bit for bit as it was; never unpickles. FileNotFoundError when there is no such
+        file; ValueError names the file and the field when it is empty, cut short, damaged, lacks a field, holds one of a wrong
+        type, or has a newer format."""
         return cls(**read_npz(path))
 
     @classmethod
@@ -383,13 +376,9 @@ class Demonstrations:
 
 
 def shipped_demonstrations(env_id: str, weak: bool = False) -> Path:
-    """The demonstrations file of a sparse task that comes with the package.
-
-    :param env_id: Gymnasium id, such as ``SparseHalfCheetah-v5``
-    :param weak: the file of a weaker demonstrator, with about half the return; only the HalfCheetah has one
-    :return: its path
-    :raises FileNotFoundError: when none is shipped; the message says how to collect them
-    """
+    """The demonstrations file of a sparse task, such as ``SparseHalfCheetah-v5``, that comes with the package; ``weak`` is
+    that of a weaker demonstrator, with about half the return, which only the HalfCheetah has. FileNotFoundError, which says
+    how to collect them, when none is shipped."""
     path = DATA_FOLDER / f"sparse_{base_name(env_id).removeprefix('Sparse').lower()}{'_weak' if weak else ''}.npz"
     if not path.is_file():
         raise FileNotFoundError(

@@ -21,13 +21,10 @@ MINARI_ID = re.compile(r"([\w-]+/)*[\w-]+-v\d+")
 def resolve(
     source: str | os.PathLike[str] | Demonstrations, observation_space: spaces.Space[Any] | None = None
 ) -> Demonstrations:
-    """Demonstrations from the path of an ``.npz`` file or the id of a local Minari dataset, or as they are.
-
-    :param observation_space: the environment's, whose order a Minari dataset's Dict is flattened in; None for its own order
-    :raises FileNotFoundError: when there is no such file or dataset
-    :raises ImportError: when it is a Minari id and Minari is not installed
-    :raises ValueError: when the file is not valid, or ``source`` is neither
-    """
+    """Demonstrations from the path of an ``.npz`` file or the id of a local Minari dataset, whose Dict is flattened in the
+    order of the environment's ``observation_space`` (None for its own), or as they are. FileNotFoundError when there is no
+    such file or dataset, ImportError when Minari is not installed, ValueError when the file is not valid, or ``source`` is
+    neither."""
     if isinstance(source, Demonstrations):
         return source
     if is_minari_id(source):

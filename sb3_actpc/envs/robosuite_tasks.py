@@ -102,12 +102,9 @@ class SparseRobosuiteEnv(gym.Env[np.ndarray, np.ndarray], utils.EzPickle):
         return self._observe(), {"is_success": False, "stage": self.stages[0]}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Advance by one control step, 1/20 s.
-
-        :param action: (7,)
-        :return: observation (obs_dim,), reward (1 on success, else 0), terminated (success), truncated (the horizon), info
-            with ``dense_reward`` (float), ``is_success`` (bool) and ``stage`` (str)
-        """
+        """Advance by one control step, 1/20 s, with an action (7,): observation (obs_dim,), reward (1 on success, else 0),
+        terminated (success), truncated (the horizon), info with ``dense_reward`` (float), ``is_success`` (bool) and ``stage``
+        (str)."""
         dense_reward = float(self._simulation.step(np.asarray(action, dtype=np.float64))[1])
         self._elapsed_steps += 1
         observation = self._observe()

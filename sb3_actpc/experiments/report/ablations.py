@@ -7,11 +7,10 @@ import pandas as pd
 
 from sb3_actpc.experiments.comparison.variants import ablation_variants
 from sb3_actpc.experiments.report.figures import MEASURE_NAMES, draw_ablation
-from sb3_actpc.experiments.report.page import Section
+from sb3_actpc.experiments.report.page import Section, interval, mean_and_deviation, number
 from sb3_actpc.experiments.report.references import measure_of
 from sb3_actpc.experiments.report.results import Results
 from sb3_actpc.experiments.report.statistics import mean_interval
-from sb3_actpc.experiments.report.tables import interval, mean_and_deviation, number
 
 NO_EFFECT = "NO: the part did nothing"
 

@@ -11,12 +11,11 @@ from sb3_actpc.experiments.comparison.execution import FINISHED
 from sb3_actpc.experiments.report import figures, statistics
 from sb3_actpc.experiments.report.ablations import ablation_sections
 from sb3_actpc.experiments.report.figures import MEASURE_NAMES
-from sb3_actpc.experiments.report.page import Section, write_pages
+from sb3_actpc.experiments.report.page import UNDEFINED, Section, interval, mean_and_deviation, number, write_pages
 from sb3_actpc.experiments.report.r_stability import N_EPISODES, WINDOW
 from sb3_actpc.experiments.report.references import measure_of, paper_results, reference_score
 from sb3_actpc.experiments.report.results import Results, load_results, write_runs
 from sb3_actpc.experiments.report.statistics import Scores
-from sb3_actpc.experiments.report.tables import UNDEFINED, interval, mean_and_deviation, number
 
 REFRESH_ALONE = "refresh_alone"
 LAST, TRAINING, STABILITY, PAPER = "last evaluation", f"last {WINDOW} training episodes", "R-stability", "paper"

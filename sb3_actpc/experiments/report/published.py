@@ -32,9 +32,9 @@ import pandas as pd
 import yaml
 
 from sb3_actpc.experiments.report.figures import reference_lines
+from sb3_actpc.experiments.report.page import UNDEFINED, markdown, number
 from sb3_actpc.experiments.report.references import measure_of, paper_results
 from sb3_actpc.experiments.report.results import load_results
-from sb3_actpc.experiments.report.tables import UNDEFINED, markdown, number
 from sb3_actpc.utils.files import atomic_write
 
 _MARKER = re.compile(r"(<!-- table: (\S+) (\S+) -->\n).*?(<!-- /table -->)", re.DOTALL)
