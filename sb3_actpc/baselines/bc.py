@@ -34,8 +34,6 @@ class BC(OfflineAlgorithm):
         self.weight_decay, self.input_noise = weight_decay, input_noise
         super().__init__(*args, **options)
 
-    # ------------------------------------------------------------------ setting up
-
     def _setup_model(self) -> None:
         self._setup_lr_schedule()
         self.set_random_seed(self.seed)
@@ -57,8 +55,6 @@ class BC(OfflineAlgorithm):
         self._observations, self._actions = self.policy.normalized(rows), th.as_tensor(actions, device=self.device)
         bounds = shown.episode_bounds
         self._episode_ends = th.as_tensor(np.repeat(bounds[:, 1], bounds[:, 1] - bounds[:, 0]), device=self.device)
-
-    # ------------------------------------------------------------------ learning
 
     def train(self) -> None:
         """One gradient step."""
@@ -82,8 +78,6 @@ class BC(OfflineAlgorithm):
         assert self._observations is not None
         inputs = self._observations[rows]
         return inputs + self.input_noise * th.randn_like(inputs) if self.input_noise else inputs
-
-    # ------------------------------------------------------------------ saving
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_observations", "_actions", "_episode_ends"]

@@ -89,8 +89,6 @@ class LOGO(LearnsFromDemonstrations, TRPO):
         self._past_returns: deque[float] = deque(maxlen=10)
         super().__init__(*args, **{"cg_max_steps": 10, "line_search_shrinking_factor": 0.5, **options})
 
-    # ------------------------------------------------------------------ setting up
-
     def _setup_model(self) -> None:
         super()._setup_model()
         self._shown: th.Tensor | None = None
@@ -116,8 +114,6 @@ class LOGO(LearnsFromDemonstrations, TRPO):
         super().set_env(env, force_reset)
         if self.demonstrations is not None:
             self._load_demonstrations()
-
-    # ------------------------------------------------------------------ learning
 
     def _update_info_buffer(self, infos: list[dict[str, Any]], dones: np.ndarray | None = None) -> None:
         super()._update_info_buffer(infos, dones)
@@ -231,8 +227,6 @@ class LOGO(LearnsFromDemonstrations, TRPO):
                 self.delta = max(self.delta * self.guidance_decay, self.guidance_delta_min)
             self._past_returns.append(mean)
         self._iteration_returns = []
-
-    # ------------------------------------------------------------------ saving
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_shown", *_NETS]

@@ -80,8 +80,6 @@ class TD3Demo(DemonstratedAlgorithm, TD3):
                 for group in optimizer.param_groups:
                     group["lr"] = own * progress
 
-    # ------------------------------------------------------------------ learning
-
     def train(self, gradient_steps: int, batch_size: int = 100) -> None:
         """TD3's updates: so many of the critic; the actor and the targets follow every ``policy_delay``."""
         assert self.replay_buffer is not None

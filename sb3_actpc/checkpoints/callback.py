@@ -85,8 +85,6 @@ class CheckpointCallback(BaseCallback):
             self.report(f"step {model.num_timesteps:>8}  saved in {path}")
         return path
 
-    # ------------------------------------------------------------------ hooks
-
     def _init_callback(self) -> None:
         if why_no_checkpoints(type(self.model)):
             raise ValueError(f"{type(self.model).__name__} {why_no_checkpoints(type(self.model))}: leave the callback out")
@@ -168,9 +166,6 @@ def between_updates(callback: BaseCallback) -> Callable[[], None]:
             saver._resume_or_stop()
 
     return resume_or_stop
-
-
-# ---------------------------------------------------------------------- going on
 
 
 def restore(model: BaseAlgorithm, path: str | os.PathLike[str], report: Report = warn) -> Restored:

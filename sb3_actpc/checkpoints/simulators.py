@@ -88,9 +88,6 @@ def restore_vec_env(env: VecEnv, record: dict[str, Any], decoder: Decoder) -> li
     return lost
 
 
-# ------------------------------------------------------------------ one environment
-
-
 def capture_env(env: gym.Env[Any, Any], encoder: Encoder, where: str) -> dict[str, Any]:
     """The state of one environment and its wrappers as JSON, ``where`` being its path in the checkpoint; with a "reason"
     where it cannot be stored."""
@@ -148,9 +145,6 @@ def set_attribute(owner: Any, name: str, node: Any, decoder: Decoder) -> None:
     value = decoder.decode(node, existing)
     if value is not existing:
         setattr(owner, name, value)
-
-
-# ------------------------------------------------------------------ MuJoCo
 
 
 def capture_physics(model: Any, data: Any) -> dict[str, np.ndarray]:

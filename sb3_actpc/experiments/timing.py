@@ -87,9 +87,6 @@ def table(files: list[Path]) -> str:
     return markdown(pd.DataFrame(rows, columns=heads))
 
 
-# ---------------------------------------------------------------------- one update
-
-
 def updates(device: str, compiled: bool) -> Group:
     """TD3's; the bare agent's and the shipped one's with every kind of settling, the paper's preset, and both presets with
     products in bfloat16 where the processor has them."""
@@ -153,9 +150,6 @@ def _products(circuit: NGCCircuit, batch: int, of_update: bool = False) -> Calla
     return products
 
 
-# ---------------------------------------------------------------------- training and acting
-
-
 def training(device: str) -> list[Group]:
     """Every task's learners, one update for each environment step, batch and layers alike; SBX's where ``sbx-rl`` is
     installed."""
@@ -207,9 +201,6 @@ def acting() -> Group:
     return entries, {"NumPy, one observation": "NumPy's time"}
 
 
-# ---------------------------------------------------------------------- growth
-
-
 def growth() -> list[Group]:
     """What grows with K, width, batch and number of environments, over the smallest of its kind, and its matrix products."""
     groups: list[Group] = []
@@ -245,9 +236,6 @@ def memory_ratio() -> float:
         for kind in (CombinedReplayBuffer, ReplayBuffer)
     )
     return ours / theirs
-
-
-# ---------------------------------------------------------------------- robosuite
 
 
 def robosuite(rounds: int) -> Iterator[str]:

@@ -21,7 +21,8 @@ LARGEST_SIZE = 2**31 - 1
 
 def _is(kind: type, largest: float, value: Any) -> bool:
     """Whether it is a number of the kind, finite and not too large (whole numbers of any size can be compared)."""
-    return isinstance(value, kind) and bool(abs(value) <= largest)
+    is_kind = isinstance(value, kind)
+    return is_kind and bool(abs(value) <= largest)
 
 
 _is_number = partial(_is, Real, LARGEST_NUMBER)

@@ -90,8 +90,6 @@ class ServedAlgorithm(OfflineAlgorithm):
         self._state_names: list[str] = []
         super().__init__(*args, batch_size=batch_size, **options)
 
-    # ------------------------------------------------------------------ setting up
-
     def _setup_model(self) -> None:
         if not isinstance(self.observation_space, spaces.Box):
             raise ValueError(f"{type(self).__name__} needs Box observations, found {self.observation_space}")
@@ -171,8 +169,6 @@ class ServedAlgorithm(OfflineAlgorithm):
             self._process.close()
             self._process = None
 
-    # ------------------------------------------------------------------ learning and acting
-
     def train(self) -> None:
         """One gradient step of every part of the method."""
         losses, _ = self._server().ask("train")
@@ -194,8 +190,6 @@ class ServedAlgorithm(OfflineAlgorithm):
             raise ValueError(f"{self.package}'s {self.method.upper()} has no finite action for every observation")
         self._state_names = list(answer)
         return actions, tuple(answer.values()) or None
-
-    # ------------------------------------------------------------------ saving
 
     def save(self, path: Any, exclude: Any = None, include: Any = None) -> None:
         """As SB3's; the networks are fetched first."""

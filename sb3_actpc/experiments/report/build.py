@@ -76,9 +76,6 @@ def _overview(runs: pd.DataFrame) -> str:
     )
 
 
-# ------------------------------------------------------------------ a task
-
-
 def _task_section(results: Results, task: str, folder: Path) -> Section:
     picture = f"curves_{task}.png"
     figures.draw_curves(results, task, folder / picture)
@@ -137,9 +134,6 @@ def _reference_rows(results: Results, task: str) -> list[dict[tuple[str, str], s
     return rows
 
 
-# ------------------------------------------------------------------ across tasks
-
-
 def _aggregate_sections(results: Results, folder: Path) -> list[Section]:
     """Statistics over all tasks with reference scores, of the variants that were run on each of them."""
     scored = results.finished.dropna(subset="normalized")
@@ -176,9 +170,6 @@ def _improvement_section(scores: Mapping[str, Scores]) -> list[Section]:
         rows.append((f"{name} over {other}", number(value, ".2f"), interval(bounds, ".2f")))
     table = pd.DataFrame(rows, columns=["pair", "probability", "95 % interval"])
     return [Section("Probability of improvement", table=table, level=3)] if rows else []
-
-
-# ------------------------------------------------------------------ inside the agent
 
 
 def _diagnostic_section(results: Results, task: str, folder: Path) -> list[Section]:
