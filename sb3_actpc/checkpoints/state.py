@@ -157,14 +157,11 @@ def replay_buffer(model: BaseAlgorithm) -> ReplayBuffer | None:
 
 def buffer_arrays(buffer: ReplayBuffer) -> dict[str, np.ndarray]:
     """A replay buffer's arrays with a row per step, (buffer_size, n_envs, ...), by name; dictionaries' as ``name.key``."""
-    arrays: dict[str, np.ndarray] = {}
+    parts = {name: value for name, value in vars(buffer).items() if name not in _BUFFER_CURSORS}
     for name, value in vars(buffer).items():
-        parts = {f"{name}.{key}": part for key, part in value.items()} if isinstance(value, dict) else {name: value}
-        for path, part in parts.items():
-            if isinstance(part, np.ndarray) and part.dtype != object and name not in _BUFFER_CURSORS:
-                if part.shape[:1] == (buffer.buffer_size,):
-                    arrays[path] = part
-    return arrays
+        parts |= {f"{name}.{key}": part for key, part in value.items()} if isinstance(value, dict) else {}
+    arrays = {name: part for name, part in parts.items() if isinstance(part, np.ndarray) and part.dtype != object}
+    return {name: array for name, array in arrays.items() if array.shape[:1] == (buffer.buffer_size,)}
 
 
 def _capture_buffer(buffer: ReplayBuffer, encoder: Encoder, writer: BundleWriter) -> dict[str, Any]:
@@ -279,8 +276,7 @@ def _restore_logger(model: BaseAlgorithm, record: dict[str, Any], decoder: Decod
         output.file.truncate()
         output.file.write(text)
         output.file.flush()
-        header = text.partition("\n")[0]
-        output.keys = header.split(",") if header else []
+        output.keys = list(filter(None, text.partition("\n")[0].split(",")))
 
 
 # ------------------------------------------------------------------ reading
@@ -343,7 +339,7 @@ def _check_fit(mine: dict[str, Any], bundle: Bundle) -> None:
                 "with the settings and the task of the stopped run"
             )
     theirs, own = stored["weights"], mine["weights"]
-    for name in [*own, *(name for name in theirs if name not in own)]:
+    for name in {**own, **theirs}:
         if theirs.get(name) != own.get(name):
             raise ValueError(
                 f"{bundle.path} is a checkpoint of another network: {name} has shape {theirs.get(name)}, the agent's "

@@ -5,7 +5,6 @@ from pathlib import Path
 
 
 def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Add the sub-command."""
     parser = subparsers.add_parser("baselines", help="install what the baselines of other packages need")
     commands = parser.add_subparsers(dest="baselines_command", required=True, metavar="{install}")
     install = commands.add_parser(

@@ -8,7 +8,6 @@ from typing import Any
 
 
 def add_parser(subparsers: Any) -> None:
-    """Add the sub-command."""
     parser = subparsers.add_parser("bench", help="time one update of ActPC against SB3's TD3")
     parser.add_argument("--rounds", type=int, default=40, help="interleaved measurements of every entry")
     parser.add_argument("--threads", type=int, default=None, help="torch threads (default: torch's own choice)")

@@ -12,7 +12,6 @@ if TYPE_CHECKING:
 
 
 def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Add the sub-command."""
     parser = subparsers.add_parser(
         "compare",
         help="train several algorithms on several tasks with several seeds",

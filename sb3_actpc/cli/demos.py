@@ -17,7 +17,6 @@ HDF5_SUFFIXES = (".hdf5", ".h5")
 
 
 def add_parser(subparsers: Subparsers) -> None:
-    """Add the sub-command."""
     parser = subparsers.add_parser("demos", help="make or look at demonstration files")
     commands = parser.add_subparsers(dest="demos_command", required=True, metavar="{collect,convert,download,info}")
     _add_collect(commands)
@@ -91,7 +90,6 @@ def _add_download(commands: Subparsers) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run the sub-command."""
     commands = {"collect": _collect, "convert": _convert, "download": _download, "info": _info}
     return commands[args.demos_command](args)
 

@@ -5,7 +5,6 @@ from pathlib import Path
 
 
 def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Add the sub-command."""
     parser = subparsers.add_parser(
         "evaluate",
         help="replay the agent of a run",

@@ -5,7 +5,6 @@ from pathlib import Path
 
 
 def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Add the sub-command."""
     parser = subparsers.add_parser(
         "examine",
         help="ask whether an agent's critic is worth following",

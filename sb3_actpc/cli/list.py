@@ -7,7 +7,6 @@ KINDS = ("tasks", "algos", "presets", "demos")
 
 
 def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Add the sub-command."""
     parser = subparsers.add_parser("list", help="what there is: tasks, algorithms, presets, demonstrations")
     parser.add_argument("kind", choices=KINDS, help="tasks (--env), algos (--algo, and variants of compare), presets, demos")
 

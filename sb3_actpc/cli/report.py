@@ -6,7 +6,6 @@ from pathlib import Path
 
 
 def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Add the sub-command."""
     parser = subparsers.add_parser(
         "report",
         help="tables and figures of a comparison",

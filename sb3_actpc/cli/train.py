@@ -4,16 +4,11 @@ import argparse
 import shlex
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from sb3_actpc.cli import add_run_options, given
 
-if TYPE_CHECKING:
-    from sb3_actpc.experiments.runs import Run
-
 
 def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Add the sub-command."""
     parser = subparsers.add_parser(
         "train",
         help="train an agent on a sparse-reward task",
@@ -38,12 +33,16 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
 def run(args: argparse.Namespace) -> int:
     """Train, then print the table; 75 when a signal stopped the run after everything was saved."""
     from sb3_actpc.checkpoints import EXIT_STOPPED, TrainingStopped
-    from sb3_actpc.experiments.runs import resume_run, train_run
+    from sb3_actpc.experiments.runs import Run, resume_run, train_run
+    from sb3_actpc.experiments.runs.presets import parse_assignments
     from sb3_actpc.experiments.runs.summary import result_table
 
     try:
         if args.resume is None:
-            result = train_run(_run(args), report=_report)
+            settings, env_kwargs = parse_assignments(args.set or ()), parse_assignments(args.env_kwarg or ())
+            chosen = given(args, "env", "algo", "preset", "seed", "output", "n_envs")
+            run = Run(**chosen, settings=settings, env_kwargs=env_kwargs, progress=not args.no_progress)
+            result = train_run(run, report=_report)
         else:
             _check_only_resume(args)
             result = resume_run(Path(args.resume), _report, not args.no_progress, more_steps=args.steps or 0)
@@ -67,12 +66,3 @@ def _check_only_resume(args: argparse.Namespace) -> None:
     if wrong:
         option = "--" + wrong[0].replace("_", "-")
         raise ValueError(f"{option} cannot be given with --resume: the run goes on with its own settings, leave it out")
-
-
-def _run(args: argparse.Namespace) -> "Run":
-    from sb3_actpc.experiments.runs import Run
-    from sb3_actpc.experiments.runs.presets import parse_assignments
-
-    settings, env_kwargs = parse_assignments(args.set or ()), parse_assignments(args.env_kwarg or ())
-    chosen = given(args, "env", "algo", "preset", "seed", "output", "n_envs")
-    return Run(**chosen, settings=settings, env_kwargs=env_kwargs, progress=not args.no_progress)

@@ -46,7 +46,6 @@ NET_ARCHS = {"small": [64, 64], "medium": [256, 256], "big": [400, 300]}
 
 
 def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Add the sub-command."""
     commands = "\n".join(f"  {name:15s} {about}" for name, (_, about) in SCRIPTS.items())
     parser = subparsers.add_parser(
         "zoo",
@@ -164,12 +163,10 @@ def sample_actpc_params(trial: Any, n_actions: int, n_envs: int, additional_args
 
 def convert_actpc_params(sampled: dict[str, Any]) -> dict[str, Any]:
     """Keywords of ActPC from the parameters of a trial, as :func:`sample_actpc_params` named them."""
-    params = {name: sampled[name] for name in ("learning_rate", "tau", "actor_pressure", "refresh_weight")}
+    as_they_are = ("learning_rate", "tau", "actor_pressure", "refresh_weight", "alpha_ep", "alpha_in")
     return {
-        **params,
+        **{name: sampled[name] for name in as_they_are},
         "refresh_kwargs": {"noise": sampled["refresh_noise"], "weighting": sampled["refresh_weighting"]},
-        "alpha_ep": sampled["alpha_ep"],
-        "alpha_in": sampled["alpha_in"],
         "gamma": 1.0 - sampled["one_minus_gamma"],
         "batch_size": 2 ** sampled["batch_size_pow"],
         "policy_kwargs": {
@@ -212,8 +209,7 @@ def _training_arguments(arguments: Sequence[str], folder: Path, optimize: bool) 
         conf_file = folder / f"{ours.algo}.yml"
         conf_file.write_text(yaml.safe_dump({ours.env: _zoo_settings(ours)}, sort_keys=False), encoding="utf-8")
         ours.conf_file = str(conf_file)
-    passed = ["--algo", ours.algo, "--env", ours.env, "--conf-file", ours.conf_file, "--log-folder", ours.log_folder]
-    passed += ["--gym-packages", *ours.gym_packages] if ours.gym_packages else []
+    passed = ["--gym-packages", *ours.gym_packages] if ours.gym_packages else []
     if optimize:
         samplers = import_extra("rl_zoo3.hyperparams_opt", "zoo").HYPERPARAMS_SAMPLER
         if ours.algo not in samplers:
@@ -223,7 +219,7 @@ def _training_arguments(arguments: Sequence[str], folder: Path, optimize: bool) 
         ours.study_name = ours.study_name or f"{ours.algo}_{ours.env}"
         # a journal: several processes can work on it, and a stopped search goes on
         ours.storage = ours.storage or os.path.join(ours.log_folder, ours.algo, f"{ours.study_name}.log")
-    for option in ("trained_agent", "storage", "study_name"):
+    for option in ("algo", "env", "conf_file", "log_folder", "trained_agent", "storage", "study_name"):
         passed += [f"--{option.replace('_', '-')}", getattr(ours, option)] if getattr(ours, option) else []
     return [*passed, *rest]
 

@@ -162,14 +162,12 @@ class ScriptedDemonstrator:
         return target, CLOSE, bool(self.task.name == "PickPlaceCan" and view.object_position[2] > height)
 
     def _carry(self, view: View) -> tuple[np.ndarray, float, bool]:
-        to_bin = CAN_BIN_CENTRE - view.object_position[:2]
-        target = view.eef_position + np.array([*to_bin, CARRYING_HEIGHT - view.object_position[2]])
-        return target, CLOSE, bool(np.linalg.norm(to_bin) < 0.05)
+        way = np.array([*CAN_BIN_CENTRE, CARRYING_HEIGHT]) - view.object_position
+        return view.eef_position + way, CLOSE, bool(np.linalg.norm(way[:2]) < 0.05)
 
     def _lower(self, view: View) -> tuple[np.ndarray, float, bool]:
-        to_bin = CAN_BIN_CENTRE - view.object_position[:2]
-        target = view.eef_position + np.array([*to_bin, CAN_STANDING_HEIGHT - view.object_position[2]])
-        return target, CLOSE, bool(view.object_position[2] < CAN_STANDING_HEIGHT + 0.02)
+        way = np.array([*CAN_BIN_CENTRE, CAN_STANDING_HEIGHT]) - view.object_position
+        return view.eef_position + way, CLOSE, bool(view.object_position[2] < CAN_STANDING_HEIGHT + 0.02)
 
     def _release(self, view: View) -> tuple[np.ndarray, float, bool]:
         """Open, then move up and away, which ends the episode."""
@@ -213,10 +211,8 @@ class ScriptedDemonstrator:
         if self.task.name == "PickPlaceCan":
             return yaw_of(multiply(view.eef_quat, POINTING_DOWN * CONJUGATE))
         if self._yaw is None or self.stage == "reach":
-            start = 0.0 if self._yaw is None else self._yaw
-            quarter = np.pi / 2.0
-            turn = yaw_of(view.object_quat) - start
-            self._yaw = start + (turn + quarter / 2.0) % quarter - quarter / 2.0
+            start, quarter = self._yaw or 0.0, np.pi / 2.0
+            self._yaw = start + (yaw_of(view.object_quat) - start + quarter / 2.0) % quarter - quarter / 2.0
         return self._yaw
 
     def _disturb(self, command: np.ndarray) -> np.ndarray:

@@ -191,11 +191,11 @@ def acting() -> Group:
             h = np.clip(h @ weights.T + bias, 0.0, 6.0)
         return np.tanh(h @ layers[-1][0].T + layers[-1][1])
 
-    circuits = [agent.actor.circuit]
+    circuit = agent.actor.circuit
     entries: Entries = {
         "NumPy, one observation": by_numpy,
-        "the circuit, one observation": lambda: agent.actor.circuit.project(agent.inputs.tensor(observation)),
-        "collecting, one observation": lambda: agent.actor.roll_out(observation, None, None, circuits),
+        "the circuit, one observation": lambda: circuit.project(agent.inputs.tensor(observation)),
+        "collecting, one observation": lambda: agent.actor.roll_out(observation, None, None, [circuit]),
         "predict(), one observation": lambda: agent.predict(observation),
     }
     return entries, {"NumPy, one observation": "NumPy's time"}

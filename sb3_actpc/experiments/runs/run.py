@@ -299,14 +299,12 @@ def close_model(model: Any) -> None:
 
 def _learn(model: BaseAlgorithm, n_timesteps: int, callbacks: list[BaseCallback], progress: bool, goes_on: bool) -> None:
     # what progress_bar=True does, but closed when training stops early
-    bar = [ProgressBarCallback()] if progress else []
-    left = n_timesteps - model.num_timesteps
+    everything = [*callbacks, *([ProgressBarCallback()] if progress else [])]
     try:
-        model.learn(max(left, 0), callback=[*callbacks, *bar], reset_num_timesteps=not goes_on)
+        model.learn(max(n_timesteps - model.num_timesteps, 0), callback=everything, reset_num_timesteps=not goes_on)
     finally:
-        for callback in callbacks:
+        for callback in everything:
             if isinstance(callback, CheckpointCallback):
                 callback.close()
-        for one in bar:
-            if hasattr(one, "pbar"):
-                one.pbar.close()
+            elif isinstance(callback, ProgressBarCallback) and hasattr(callback, "pbar"):
+                callback.pbar.close()
