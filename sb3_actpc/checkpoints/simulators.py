@@ -21,18 +21,12 @@ _IN_ARENA = ("efc_", "contact", "iefc_", "iM", "iLD", "iacc", "ifrc_")
 
 def vec_env_layers(env: VecEnv) -> list[VecEnv]:
     """The environment, the one it wraps, and so on, outermost first."""
-    layers = [env]
-    while isinstance(layers[-1], VecEnvWrapper):
-        layers.append(layers[-1].venv)
-    return layers
+    return [env, *vec_env_layers(env.venv)] if isinstance(env, VecEnvWrapper) else [env]
 
 
 def env_layers(env: gym.Env[Any, Any]) -> list[gym.Env[Any, Any]]:
     """The wrappers of one environment, outermost first, and the environment itself."""
-    layers = [env]
-    while isinstance(layers[-1], gym.Wrapper):
-        layers.append(layers[-1].env)
-    return layers
+    return [env, *env_layers(env.env)] if isinstance(env, gym.Wrapper) else [env]
 
 
 def env_name(env: VecEnv) -> str:

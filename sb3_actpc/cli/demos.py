@@ -3,6 +3,7 @@
 import argparse
 import shlex
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +15,7 @@ if TYPE_CHECKING:
 Subparsers = Any  # argparse's own type is private
 
 HDF5_SUFFIXES = (".hdf5", ".h5")
+_report = partial(print, flush=True)
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -92,10 +94,6 @@ def _add_download(commands: Subparsers) -> None:
 def run(args: argparse.Namespace) -> int:
     commands = {"collect": _collect, "convert": _convert, "download": _download, "info": _info}
     return commands[args.demos_command](args)
-
-
-def _report(line: str) -> None:
-    print(line, flush=True)
 
 
 def _collect(args: argparse.Namespace) -> int:

@@ -3,6 +3,7 @@
 import argparse
 import shlex
 import sys
+from functools import partial
 from pathlib import Path
 
 from sb3_actpc.cli import add_run_options, given
@@ -37,15 +38,16 @@ def run(args: argparse.Namespace) -> int:
     from sb3_actpc.experiments.runs.presets import parse_assignments
     from sb3_actpc.experiments.runs.summary import result_table
 
+    report = partial(print, flush=True)
     try:
         if args.resume is None:
             settings, env_kwargs = parse_assignments(args.set or ()), parse_assignments(args.env_kwarg or ())
             chosen = given(args, "env", "algo", "preset", "seed", "output", "n_envs")
             run = Run(**chosen, settings=settings, env_kwargs=env_kwargs, progress=not args.no_progress)
-            result = train_run(run, report=_report)
+            result = train_run(run, report)
         else:
             _check_only_resume(args)
-            result = resume_run(Path(args.resume), _report, not args.no_progress, more_steps=args.steps or 0)
+            result = resume_run(Path(args.resume), report, not args.no_progress, more_steps=args.steps or 0)
     except TrainingStopped as stop:
         run_folder = Path(stop.checkpoint).parents[1]
         print(f"sb3-actpc: {stop}; go on with: sb3-actpc train --resume {shlex.quote(str(run_folder))}", file=sys.stderr)
@@ -53,10 +55,6 @@ def run(args: argparse.Namespace) -> int:
     written = "model.zip, progress.csv, episodes.csv, learning_curve.png"
     print(f"\n{result_table(result)}\n\nwritten to {result['folder']}: {written}")
     return 0
-
-
-def _report(line: str) -> None:
-    print(line, flush=True)
 
 
 def _check_only_resume(args: argparse.Namespace) -> None:

@@ -185,9 +185,6 @@ def _with_one_learning_rate(sample: Callable[..., dict[str, Any]]) -> Callable[.
     return sample_params
 
 
-# ---------------------------------------------------------------------- arguments
-
-
 def _training_arguments(arguments: Sequence[str], folder: Path, optimize: bool) -> list[str]:
     from sb3_actpc.experiments.runs.algorithms import ALGORITHMS
     from sb3_actpc.experiments.runs.environments import check_env_id
@@ -276,9 +273,6 @@ def _zoo_settings(ours: argparse.Namespace) -> dict[str, Any]:
     if ours.trained_agent and "learning_starts" in known and not uses_hindsight:
         settings["learning_starts"] = 0
     return settings
-
-
-# ---------------------------------------------------------------------- handing over
 
 
 def _plot(script: str, arguments: Sequence[str]) -> int:

@@ -177,8 +177,6 @@ class ScriptedDemonstrator:
             self._enter("reach")
         return view.eef_position + np.array([0.0, 0.0, up]), OPEN, False
 
-    # ------------------------------------------------------------------ parts
-
     def _enter(self, stage: str) -> None:
         self.stage = stage
         self._stage_steps = 0

@@ -44,7 +44,10 @@ class RayEngine(Engine):
             options = {"address": "local", "include_dashboard": False} if address is None else {"address": address}
             self.ray.init(log_to_driver=False, **options)
         self._task = self.ray.remote(num_cpus=threads, max_retries=0)(_execute)
-        self._board = self._start_board()
+        # the actor to which runs tell their steps; on this node, so that no other's death takes it along
+        node = self.ray.get_runtime_context().get_node_id()
+        here = import_extra("ray.util.scheduling_strategies", "ray").NodeAffinitySchedulingStrategy(node, soft=True)
+        self._board = self.ray.remote(num_cpus=0, scheduling_strategy=here)(StepBoard).remote()
         self._tasks: dict[Any, Run] = {}  # by Ray's reference to the answer
         self._steps: dict[str, int] = {}
         self._is_stopping = False
@@ -82,13 +85,6 @@ class RayEngine(Engine):
             self.ray.cancel(reference, force=True)
         if self._is_mine:
             self.ray.shutdown()
-
-    def _start_board(self) -> Any:
-        """The actor to which runs tell their steps; on this node, so that no other's death takes it along."""
-        from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
-
-        here = NodeAffinitySchedulingStrategy(self.ray.get_runtime_context().get_node_id(), soft=True)
-        return self.ray.remote(num_cpus=0, scheduling_strategy=here)(StepBoard).remote()
 
     def _progress(self) -> list[Event]:
         try:

@@ -105,14 +105,11 @@ def _table(spec: dict[str, Any], folder: Path) -> str:
 def _cell(spec: dict[str, Any], folder: Path) -> str:
     if unknown := sorted(set(spec) - _KEYS):
         raise ValueError(f"unknown {', '.join(unknown)}; known are {', '.join(sorted(_KEYS))}")
-    runs = _runs(folder / spec["from"])
-    for key in _CHOOSING:
-        if key not in spec:
-            continue
-        if spec[key] not in (known := runs[key].unique()):
+    runs = exported = _runs(folder / spec["from"])
+    for key in [key for key in _CHOOSING if key in spec]:
+        if spec[key] not in (known := exported[key].unique()):
             raise ValueError(f"no {key} {spec[key]!r} in {spec['from']}: there are {', '.join(sorted(map(str, known)))}")
-    for key in _CHOOSING:
-        runs = runs[runs[key] == spec[key]] if key in spec else runs
+        runs = runs[runs[key] == spec[key]]
     if runs.empty:
         return ""
     if runs["seed"].duplicated().any():
