@@ -30,19 +30,15 @@ def resolve(
     if is_minari_id(source):
         return Demonstrations.from_minari(source, observation_space=observation_space)
     if isinstance(source, (str, os.PathLike)):
-        return Demonstrations.load(_here(Path(source)))
+        path, parts = Path(source), PureWindowsPath(source).parts  # which knows both kinds of slash
+        is_shipped = not path.exists() and parts[-3:-1] == DATA_FOLDER.parts[-2:]  # where the agent was trained, elsewhere
+        return Demonstrations.load(DATA_FOLDER / parts[-1] if is_shipped else path)
     raise ValueError(f"demonstrations must be a file path, a Minari id or a Demonstrations object, found {source!r}")
 
 
 def is_minari_id(source: Any) -> bool:
     """Whether the source of demonstrations is a text that names a Minari dataset, and no file."""
     return isinstance(source, str) and MINARI_ID.fullmatch(source) is not None and not os.path.exists(source)
-
-
-def _here(path: Path) -> Path:
-    """A file of the package lies elsewhere on the machine where an agent was trained."""
-    parts, own = PureWindowsPath(path).parts, DATA_FOLDER.parts[-2:]  # which knows both kinds of slash
-    return path if path.exists() or parts[-3:-1] != own else DATA_FOLDER / parts[-1]
 
 
 def fit_demonstrations(

@@ -49,11 +49,9 @@ class NormalizedPredictor:
     def __init__(self, model: Predictor, normalize: Callable[[np.ndarray], np.ndarray]) -> None:
         self.model, self.normalize = model, normalize
 
-    def predict(
-        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = False
-    ) -> tuple[Any, Any]:
+    def predict(self, observation: Any, *further: Any, **options: Any) -> tuple[Any, Any]:
         """See :class:`Predictor`."""
-        return self.model.predict(self.normalize(observation), state, episode_start, deterministic)
+        return self.model.predict(self.normalize(observation), *further, **options)
 
     @classmethod
     def wrap(cls, model: BaseAlgorithm) -> Predictor:
