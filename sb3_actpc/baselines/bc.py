@@ -23,7 +23,6 @@ class BC(OfflineAlgorithm):
     :param weight_decay: decoupled from the gradient (AdamW)
     :param input_noise: standard deviation of Gaussian noise on the normalised observations of each batch
     :param options: further keywords as there; ``policy_kwargs`` takes ``net_arch``
-    :raises ValueError: as there
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": BCPolicy}
@@ -102,7 +101,6 @@ class BCRNN(BC):
     :param carry_state: when it plays, keep the state beyond L steps, through the whole episode
     :param options: further keywords of :class:`BC`; ``policy_kwargs`` are those of
         :class:`~sb3_actpc.baselines.bc_policies.BCRNNPolicy`
-    :raises ValueError: as :class:`BC`
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": BCRNNPolicy}

@@ -167,7 +167,6 @@ class DDPGDemo(TD3Demo):
     :param q_filter: clone only what the critic values above the actor's own action
     :param demonstration_fraction: share of each batch; Nair et al. take 128 of 1152
     :param options: further keywords of :class:`TD3Demo`
-    :raises ValueError: as :class:`TD3Demo`
     """
 
     @checked

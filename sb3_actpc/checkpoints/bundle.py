@@ -74,12 +74,8 @@ def _hash_file(path: Path) -> str:
 
 
 class Bundle:
-    """A checkpoint on the disk.
-
-    :param path: its folder
-    :raises DamagedCheckpoint: when the manifest is missing or not whole
-    :raises ValueError: when another version of the format wrote it
-    """
+    """A checkpoint on the disk, by its folder. DamagedCheckpoint when the manifest is missing or not whole, ValueError when
+    another version of the format wrote it."""
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path)

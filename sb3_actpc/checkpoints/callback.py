@@ -152,11 +152,9 @@ def why_no_checkpoints(algorithm: type[BaseAlgorithm]) -> str:
 
 
 def between_updates(callback: BaseCallback) -> Callable[[], None]:
-    """For algorithms that learn before their first rollout, in ``_setup_learn``, where SB3 calls no callback.
-
-    :param callback: of this ``learn``, as SB3's ``_setup_learn`` returns it
-    :return: to be called before each of those updates: goes on from a checkpoint taken there, and saves and stops on a signal
-    """
+    """For algorithms that learn before their first rollout, in ``_setup_learn``, where SB3 calls no callback: given what SB3's
+    ``_setup_learn`` returns, what is to be called before each of those updates. It goes on from a checkpoint taken there, and
+    saves and stops on a signal."""
     savers = [one for one in callback_tree(callback) if isinstance(one, CheckpointCallback)]
     for saver in savers:
         saver._follow(callback)

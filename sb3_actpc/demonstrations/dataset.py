@@ -237,14 +237,10 @@ class Demonstrations:
         return dataclasses.replace(self, **columns, episode_starts=self.episode_starts[self.episode_starts < end])
 
     def check(self, observation_space: spaces.Space[Any], action_space: spaces.Space[Any], env_id: str | None = None) -> None:
-        """Check that the demonstrations fit an environment.
-
-        :param observation_space: space whose flattened size must be obs_dim
-        :param action_space: Box whose flattened size must be action_dim; the actions may leave its bounds by at most
-            ``ACTION_TOLERANCE``
-        :param env_id: id of the environment, or None to skip it; the version (``-v5``) may differ from the recorded one
-        :raises ValueError: naming the field that does not fit, what was found and what was expected
-        """
+        """ValueError, which names the field, what was found and what was expected, when the demonstrations do not fit an
+        environment: obs_dim must be the flattened size of its observation space, action_dim that of its action space, a Box,
+        whose bounds the actions may leave by at most ``ACTION_TOLERANCE``; the version (``-v5``) of ``env_id`` may differ from
+        the recorded one (None: not compared)."""
         if env_id is not None and base_name(env_id) != base_name(self.env_id):
             raise self._error("env_id", f"{env_id!r} (any version)", repr(self.env_id))
         obs_dim = flat_size(observation_space)

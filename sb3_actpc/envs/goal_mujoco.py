@@ -27,12 +27,8 @@ _REACHER_DIFFERENCE = slice(8, 10)  # fingertip minus target; -v4 has its height
 
 
 class GoalTask(gym.Wrapper[Any, np.ndarray, Any, np.ndarray]):
-    """A sparse task as a goal task: the same physics, time limits and ``info``.
-
-    :param env: the sparse task
-    :param n_own: size of ``observation``
-    :param n_goal: size of a goal
-    """
+    """A sparse task as a goal task: the same physics, time limits and ``info``; ``n_own`` is the size of ``observation``,
+    ``n_goal`` that of a goal."""
 
     def __init__(self, env: gym.Env[np.ndarray, np.ndarray], n_own: int, n_goal: int) -> None:
         super().__init__(env)
@@ -115,11 +111,8 @@ class GoalReacher(GoalTask):
 
 
 class GoalLocomotion(GoalTask):
-    """A goal is a distance from the start along x, in metres, (1,): reached, and paid, at or beyond it.
-
-    :param env: a sparse locomotion task with the ``"displacement"`` condition; its threshold is the goal
-    :raises ValueError: for another condition
-    """
+    """A goal is a distance from the start along x, in metres, (1,): reached, and paid, at or beyond it. It is the threshold of
+    a sparse locomotion task with the ``"displacement"`` condition; ValueError for another condition."""
 
     def __init__(self, env: gym.Env[np.ndarray, np.ndarray]) -> None:
         task: Any = env.unwrapped

@@ -18,14 +18,9 @@ class ServerFailed(OSError):
 
 
 class ServerProcess:
-    """A child process that answers questions; it ends with its parent, whose death closes the pipe.
-
-    :param command: its program and arguments
-    :param name: for messages
-    :param timeout: seconds that an answer may take
-    :param threads: of numerical libraries in it
-    :raises ServerFailed: when it cannot be started
-    """
+    """A child process, by the ``command`` that starts it, which answers questions, each within ``timeout`` seconds; it ends
+    with its parent, whose death closes the pipe. ``name`` is for messages, ``threads`` are those of numerical libraries in it.
+    ServerFailed when it cannot be started."""
 
     def __init__(self, command: Sequence[str], name: str, timeout: float, threads: int = 1) -> None:
         self.name, self.timeout = name, timeout

@@ -20,18 +20,12 @@ _PROBE = ".shared-"  # a file by which a node sees whether it shares the folders
 
 
 class RayEngine(Engine):
-    """A Ray task for each run. A run whose node dies ends as lost, and is begun again, or gone on with, elsewhere.
-
-    A node that sees this machine's folders (a network file system, or the same machine) works in them, checkpoints and all.
-    To another the run's folder is sent, and what it made of it comes back when the run has ended.
-
-    :param n_workers: runs at a time; by default as many as the cluster has cores for
-    :param threads: of each run, the cores that it reserves
-    :param address: of a cluster, such as ``"auto"`` or ``"10.0.0.1:6379"``; by default one is started on this machine, or the
-        one that this process has joined already is used
-    :raises ImportError: when Ray is not installed
-    :raises ConnectionError: when there is no cluster at the address
-    """
+    """A Ray task for each run, at most ``n_workers`` at a time, by default as many as the cluster has cores for their
+    ``threads``. A run whose node dies ends as lost, and is begun again, or gone on with, elsewhere. A node that sees this
+    machine's folders (a network file system, or the same machine) works in them, checkpoints and all. To another the run's
+    folder is sent, and what it made of it comes back when the run has ended. The cluster is that at the ``address``, such as
+    ``"auto"`` or ``"10.0.0.1:6379"``; by default one is started on this machine, or the one that this process has joined
+    already is used. ImportError when Ray is not installed, ConnectionError when there is no cluster at the address."""
 
     def __init__(self, n_workers: int | None = None, threads: int = 1, address: str | None = None) -> None:
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # nothing is reported to anybody unless the user asks for it

@@ -35,14 +35,10 @@ def run_comparison(
     display: Display,
     retry_failed: bool = False,
 ) -> Summary:
-    """Bring every run of a table to its end that is not there yet. Stopped at any moment and called again, it loses no
-    finished run, repeats none, and goes on with the others from their last checkpoint.
-
-    :param make_engine: makes what executes the runs; not called when there is nothing to do
-    :param retry_failed: also try those again that failed before
-    :raises FolderBusy: when another process works in the folder
-    :raises OSError: when the folder cannot be written
-    """
+    """Bring every run of a table to its end that is not there yet, and with ``retry_failed`` those that failed before. Stopped
+    at any moment and called again, it loses no finished run, repeats none, and goes on with the others from their last
+    checkpoint. ``make_engine`` makes what executes the runs; it is not called when there is nothing to do. FolderBusy when
+    another process works in the folder, OSError when it cannot be written."""
     with folder_lock(folder, LOCK_WAIT, display.line):
         for run in runs:
             execution.repair_result(run.folder, display.line)

@@ -25,10 +25,7 @@ EPISODE_COLUMNS = (
 
 
 class CsvCallback(BaseCallback):
-    """Writes rows into a CSV file; a checkpoint keeps those written so far, and the attributes ``kept``.
-
-    :param path: the file
-    """
+    """Writes rows into a CSV file; a checkpoint keeps those written so far, and the attributes ``kept``."""
 
     columns: ClassVar[tuple[str, ...]]
     kept: ClassVar[tuple[str, ...]]
@@ -65,10 +62,8 @@ class EpisodeLog(CsvCallback):
     ``sparse_return`` is the sum of the environment's rewards, ``dense_return`` that of ``info["dense_reward"]`` (the
     same again where the environment does not report it), ``success`` is ``info["is_success"]`` at the end (empty where it is
     not reported), ``timesteps`` and ``seconds`` are those of the training until then. ``actions_crc32`` is the CRC-32 of all
-    actions of the training so far: two runs that have the same number have taken the same actions.
-
-    :param folder: run folder
-    :param clock: seconds that the training has taken so far
+    actions of the training so far: two runs that have the same number have taken the same actions. ``clock`` gives the seconds
+    that the training has taken so far.
     """
 
     columns = EPISODE_COLUMNS

@@ -109,16 +109,11 @@ class EpisodeStatistics:
 
 
 def play_episodes(model: Predictor, envs: Sequence[gym.Env[Any, Any]], n_episodes: int, seed: int) -> EpisodeStatistics:
-    """Play whole episodes with the deterministic policy, carrying its recurrent state.
-
-    Episode i starts from ``reset(seed=seed + i)``, so that two calls with one seed start from the same states. The
-    environments are stepped side by side, each playing at most one episode at a time, so that the policy is asked once
-    for all of them and short episodes are not counted more often than long ones.
-
-    :param envs: at least one environment; as many episodes are played at a time
-    :return: returns, successes and lengths, in the order of the seeds
-    :raises ValueError: when ``n_episodes`` is less than 1 or there is no environment
-    """
+    """Play whole episodes with the deterministic policy, carrying its recurrent state; their numbers are in the order of the
+    seeds. Episode i starts from ``reset(seed=seed + i)``, so that two calls with one seed start from the same states. The
+    environments, at least one, are stepped side by side, each playing at most one episode at a time, so that the policy is
+    asked once for all of them and short episodes are not counted more often than long ones. ValueError for less than one
+    episode or environment."""
     if n_episodes < 1 or not envs:
         raise ValueError(f"expected at least one episode and one environment, found {n_episodes} and {len(envs)}")
     played = EpisodeStatistics(*np.zeros((4, n_episodes)), [""] * n_episodes)

@@ -96,12 +96,9 @@ def resume_run(
 
 
 def finish_run(run: Run, report: Report = silent, callbacks: Sequence[BaseCallback] = ()) -> dict[str, Any]:
-    """Bring a run to its end, whatever has become of it: begun now, gone on with from its newest whole checkpoint, given more
-    steps when it ended with fewer, or left alone when it is done.
-
-    :param run: with its folder (``output``); for the rest see :func:`train_run`
-    :raises ValueError: when the folder holds another run, or for a wrong setting
-    """
+    """Bring a run with its folder (``output``) to its end, whatever has become of it: begun now, gone on with from its newest
+    whole checkpoint, given more steps when it ended with fewer, or left alone when it is done. See :func:`train_run`;
+    ValueError also when the folder holds another run."""
     check_env_id(run.env, run.gym_packages)
     run, folder = resolve(run), run.folder
     stored = _stored_run(folder, report)
