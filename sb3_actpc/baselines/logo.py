@@ -186,8 +186,7 @@ class LOGO(LearnsFromDemonstrations, TRPO):
         self.logger.record("train/guidance_value_loss", loss.item())
 
     def _trust_region_step(self, guidance: Guidance, max_kl: float) -> bool:
-        """Move the policy along the natural gradient of the guidance's surrogate objective, at most a mean divergence of
-        ``max_kl`` far; whether the line search found a better policy. If not, the policy is as it was."""
+        """Move the policy along the natural gradient, at most ``max_kl`` far; if no better one is found it stays: False."""
         with th.no_grad():
             old = copy.copy(self.policy.get_distribution(guidance.observations))
         objective, divergence = self._surrogate(guidance, old)

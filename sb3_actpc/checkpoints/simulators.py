@@ -103,8 +103,7 @@ def capture_env(env: gym.Env[Any, Any], encoder: Encoder, where: str) -> dict[st
 
 
 def _layer_values(layer: gym.Env[Any, Any]) -> dict[str, Any]:
-    """What to store of an environment or a wrapper: its attributes and, first, what it says of the objects that it hides
-    (``checkpoint_state()``; the attributes named in ``checkpoint_skipped`` hold them)."""
+    """Attributes but those in ``checkpoint_skipped``, and first what the layer says of the objects that these hold."""
     skipped = {*_SKIPPED, *getattr(layer, "checkpoint_skipped", ())}
     own = {_OWN_STATE: layer.checkpoint_state()} if hasattr(layer, "checkpoint_state") else {}
     return own | {name: value for name, value in vars(layer).items() if name not in skipped}

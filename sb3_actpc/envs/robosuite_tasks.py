@@ -305,8 +305,7 @@ def resize_cube(simulation: Any, half_edges: np.ndarray) -> None:
 
 @contextmanager
 def _quiet_import() -> Iterator[None]:
-    """Keep robosuite's greetings off the screen, and its choice of an OpenGL library out of the environment variables:
-    MuJoCo cannot be imported by child processes with the name of one that is not there."""
+    """Without robosuite's greetings, and its choice of an OpenGL library, with which child processes may not find MuJoCo's."""
     logger, backend = logging.getLogger("robosuite_logs"), os.environ.get("MUJOCO_GL")
 
     def is_error(record: logging.LogRecord) -> bool:

@@ -237,8 +237,7 @@ def _visited_states(agent: _Agent, envs: Sequence[gym.Env[Any, Any]], n_states: 
 
 
 def _demonstrated_states(model: Any, env: gym.Env[Any, Any], n_states: int, seed: int) -> list[_Start]:
-    """States of demonstrated episodes, their positions and velocities rebuilt from what was observed; none of other tasks
-    than gymnasium's MuJoCo ones, or where the recording does not tell how far the demonstrator had come."""
+    """States of demonstrated episodes; none where they cannot be rebuilt from what was recorded."""
     known = resolve(model.demonstrations).select(model.n_demonstrations, model.n_demonstration_transitions)
     task = known.env_id.rpartition(":")[2].removeprefix("Sparse").removeprefix("Goal")
     simulation: Any = env.unwrapped
@@ -411,8 +410,7 @@ def _wins(first: pd.Series, second: pd.Series) -> np.ndarray:
 
 
 def _correlation(blocks: list[np.ndarray], column: int, rng: np.random.Generator) -> tuple[float, float]:
-    """Spearman's rank correlation between column 0 and another of all blocks (one for each state) together, and its standard
-    error over resampled states; NaN where one of the columns is constant."""
+    """Spearman's, of columns 0 and another of all blocks (one a state), and its standard error over states; or NaN."""
     from scipy.stats import spearmanr
 
     def correlation(parts: list[np.ndarray]) -> float:

@@ -116,7 +116,8 @@ def play_episodes(model: Predictor, envs: Sequence[gym.Env[Any, Any]], n_episode
     episode or environment."""
     if n_episodes < 1 or not envs:
         raise ValueError(f"expected at least one episode and one environment, found {n_episodes} and {len(envs)}")
-    played = EpisodeStatistics(*np.zeros((4, n_episodes)), [""] * n_episodes)
+    dense_returns, sparse_returns, successes, lengths = np.zeros((4, n_episodes))
+    played = EpisodeStatistics(dense_returns, sparse_returns, successes, lengths, [""] * n_episodes)
     for first in range(0, n_episodes, len(envs)):
         _play_side_by_side(model, envs[: n_episodes - first], seed, first, played)
     return played
