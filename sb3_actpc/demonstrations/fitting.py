@@ -70,17 +70,11 @@ def fit_demonstrations(
             demonstrations = env.env_method("goal_demonstrations", demonstrations, indices=[0])[0]
         spec = env.get_attr("spec", indices=0)[0] if env.has_attr("spec") else None
         env_id = None if spec is None else spec.id
-        demonstrations = _with_dense_rewards(demonstrations, env_id)
+        if env_id in SPARSE_MUJOCO_IDS and base_name(dense_env_id(env_id)) == base_name(demonstrations.env_id):
+            sparse_id = f"Sparse{demonstrations.env_id.rpartition(':')[2]}"  # which then pays them anew
+            demonstrations = dataclasses.replace(demonstrations, env_id=sparse_id, dense_rewards=demonstrations.rewards)
     demonstrations.check(observation_space, action_space, env_id)
     return demonstrations if env is None else demonstrations.rewarded_by(env)
-
-
-def _with_dense_rewards(demonstrations: Demonstrations, env_id: str | None) -> Demonstrations:
-    """Demonstrations of a sparse task's dense base as those of the sparse task, which then pays them anew."""
-    if env_id not in SPARSE_MUJOCO_IDS or base_name(dense_env_id(env_id)) != base_name(demonstrations.env_id):
-        return demonstrations
-    recorded_id = f"Sparse{demonstrations.env_id.rpartition(':')[2]}"
-    return dataclasses.replace(demonstrations, env_id=recorded_id, dense_rewards=demonstrations.rewards)
 
 
 def scaled_actions(demonstrations: Demonstrations, action_space: spaces.Box) -> np.ndarray:

@@ -287,13 +287,6 @@ def _capture(env: gym.Env[Any, Any]) -> tuple[dict[str, Any], Decoder]:
     return record, Decoder(arrays, {name: tensor.clone() for name, tensor in encoder.tensors.items()})
 
 
-def _restore(env: gym.Env[Any, Any], captured: tuple[dict[str, Any], Decoder]) -> None:
-    restore_env(env, *captured)
-    for layer in env_layers(env):
-        if isinstance(layer, TimeLimit):
-            layer._elapsed_steps = 0  # type: ignore[assignment]  # each state has its whole horizon before it
-
-
 # ------------------------------------------------------------------ trying actions
 
 
@@ -321,7 +314,10 @@ def _roll_out(
 ) -> pd.DataFrame:
     """Side by side: the branch's actions for ``hold`` steps, then the policy's. A row each: value, paid, dense, rest, fell."""
     for env, start in zip(envs, starts, strict=False):
-        _restore(env, start.captured)
+        restore_env(env, *start.captured)
+        for layer in env_layers(env):
+            if isinstance(layer, TimeLimit):
+                layer._elapsed_steps = 0  # type: ignore[assignment]  # each state has its whole horizon before it
     gamma, n = agent.model.gamma, len(starts)
     observations = [start.observation for start in starts]
     memory, begins = _memories(starts)

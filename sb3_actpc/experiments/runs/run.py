@@ -160,7 +160,11 @@ def _train(
     restored = restore(model, checkpoints, report) if goes_on else None  # before any file of the run is touched
     folder.mkdir(parents=True, exist_ok=True)
     if not resumes:
-        run = _begun(run, model)
+        commit, dirty = git_state()
+        policy = fitting_policy(run.policy or "MlpPolicy", model.observation_space)
+        reference = demonstrators_return(find_demonstrations(run.env, run.demonstrations))
+        filled = {"policy": policy, "demonstrators_return": reference, "versions": package_versions()}
+        run = run.model_copy(update={**filled, "git_commit": commit, "dirty": dirty})
         write_config(run)
     model.set_logger(_logger(model, folder))
     seed = run.seed + EVALUATION_SEED_OFFSET
@@ -181,15 +185,6 @@ def _train(
     plot_learning_curve(folder / PROGRESS, folder / "learning_curve.png", f"{run.env}, {run.algo}", run.demonstrators_return)
     _keep_last_checkpoint(saver, run.continuable, report)
     return write_result(folder)
-
-
-def _begun(run: Run, model: BaseAlgorithm) -> Run:
-    """With what is known once the agent has been made."""
-    commit, dirty = git_state()
-    policy = fitting_policy(run.policy or "MlpPolicy", model.observation_space)
-    reference = demonstrators_return(find_demonstrations(run.env, run.demonstrations))
-    filled = {"policy": policy, "demonstrators_return": reference, "versions": package_versions()}
-    return run.model_copy(update={**filled, "git_commit": commit, "dirty": dirty})
 
 
 def _logger(model: BaseAlgorithm, folder: Path) -> Logger:
