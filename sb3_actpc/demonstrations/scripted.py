@@ -49,38 +49,6 @@ class View:
     object_position: np.ndarray  # (3,)
     object_quat: np.ndarray  # (4,)
 
-    @property
-    def offset(self) -> np.ndarray:
-        """From the gripper to the object, (3,)."""
-        return self.object_position - self.eef_position
-
-
-@dataclass(frozen=True)
-class Skill:
-    """How well a demonstrator works."""
-
-    speed: float  # largest translation action
-    tremor: float  # standard deviation of the correlated noise on the actions
-    pause_rate: float  # probability of a pause, per step
-    detour_rate: float  # probability of a detour, per stage
-    aim_error: float  # standard deviation of a grasp's place, in metres
-    tolerance: float  # distance from the place aimed at, in metres, at which the fingers go down
-
-    @classmethod
-    def of(cls, proficiency: float) -> "Skill":
-        """Of a proficiency in [0, 1]."""
-        if isinstance(proficiency, bool) or not isinstance(proficiency, int | float) or not 0.0 <= proficiency <= 1.0:
-            raise ValueError(f"proficiency={proficiency!r} must be a number from 0 (clumsy) to 1 (sure), or 'mixed'")
-        clumsiness = 1.0 - float(proficiency)
-        return cls(
-            speed=1.0 - 0.6 * clumsiness,
-            tremor=0.25 * clumsiness,
-            pause_rate=0.05 * clumsiness,
-            detour_rate=0.7 * clumsiness,
-            aim_error=0.01 * clumsiness,
-            tolerance=0.01 + 0.015 * clumsiness,
-        )
-
 
 class ScriptedDemonstrator:
     """Reaches over the object, descends, grasps, lifts, and for the can carries and lets go; starts anew when it has lost it.
@@ -94,9 +62,16 @@ class ScriptedDemonstrator:
 
     def __init__(self, env_id: str, obs: str = "paper", proficiency: float = 1.0, seed: int = 0) -> None:
         self.task: RobosuiteTask = robosuite_task(env_id)
-        self.proficiency = proficiency
-        self.skill = Skill.of(proficiency)
-        self.seed = seed
+        if isinstance(proficiency, bool) or not isinstance(proficiency, int | float) or not 0.0 <= proficiency <= 1.0:
+            raise ValueError(f"proficiency={proficiency!r} must be a number from 0 (clumsy) to 1 (sure), or 'mixed'")
+        self.proficiency, self.seed = proficiency, seed
+        clumsiness = 1.0 - float(proficiency)
+        self.speed = 1.0 - 0.6 * clumsiness  # largest translation action
+        self.tremor = 0.25 * clumsiness  # standard deviation of the correlated noise on the actions
+        self.pause_rate = 0.05 * clumsiness  # probability of a pause, per step
+        self.detour_rate = 0.7 * clumsiness  # probability of a detour, per stage
+        self.aim_error = 0.01 * clumsiness  # standard deviation of a grasp's place, in metres
+        self.tolerance = 0.01 + 0.015 * clumsiness  # metres from the place aimed at, within which the fingers go down
         self._layout = self.task.layout(obs)
         self._object_columns = self.task.object_columns()
         habits = np.random.default_rng([seed, 0])
@@ -125,7 +100,7 @@ class ScriptedDemonstrator:
             self._enter(self._stages[self._stages.index(self.stage) + 1])
         action = np.empty(ACTION_DIM)
         action[:3] = self._translation(view, target)
-        action[3:6] = np.clip(GAIN * self._turn(view) / RADIANS_PER_ACTION, -self.skill.speed, self.skill.speed)
+        action[3:6] = np.clip(GAIN * self._turn(view) / RADIANS_PER_ACTION, -self.speed, self.speed)
         action[:6] = self._disturb(action[:6])
         action[6] = fingers
         self._last_gap = view.finger_gap
@@ -136,16 +111,16 @@ class ScriptedDemonstrator:
     def _reach(self, view: View) -> tuple[np.ndarray, float, bool]:
         """Over the object, the fingers open and turned along it."""
         target = view.object_position + self._aim + np.array([0.0, 0.0, self._hover_height])
-        distance, tolerance = np.linalg.norm((target - view.eef_position)[:2]), self.skill.tolerance
+        distance, tolerance = np.linalg.norm((target - view.eef_position)[:2]), self.tolerance
         aligned = distance < tolerance and np.linalg.norm(self._turn(view)) < 10.0 * tolerance
         return target, OPEN, bool(aligned and view.eef_position[2] < target[2] + 0.03)
 
     def _descend(self, view: View) -> tuple[np.ndarray, float, bool]:
         target = view.object_position + self._aim
         distance = np.linalg.norm((target - view.eef_position)[:2])
-        if distance > self.skill.tolerance + 0.02:
+        if distance > self.tolerance + 0.02:
             self._enter("reach")
-        elif distance > self.skill.tolerance + 0.005:  # wait above it, do not push it over
+        elif distance > self.tolerance + 0.005:  # wait above it, do not push it over
             target = target + np.array([0.0, 0.0, 0.05])
         depth = 0.01 if self.task.name == "Lift" else 0.02
         return target, OPEN, bool(self.stage == "descend" and view.eef_position[2] < view.object_position[2] + depth)
@@ -181,15 +156,15 @@ class ScriptedDemonstrator:
         self.stage = stage
         self._stage_steps = 0
         if stage == "reach":
-            self._aim = np.array([*self._rng.normal(0.0, self.skill.aim_error, 2), 0.0])
+            self._aim = np.array([*self._rng.normal(0.0, self.aim_error, 2), 0.0])
         self._detour: np.ndarray | None = None
         self._detour_left = LONGEST_DETOUR
-        if stage in ("reach", "carry") and self._rng.random() < self.skill.detour_rate:
+        if stage in ("reach", "carry") and self._rng.random() < self.detour_rate:
             self._detour = self._rng.uniform([-0.08, -0.08, 0.0], [0.08, 0.08, 0.06])
 
     def _has_lost(self, view: View) -> bool:
         """Whether the fingers have closed on nothing, or the object has slipped out of them."""
-        return view.finger_gap < 0.01 or bool(np.linalg.norm(view.offset) > 0.06)
+        return view.finger_gap < 0.01 or bool(np.linalg.norm(view.object_position - view.eef_position) > 0.06)
 
     def _translation(self, view: View, target: np.ndarray) -> np.ndarray:
         if self._detour is not None:
@@ -198,7 +173,7 @@ class ScriptedDemonstrator:
             if np.linalg.norm(target - view.eef_position) < 0.03 or self._detour_left == 0:
                 self._detour = None
         command = GAIN * (target - view.eef_position) / METRES_PER_ACTION
-        return command * min(1.0, self.skill.speed / max(float(np.abs(command).max()), 1e-9))
+        return command * min(1.0, self.speed / max(float(np.abs(command).max()), 1e-9))
 
     def _turn(self, view: View) -> np.ndarray:
         """Rotation vector (3,) that is left until the gripper points straight down, along the object's edges."""
@@ -215,12 +190,12 @@ class ScriptedDemonstrator:
 
     def _disturb(self, command: np.ndarray) -> np.ndarray:
         """Pauses and tremor; an autocorrelated noise, weaker on the rotation."""
-        if self._pause == 0 and self._rng.random() < self.skill.pause_rate:
+        if self._pause == 0 and self._rng.random() < self.pause_rate:
             self._pause = int(self._rng.integers(3, 12))
         if self._pause > 0:
             self._pause -= 1
             command = np.zeros_like(command)
-        scale = self.skill.tremor * np.array([1.0, 1.0, 1.0, 0.3, 0.3, 0.3])
+        scale = self.tremor * np.array([1.0, 1.0, 1.0, 0.3, 0.3, 0.3])
         self._noise = 0.8 * self._noise + 0.6 * self._rng.normal(0.0, 1.0, len(command))
         return command + scale * self._noise
 
