@@ -2,13 +2,10 @@
 
 import argparse
 import sys
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from sb3_actpc.cli import add_run_options, given
-
-if TYPE_CHECKING:
-    from sb3_actpc.experiments.comparison.schedule import Summary
 
 
 def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
@@ -37,6 +34,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
 
 def run(args: argparse.Namespace) -> int:
     """Bring the runs to their end; 1 when runs have failed, 75 when a signal or a full disk stopped the command."""
+    from sb3_actpc.checkpoints import EXIT_STOPPED
     from sb3_actpc.experiments.comparison import plan_runs, read_comparison
     from sb3_actpc.experiments.comparison.display import Display, describe_runs
     from sb3_actpc.experiments.comparison.engines import make_engine
@@ -52,32 +50,16 @@ def run(args: argparse.Namespace) -> int:
     if args.dry_run:
         print(describe_runs(runs))
         return 0
-    threads = max(run.threads for run in runs)
+    engine = partial(make_engine, args.engine, args.workers, max(run.threads for run in runs), args.address)
     with Display(not args.no_progress) as display:
-        summary = run_comparison(
-            runs,
-            folder,
-            lambda: make_engine(args.engine, args.workers, threads, args.address),
-            display,
-            args.retry_failed,
-        )
-    return _conclude(summary, folder)
-
-
-def _conclude(summary: "Summary", folder: Path) -> int:
-    """The last lines, and the exit code."""
-    from sb3_actpc.checkpoints import EXIT_STOPPED
-
-    n_runs = len(summary.finished) + len(summary.failed) + len(summary.unfinished)
-    print(f"{len(summary.finished)} of {n_runs} runs are finished; see them with: sb3-actpc report {folder}")
+        summary = run_comparison(runs, folder, engine, display, args.retry_failed)
+    print(f"{len(summary.finished)} of {len(runs)} runs are finished; see them with: sb3-actpc report {folder}")
     for run, message in summary.failed:
         print(f"sb3-actpc: failed: {run.label} ({run.folder}): {message}", file=sys.stderr)
     if summary.stopped_by is not None:
         reason = f"the disk is full ({summary.message}), free some space" if summary.message else summary.stopped_by
-        print(
-            f"sb3-actpc: stopped by {reason}; {len(summary.unfinished)} runs are left, the same command goes on with them",
-            file=sys.stderr,
-        )
+        left = f"{len(summary.unfinished)} runs are left, the same command goes on with them"
+        print(f"sb3-actpc: stopped by {reason}; {left}", file=sys.stderr)
         return EXIT_STOPPED
     if summary.failed:
         print("sb3-actpc: try failed runs again with --retry-failed", file=sys.stderr)

@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 
 DATA_FOLDER = Path(__file__).resolve().parents[1] / "data"
 ACTION_TOLERANCE = 1e-4
+# the fields with one row for each transition
 COLUMNS = ("observations", "actions", "next_observations", "rewards", "terminations", "dense_rewards")
-"""The fields with one row for each transition."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)

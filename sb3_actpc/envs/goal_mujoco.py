@@ -82,7 +82,7 @@ class GoalTask(gym.Wrapper[Any, np.ndarray, Any, np.ndarray]):
 
     def _demonstrated_rows(self, demonstrations: Demonstrations) -> tuple[Observation, Observation]:
         """Observations and next observations of N transitions, (N, size) each."""
-        raise NotImplementedError
+        return self._goal_observation(demonstrations.observations), self._goal_observation(demonstrations.next_observations)
 
 
 class GoalReacher(GoalTask):
@@ -105,9 +105,6 @@ class GoalReacher(GoalTask):
             "achieved_goal": observation[..., _REACHER_DIFFERENCE] + target,
             "desired_goal": target,
         }
-
-    def _demonstrated_rows(self, demonstrations: Demonstrations) -> tuple[Observation, Observation]:
-        return self._goal_observation(demonstrations.observations), self._goal_observation(demonstrations.next_observations)
 
 
 class GoalLocomotion(GoalTask):

@@ -23,8 +23,7 @@ OBSERVATIONS: dict[str, tuple[str, ...]] = {
     # robomimic's low-dimensional keys: 19 and 23 numbers
     "robomimic": ("robot0_eef_pos", "robot0_eef_quat", "robot0_gripper_qpos", "object"),
 }
-ACTION_DIM = 7
-"""Translation (3), rotation (3) and gripper (1; positive closes), each in [-1, 1]; 1 is 5 cm or 0.5 rad."""
+ACTION_DIM = 7  # translation (3), rotation (3) and gripper (1; positive closes), each in [-1, 1]; 1 is 5 cm or 0.5 rad
 
 
 @dataclass(frozen=True)
