@@ -23,7 +23,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
 
 def run(args: argparse.Namespace) -> int:
     """Play, print the table, record; a machine that cannot render is no error."""
-    from sb3_actpc.experiments.runs.video import check_video_path, choose_gl_backend
+    from sb3_actpc.experiments.runs.video import RenderingUnavailable, check_video_path, choose_gl_backend, record_video
 
     folder = args.folder
     video = None if args.no_video else Path(args.video or folder / "video.mp4")
@@ -34,21 +34,14 @@ def run(args: argparse.Namespace) -> int:
         check_video_path(video)
         choose_gl_backend()  # before MuJoCo is imported
 
-    from sb3_actpc.experiments.runs import evaluate_run
+    from sb3_actpc.demonstrations import resolve
+    from sb3_actpc.experiments.runs import evaluate_run, load_run
+    from sb3_actpc.experiments.runs.presets import find_demonstrations
     from sb3_actpc.experiments.runs.summary import result_table
 
     print(result_table(evaluate_run(folder, args.episodes, args.seed)), flush=True)
-    if video is not None:
-        _record(folder, video, args)
-    return 0
-
-
-def _record(folder: Path, video: Path, args: argparse.Namespace) -> None:
-    from sb3_actpc.demonstrations import resolve
-    from sb3_actpc.experiments.runs.presets import find_demonstrations
-    from sb3_actpc.experiments.runs.run import load_run
-    from sb3_actpc.experiments.runs.video import RenderingUnavailable, record_video
-
+    if video is None:
+        return 0
     run, model = load_run(folder)
     size = {} if args.size is None else {"width": args.size, "height": args.size}
     env_kwargs, demonstrations = {**run.env_kwargs, **size}, None
@@ -63,3 +56,4 @@ def _record(folder: Path, video: Path, args: argparse.Namespace) -> None:
         print(f"no video: rendering is not available here ({' '.join(str(error).split())})")
     else:
         print(f"video of {n_frames} frames written to {video}")
+    return 0

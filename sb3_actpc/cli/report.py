@@ -22,9 +22,11 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
 def run(args: argparse.Namespace) -> int:
     """Write the report, the export or the tables; 1 when an ablation has changed not one action, which is an error of the
     agent's."""
+    from sb3_actpc.experiments.report.ablations import without_effect
     from sb3_actpc.experiments.report.build import write_report
     from sb3_actpc.experiments.report.export import export
     from sb3_actpc.experiments.report.published import write_tables
+    from sb3_actpc.experiments.report.results import load_results
 
     if args.folder is None and not args.tables:
         raise ValueError("nothing to report on: give the folder of a comparison, or --tables FILE.md")
@@ -37,14 +39,8 @@ def run(args: argparse.Namespace) -> int:
     files += [path for path in map(Path, args.tables or ()) if write_tables(path)]
     for path in files:
         print(path)
-    return _idle_parts(folder) if args.folder is not None and args.export is None else 0
-
-
-def _idle_parts(folder: Path) -> int:
-    """Name the ablations that changed nothing; exit code 1 where there is one."""
-    from sb3_actpc.experiments.report.ablations import without_effect
-    from sb3_actpc.experiments.report.results import load_results
-
+    if args.folder is None or args.export is not None:
+        return 0
     results = load_results(folder)
     idle = {task: names for task in results.finished["task"].unique() if (names := without_effect(results, task))}
     for task, names in idle.items():

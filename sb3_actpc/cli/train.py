@@ -46,7 +46,12 @@ def run(args: argparse.Namespace) -> int:
             run = Run(**chosen, settings=settings, env_kwargs=env_kwargs, progress=not args.no_progress)
             result = train_run(run, report)
         else:
-            _check_only_resume(args)
+            others = set(vars(args)) - {"resume", "steps", "no_progress", "command", "debug"}
+            if wrong := sorted(name for name in others if getattr(args, name) is not None):
+                option = "--" + wrong[0].replace("_", "-")
+                raise ValueError(
+                    f"{option} cannot be given with --resume: the run goes on with its own settings, leave it out"
+                )
             result = resume_run(Path(args.resume), report, not args.no_progress, more_steps=args.steps or 0)
     except TrainingStopped as stop:
         run_folder = Path(stop.checkpoint).parents[1]
@@ -55,12 +60,3 @@ def run(args: argparse.Namespace) -> int:
     written = "model.zip, progress.csv, episodes.csv, learning_curve.png"
     print(f"\n{result_table(result)}\n\nwritten to {result['folder']}: {written}")
     return 0
-
-
-def _check_only_resume(args: argparse.Namespace) -> None:
-    """:raises ValueError: when an option is given that the run's own settings decide"""
-    others = set(vars(args)) - {"resume", "steps", "no_progress", "command", "debug"}
-    wrong = sorted(name for name in others if getattr(args, name) is not None)
-    if wrong:
-        option = "--" + wrong[0].replace("_", "-")
-        raise ValueError(f"{option} cannot be given with --resume: the run goes on with its own settings, leave it out")

@@ -12,7 +12,6 @@ import numpy as np
 
 from sb3_actpc.demonstrations.dataset import Demonstrations
 from sb3_actpc.experiments.runs.evaluation import play_episodes
-from sb3_actpc.utils.files import atomic_write
 
 GL_BACKENDS = ("egl", "osmesa")
 VIDEO_SUFFIXES = (".mp4", ".gif", ".png")
@@ -78,14 +77,11 @@ def record_video(
     import imageio.v2 as imageio
 
     path.parent.mkdir(parents=True, exist_ok=True)
-    if path.suffix.lower() == ".png":
-        with atomic_write(path) as file:
-            chosen = np.linspace(0, len(frames) - 1, STRIP_LENGTH).round().astype(int)
-            strip = np.concatenate([frames[index][::2, ::2] for index in chosen], axis=1)
-            file.write(imageio.imwrite("<bytes>", strip, format="png"))
-        return len(frames)
     temporary = path.with_name(f".{path.name}{path.suffix}")  # the suffix tells imageio the format
-    if path.suffix.lower() == ".gif":
+    if path.suffix.lower() == ".png":
+        chosen = np.linspace(0, len(frames) - 1, STRIP_LENGTH).round().astype(int)
+        imageio.imwrite(temporary, np.concatenate([frames[index][::2, ::2] for index in chosen], axis=1))
+    elif path.suffix.lower() == ".gif":
         # viewers slow down a GIF with delays below 20 ms
         stride = max(1, round(frames_per_second / 25))
         imageio.mimsave(temporary, frames[::stride], duration=1000 * stride / frames_per_second, loop=0)
