@@ -88,7 +88,15 @@ class CheckpointCallback(BaseCallback):
     def _init_callback(self) -> None:
         if why_no_checkpoints(type(self.model)):
             raise ValueError(f"{type(self.model).__name__} {why_no_checkpoints(type(self.model))}: leave the callback out")
-        check_writable(self.folder)
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryFile(dir=self.folder):
+                pass
+        except OSError as error:
+            reason = error.strerror or error
+            raise ValueError(
+                f"folder={str(self.folder)!r}: no checkpoint can be written there ({reason}): choose another folder"
+            ) from error
         if self.handle_signals:
             self.signals.install()
 
@@ -211,15 +219,3 @@ def callback_tree(callback: Any) -> list[BaseCallback]:
         return []
     children = [getattr(callback, name, None) for name in ("callback", "callback_on_new_best")]  # SB3's EvalCallback has both
     return [callback, *(one for child in children for one in callback_tree(child))]
-
-
-def check_writable(folder: Path) -> None:
-    """Make the folder of checkpoints; ValueError when nothing can be written there."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            pass
-    except OSError as error:
-        raise ValueError(
-            f"folder={str(folder)!r}: no checkpoint can be written there ({error.strerror or error}): choose another folder"
-        ) from error

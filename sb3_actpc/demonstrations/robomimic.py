@@ -7,6 +7,7 @@ and ``mask/<filter key>``, the names of some of the demonstrations.
 import io
 import json
 import os
+from collections import defaultdict
 from pathlib import Path
 from typing import Any
 
@@ -75,9 +76,13 @@ def write_robomimic(demonstrations: Demonstrations, path: str | os.PathLike[str]
         data = file.create_group("data")
         data.attrs["total"] = len(demonstrations)
         data.attrs["env_args"] = json.dumps(_env_args(task))
+        masks: dict[str, list[str]] = defaultdict(list)
+        filter_keys = [*demonstrations.metadata.get("filter_keys", []), *[()] * demonstrations.n_episodes]
         for index, (start, end) in enumerate(demonstrations.episode_bounds):
             _write_episode(data.create_group(f"demo_{index}"), demonstrations, slice(start, end), layout)
-        for key, members in _masks(demonstrations).items():
+            for key in filter_keys[index]:
+                masks[key].append(f"demo_{index}")
+        for key, members in masks.items():
             file.create_dataset(f"mask/{key}", data=np.array(members, dtype="S"))
     with atomic_write(path) as target:
         target.write(content.getvalue())
@@ -222,12 +227,3 @@ def _write_episode(group: Any, demonstrations: Demonstrations, rows: slice, layo
     for part, columns in layout.items():
         group[f"obs/{part}"] = demonstrations.observations[rows, columns]
         group[f"next_obs/{part}"] = demonstrations.next_observations[rows, columns]
-
-
-def _masks(demonstrations: Demonstrations) -> dict[str, list[str]]:
-    """Filter key -> names of its demonstrations."""
-    masks: dict[str, list[str]] = {}
-    for index, keys in enumerate(demonstrations.metadata.get("filter_keys", [])[: demonstrations.n_episodes]):
-        for key in keys:
-            masks.setdefault(key, []).append(f"demo_{index}")
-    return masks

@@ -1,6 +1,5 @@
 """The report of a comparison: tables, figures and a CSV file made from the folders of its runs, without any training."""
 
-from collections.abc import Mapping
 from itertools import combinations
 from pathlib import Path
 
@@ -15,7 +14,6 @@ from sb3_actpc.experiments.report.page import UNDEFINED, Section, interval, mean
 from sb3_actpc.experiments.report.r_stability import N_EPISODES, WINDOW
 from sb3_actpc.experiments.report.references import measure_of, paper_results, reference_score
 from sb3_actpc.experiments.report.results import Results, load_results, write_runs
-from sb3_actpc.experiments.report.statistics import Scores
 
 REFRESH_ALONE = "refresh_alone"
 LAST, TRAINING, STABILITY, PAPER = "last evaluation", f"last {WINDOW} training episodes", "R-stability", "paper"
@@ -159,17 +157,14 @@ def _aggregate_sections(results: Results, folder: Path) -> list[Section]:
     ]
     table = pd.DataFrame(rows, columns=["variant", "runs", "interquartile mean", "95 % interval"])
     caption = "interquartile means and performance profiles"
-    return [Section("Across tasks", text, table, "aggregates.png", caption), *_improvement_section(whole)]
-
-
-def _improvement_section(scores: Mapping[str, Scores]) -> list[Section]:
-    rows = []
-    for name, other in combinations(scores, 2):
-        value = statistics.probability_of_improvement(scores[name], scores[other])
-        bounds = statistics.probability_of_improvement_interval(scores[name], scores[other])
-        rows.append((f"{name} over {other}", number(value, ".2f"), interval(bounds, ".2f")))
-    table = pd.DataFrame(rows, columns=["pair", "probability", "95 % interval"])
-    return [Section("Probability of improvement", table=table, level=3)] if rows else []
+    pairs = []
+    for name, other in combinations(whole, 2):
+        value = statistics.probability_of_improvement(whole[name], whole[other])
+        bounds = statistics.probability_of_improvement_interval(whole[name], whole[other])
+        pairs.append((f"{name} over {other}", number(value, ".2f"), interval(bounds, ".2f")))
+    improvement = pd.DataFrame(pairs, columns=["pair", "probability", "95 % interval"])
+    sections = [Section("Across tasks", text, table, "aggregates.png", caption)]
+    return sections + ([Section("Probability of improvement", table=improvement, level=3)] if pairs else [])
 
 
 def _diagnostic_section(results: Results, task: str, folder: Path) -> list[Section]:

@@ -231,7 +231,12 @@ class EvaluationCallback(CsvCallback):
         n_episodes = self.eval_episodes if n_episodes is None else n_episodes
         statistics = play_episodes(NormalizedPredictor.wrap(self.model), self.envs, n_episodes, self.seed)
         self.last_summary = statistics.summary()
-        self._keep_model(float(statistics.dense_returns.mean()))
+        dense_return = float(statistics.dense_returns.mean())
+        if not self.keeps_best or dense_return >= self.best_return:
+            NormalizedPredictor.save(self.model, self.folder)
+            with atomic_write(self.folder / "model.zip") as file:
+                self.model.save(cast(BufferedIOBase, file))
+        self.best_return = max(self.best_return, dense_return)
         now = time.perf_counter()
         self.evaluation_seconds += now - started
         self.last_timesteps = self.num_timesteps
@@ -253,10 +258,3 @@ class EvaluationCallback(CsvCallback):
             f"step {self.num_timesteps:>8}  dense return {summary['dense_return']:9.1f} ± {summary['dense_return_std']:<7.1f} "
             f"sparse return {summary['sparse_return']:7.1f}  success {'n/a' if success is None else f'{success:.2f}'}"
         )
-
-    def _keep_model(self, dense_return: float) -> None:
-        if not self.keeps_best or dense_return >= self.best_return:
-            NormalizedPredictor.save(self.model, self.folder)
-            with atomic_write(self.folder / "model.zip") as file:
-                self.model.save(cast(BufferedIOBase, file))
-        self.best_return = max(self.best_return, dense_return)
