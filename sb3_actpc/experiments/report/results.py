@@ -83,18 +83,14 @@ def load_results(folder: Path) -> Results:
     found = sorted({path.parent for name in (CONFIG, ERROR) for path in folder.glob(f"*/*/seed[0-9]*_*/{name}")})
     if not found:
         raise FileNotFoundError(f"no runs in {folder}: make some with sb3-actpc compare --output {folder}")
-    rows = []
-    tables: dict[str, list[pd.DataFrame]] = {PROGRESS: [], EPISODES: [], DIAGNOSTICS: []}
-    for path in found:
-        name = path.relative_to(folder).as_posix()
-        own = {file: read_rows(path / file) for file in tables}
-        rows.append({"run": name, **_run_row(path, own[PROGRESS], own[EPISODES])})
-        for file, table in own.items():
-            tables[file].append(table.assign(run=name))
+    names = [path.relative_to(folder).as_posix() for path in found]
+    files = [[read_rows(path / file) for path in found] for file in (PROGRESS, EPISODES, DIAGNOSTICS)]
+    runs = pd.DataFrame([_run_row(*row) for row in zip(found, *files[:2], strict=True)], index=pd.Index(names, name="run"))
+    named = [[table.assign(run=name) for name, table in zip(names, tables, strict=True)] for tables in files]
     evaluations, episodes, diagnostics = (
-        pd.concat([part for part in parts if len(part)] or [_NO_ROWS], ignore_index=True) for parts in tables.values()
+        pd.concat([part for part in parts if len(part)] or [_NO_ROWS], ignore_index=True) for parts in named
     )
-    return Results(_labelled(pd.DataFrame(rows).set_index("run")), evaluations, episodes, diagnostics)
+    return Results(_labelled(runs), evaluations, episodes, diagnostics)
 
 
 def run_measures(task: str, evaluations: pd.DataFrame, episodes: pd.DataFrame) -> dict[str, float]:

@@ -101,7 +101,14 @@ def finish_run(run: Run, report: Report = silent, callbacks: Sequence[BaseCallba
     ValueError also when the folder holds another run."""
     check_env_id(run.env, run.gym_packages)
     run, folder = resolve(run), run.folder
-    stored = _stored_run(folder, report)
+    stored = None
+    try:
+        stored = read_run(folder)
+    except FileNotFoundError:
+        pass
+    except ValueError as error:
+        report(f"{error}: the run starts again")
+        (folder / CONFIG).unlink()
     if stored is not None and _content(stored) != _content(run):
         raise ValueError(f"{folder} holds another run, of other settings: choose another folder")
     if stored is not None and (folder / RESULT).is_file():
@@ -117,17 +124,6 @@ def finish_run(run: Run, report: Report = silent, callbacks: Sequence[BaseCallba
             report(f"{error}: the run starts again")
     shutil.rmtree(folder / CHECKPOINTS, ignore_errors=True)
     return train_run(run, report, callbacks)
-
-
-def _stored_run(folder: Path, report: Report) -> Run | None:
-    try:
-        return read_run(folder)
-    except FileNotFoundError:
-        return None
-    except ValueError as error:
-        report(f"{error}: the run starts again")
-        (folder / CONFIG).unlink()
-        return None
 
 
 def _content(run: Run) -> str:
