@@ -10,12 +10,7 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.noise import (
-    ActionNoise,
-    NormalActionNoise,
-    OrnsteinUhlenbeckActionNoise,
-    VectorizedActionNoise,
-)
+from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise, VectorizedActionNoise
 from stable_baselines3.common.type_aliases import TrainFreq
 from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
 
@@ -100,10 +95,9 @@ def _name_object(value: Any) -> dict[str, Any]:
     for name, (kind, attributes) in _SCHEDULES.items():
         if type(value) is kind:
             return {"schedule": [name, *(float(getattr(value, attribute)) for attribute in attributes)]}
-    if isinstance(value, ActionNoise):
-        for name, (kind, parameters) in _NOISES.items():
-            if type(value) is kind:
-                return {"noise": [name, {key: np.asarray(vars(value)[part]).tolist() for key, part in parameters.items()}]}
+    for name, (kind, parameters) in _NOISES.items():
+        if type(value) is kind:
+            return {"noise": [name, {key: np.asarray(vars(value)[part]).tolist() for key, part in parameters.items()}]}
     raise ValueError(f"{value!r} has no name here")
 
 
