@@ -29,7 +29,7 @@ class DamagedCheckpoint(ValueError):
 
 
 def warn(line: str) -> None:
-    """:param line: what there is to report, where nobody has said to whom"""
+    """Where nobody has said to whom to report."""
     warnings.warn(line, stacklevel=3)
 
 
@@ -146,15 +146,9 @@ def list_bundles(folder: str | os.PathLike[str]) -> list[Path]:
 
 
 def find_bundle(path: str | os.PathLike[str], report: Report = warn) -> Bundle:
-    """The checkpoint at ``path``, or the newest whole one of those in it; damaged ones are named and skipped.
-
-    :param path: one checkpoint, or the folder of a run's checkpoints
-    :param report: given a line for every damaged one
-    :return: the checkpoint, verified
-    :raises FileNotFoundError: when there is none
-    :raises DamagedCheckpoint: when all are damaged, or ``path`` is one that is
-    :raises ValueError: when the newest was written in another version of the format
-    """
+    """The checkpoint at ``path``, or the newest whole one of those in it, verified; damaged ones are skipped, and ``report``
+    is given a line for each. FileNotFoundError when there is none, DamagedCheckpoint when all are damaged, or ``path`` is one
+    that is, ValueError when the newest was written in another version of the format."""
     path = Path(path)
     bundles = list_bundles(path)
     if not bundles and (path / MANIFEST).exists():

@@ -124,13 +124,9 @@ class Demonstrations:
         metadata: Mapping[str, Any] | None = None,
         source: str = "",
     ) -> Demonstrations:
-        """:param episodes: columns of each episode, by the names of ``COLUMNS``; dense rewards count where all have them
-        :param env_id: Gymnasium id of the environment that was recorded
-        :param metadata: JSON values
-        :param source: where they come from, for error messages
-        :return: the episodes end to end
-        :raises ValueError: when there are none, or they do not fit together
-        """
+        """The episodes end to end, from the columns of each, by the names of ``COLUMNS`` (dense rewards count where all have
+        them), recorded in the environment ``env_id``; ``metadata`` are JSON values, ``source`` is for error messages.
+        ValueError when there are none, or they do not fit together."""
         if not episodes:
             raise field_error(source, "observations", "at least one episode", "none")
         columns = {}
@@ -189,14 +185,11 @@ class Demonstrations:
         observation_space: spaces.Space[Any] | None = None,
         final_reward: float | None = None,
     ) -> Demonstrations:
-        """Take over trajectories of the ``imitation`` library, or objects like them, recorded in ``env_id``.
-
-        :param trajectories: each with ``obs`` (n + 1 rows), ``acts`` (n rows), ``infos`` (or None), ``terminal``, and perhaps
-            ``rews``. A last info with ``TimeLimit.truncated`` is no termination; ``dense_reward`` in every info is kept
-        :param observation_space: the environment's, needed for dict observations
-        :param final_reward: what the last step of each is paid, and all others 0, where they have no ``rews``
-        :raises ValueError: when something needed is missing, or does not fit together
-        """
+        """Take over trajectories of the ``imitation`` library, or objects like them, recorded in ``env_id``: each has ``obs``
+        (n + 1 rows), ``acts`` (n rows), ``infos`` (or None), ``terminal``, and perhaps ``rews``; where it has none, the last
+        step is paid ``final_reward`` and all others 0. A last info with ``TimeLimit.truncated`` is no termination;
+        ``dense_reward`` in every info is kept. Dict observations need the environment's ``observation_space``. ValueError when
+        something needed is missing, or does not fit together."""
         columns = [trajectory_columns(trajectory, observation_space, final_reward) for trajectory in trajectories]
         return cls.from_episodes(columns, env_id, source="trajectories")
 

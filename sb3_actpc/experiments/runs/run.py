@@ -61,14 +61,10 @@ def train_run(run: Run, report: Report = silent, callbacks: Sequence[BaseCallbac
 def resume_run(
     folder: Path, report: Report = silent, progress: bool = True, callbacks: Sequence[BaseCallback] = (), more_steps: int = 0
 ) -> dict[str, Any]:
-    """Go on with a run from its newest whole checkpoint, with the settings in its ``config.json``.
-
-    :param report: given a line of text when the run goes on, after each evaluation and for each damaged checkpoint
-    :param more_steps: added to those that the run was to have; a finished run needs some
-    :return: as :func:`train_run`
-    :raises FileNotFoundError: when the folder is not that of a run
-    :raises ValueError: when the run is finished and gets no more steps, or its checkpoints do not fit or are all damaged
-    """
+    """Go on with a run from its newest whole checkpoint, with the settings in its ``config.json``, for the steps that it was
+    to have and ``more_steps``, of which a finished run needs some. ``report`` is given a line of text when the run goes on,
+    after each evaluation and for each damaged checkpoint; see :func:`train_run`. FileNotFoundError when the folder is not that
+    of a run, ValueError when the run is finished and gets no more steps, or its checkpoints do not fit or are all damaged."""
     run = read_run(folder).model_copy(update={"progress": progress})
     without = why_no_checkpoints(load_algorithm(run.algo))
     if without:
