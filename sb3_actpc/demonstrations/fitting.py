@@ -49,16 +49,10 @@ def fit_demonstrations(
     n_episodes: int | None = None,
     n_transitions: int | None = None,
 ) -> Demonstrations:
-    """The demonstrations as an environment would have shown them: of its task, in its spaces, paid as it pays.
-
-    Those of the dense base task of a sparse one (such as Minari's ``mujoco/hopper/expert-v0``) fit too.
-
-    :param source: as of :func:`resolve`
-    :param env: the environment, whose goal version and rewards count; None where there is none yet
-    :param n_episodes: use only the first so many episodes, None for all; and likewise ``n_transitions``
-    :raises FileNotFoundError: when there is no such file
-    :raises ValueError: when they are damaged, fewer than asked for, or of another task
-    """
+    """The demonstrations, from a source of :func:`resolve`, as an environment would have shown them: of its task, in its
+    spaces, paid as it pays (None where there is none yet); the first ``n_episodes`` alone, or ``n_transitions``, None for all.
+    Those of the dense base task of a sparse one (such as Minari's ``mujoco/hopper/expert-v0``) fit too. FileNotFoundError when
+    there is no such file, ValueError when they are damaged, fewer than asked for, or of another task."""
     demonstrations = resolve(source, observation_space)
     try:
         demonstrations = demonstrations.select(n_episodes, n_transitions)

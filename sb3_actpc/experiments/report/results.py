@@ -94,15 +94,10 @@ def load_results(folder: Path) -> Results:
 
 
 def run_measures(task: str, evaluations: pd.DataFrame, episodes: pd.DataFrame) -> dict[str, float]:
-    """What one run has reached; NaN where it is undefined.
-
-    :param task: Gymnasium id
-    :param evaluations: rows of its ``progress.csv``
-    :param episodes: rows of its ``episodes.csv``
-    :return: of dense return, sparse return and success rate: the last evaluation's, the worst from 5,000 steps on, the mean of
-        the evaluations in the last half of the steps, the mean of the last 100 training episodes and their R-stability; the
-        measure by which the task is compared, 0 for random actions and 1 for the demonstrators; and what it took
-    """
+    """What one run on a task has reached, from the rows of its ``progress.csv`` and ``episodes.csv``; NaN where it is
+    undefined. Of dense return, sparse return and success rate: the last evaluation's, the worst from 5,000 steps on, the mean
+    of the evaluations in the last half of the steps, the mean of the last 100 training episodes and their R-stability; the
+    measure by which the task is compared, 0 for random actions and 1 for the demonstrators; and what it took."""
     values: dict[str, float] = {}
     steps = evaluations.get("timesteps", pd.Series(dtype=float))
     end = float(steps.max()) if len(steps) else 0.0

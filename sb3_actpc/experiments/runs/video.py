@@ -57,15 +57,11 @@ def record_video(
     n_frames: int = MAX_FRAMES,
     demonstrations: Demonstrations | None = None,
 ) -> int:
-    """Write a video of the first steps of an episode with the deterministic policy.
-
-    :param env_kwargs: keywords of the environment; ``width`` and ``height`` in pixels where it takes them
-    :param path: file to write: ``.mp4``, ``.gif``, or ``.png`` for ``STRIP_LENGTH`` pictures side by side, at half the size
-    :param n_frames: most frames to render
-    :param demonstrations: draw their first episode on the right of the agent, or None
-    :return: number of frames, each (height, width, 3) uint8
-    :raises RenderingUnavailable: when rendering does not work here
-    :raises ValueError: when the path has another suffix, or the environment cannot draw demonstrations
+    """Write a video of the first steps, at most ``n_frames``, of an episode with the deterministic policy: the number of
+    frames, each (height, width, 3) uint8. The path ends in ``.mp4``, ``.gif``, or ``.png`` for ``STRIP_LENGTH`` pictures side
+    by side, at half the size; ``env_kwargs`` are the environment's, ``width`` and ``height`` in pixels where it takes them. On
+    the right of the agent the first episode of the demonstrations is drawn, where they are given. RenderingUnavailable when
+    rendering does not work here, ValueError when the path has another suffix, or the environment cannot draw demonstrations.
     """
     check_video_path(path)
     with _rendering(env_id, env_kwargs) as env:
