@@ -1,7 +1,5 @@
 """Behaviour cloning, with and without a memory, as Stable-Baselines3 algorithms."""
 
-from __future__ import annotations
-
 from typing import Any, ClassVar
 
 import numpy as np
@@ -25,7 +23,6 @@ class BC(OfflineAlgorithm):
     :param weight_decay: decoupled from the gradient (AdamW)
     :param input_noise: standard deviation of Gaussian noise on the normalised observations of each batch
     :param options: further keywords as there; ``policy_kwargs`` takes ``net_arch``
-    :raises ValueError: as there
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": BCPolicy}
@@ -35,8 +32,6 @@ class BC(OfflineAlgorithm):
     def __init__(self, *args: Any, weight_decay: Weight = 0.0, input_noise: Weight = 0.0, **options: Any) -> None:
         self.weight_decay, self.input_noise = weight_decay, input_noise
         super().__init__(*args, **options)
-
-    # ------------------------------------------------------------------ setting up
 
     def _setup_model(self) -> None:
         self._setup_lr_schedule()
@@ -59,8 +54,6 @@ class BC(OfflineAlgorithm):
         self._observations, self._actions = self.policy.normalized(rows), th.as_tensor(actions, device=self.device)
         bounds = shown.episode_bounds
         self._episode_ends = th.as_tensor(np.repeat(bounds[:, 1], bounds[:, 1] - bounds[:, 0]), device=self.device)
-
-    # ------------------------------------------------------------------ learning
 
     def train(self) -> None:
         """One gradient step."""
@@ -85,8 +78,6 @@ class BC(OfflineAlgorithm):
         inputs = self._observations[rows]
         return inputs + self.input_noise * th.randn_like(inputs) if self.input_noise else inputs
 
-    # ------------------------------------------------------------------ saving
-
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_observations", "_actions", "_episode_ends"]
 
@@ -110,7 +101,6 @@ class BCRNN(BC):
     :param carry_state: when it plays, keep the state beyond L steps, through the whole episode
     :param options: further keywords of :class:`BC`; ``policy_kwargs`` are those of
         :class:`~sb3_actpc.baselines.bc_policies.BCRNNPolicy`
-    :raises ValueError: as :class:`BC`
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": BCRNNPolicy}

@@ -1,7 +1,5 @@
 """The networks of behaviour cloning: normalised observations in, actions out, with or without a memory."""
 
-from __future__ import annotations
-
 from abc import abstractmethod
 from typing import Annotated, Any, Literal
 
@@ -18,16 +16,41 @@ from sb3_actpc.actpc.arguments import Between, Positive, checked
 CELLS: dict[str, type[nn.GRU] | type[nn.LSTM]] = {"gru": nn.GRU, "lstm": nn.LSTM}
 SMALLEST_SPREAD = 1e-3  # an entry that hardly varies in the demonstrations is not blown up
 LARGEST_INPUT = 10.0  # as in SB3's VecNormalize
+State = tuple[np.ndarray, ...]  # recurrent, an entry in each array for each environment, as SB3's predict takes and returns it
+
+
+class StatefulPolicy(BasePolicy):
+    """A policy with a recurrent state."""
+
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: State | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, State | None]:
+        """As SB3's: actions in the environment's units, and the next state, which begins anew where ``episode_start``, (n,),
+        is true; ``deterministic`` has no effect. ValueError when the state is not that of n episodes."""
+        self.set_training_mode(False)
+        rows, is_batch = self.obs_to_tensor(observation)
+        assert isinstance(rows, th.Tensor)
+        begins = np.full(len(rows), state is None) if episode_start is None else np.ravel(episode_start).astype(bool)
+        if len(begins) != len(rows):
+            raise ValueError(f"episode_start has {len(begins)} entries for {len(rows)} observations")
+        scaled, after = self.act(rows.float().flatten(1), begins, state)
+        shape = self.action_space.shape or ()
+        actions = np.asarray(self.unscale_action(np.clip(scaled, -1, 1).reshape(-1, *shape)))
+        return actions if is_batch else actions[0], after
+
+    @abstractmethod
+    def act(self, rows: th.Tensor, begins: np.ndarray, state: State | None) -> tuple[np.ndarray, State | None]:
+        """Actions (n, A), about in [-1, 1], and the next state, of observations (n, obs_dim); (n,) is true where an episode
+        begins."""
 
 
 class CloningPolicy(BasePolicy):
     """What both policies share: the normalisation of observations, the optimiser, and actions cut to [-1, 1] before they are
-    given the environment's units.
-
-    The parameters are SB3's.
-
-    :raises ValueError: for observations that are no Box
-    """
+    given the environment's units. The parameters are SB3's; ValueError for observations that are no Box."""
 
     mean: th.Tensor
     spread: th.Tensor
@@ -97,7 +120,7 @@ class BCPolicy(CloningPolicy):
         return {**super()._get_constructor_parameters(), "net_arch": self.net_arch}
 
 
-class BCRNNPolicy(CloningPolicy):
+class BCRNNPolicy(StatefulPolicy, CloningPolicy):
     """A recurrent network.
 
     Its state is a tuple of arrays, as in sb3-contrib's RecurrentPPO: (n_layers, n, hidden_size) of the cells (two for an
@@ -137,58 +160,31 @@ class BCRNNPolicy(CloningPolicy):
         :param hidden: of the cells, each (n_layers, B, hidden_size); None for zeros
         :return: actions, (B, T, A), not cut to [-1, 1], and the hidden state after the last
         """
-        if hidden is None:
-            outputs, after = self.memory(inputs)
-        else:
-            outputs, after = self.memory(inputs, hidden if self.cell == "lstm" else hidden[0])
-        return self.head(outputs), after if self.cell == "lstm" else (after,)
+        is_lstm = self.cell == "lstm"
+        outputs, after = self.memory(inputs, hidden if hidden is None or is_lstm else hidden[0])
+        return self.head(outputs), after if is_lstm else (after,)
 
-    def initial_state(self, n: int) -> tuple[np.ndarray, ...]:
+    def initial_state(self, n: int) -> State:
         """The state before the first step of n episodes side by side."""
         n_parts = 2 if self.cell == "lstm" else 1
         hidden = [np.zeros((self.n_layers, n, self.hidden_size), dtype=np.float32) for _ in range(n_parts)]
         return *hidden, np.zeros(n, dtype=np.int64)
 
-    def predict(
-        self,
-        observation: np.ndarray | dict[str, np.ndarray],
-        state: tuple[np.ndarray, ...] | None = None,
-        episode_start: np.ndarray | None = None,
-        deterministic: bool = False,
-    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
-        """As SB3's: actions in the environment's units, and the next state, which begins anew where ``episode_start``, (n,),
-        is true; ``deterministic`` has no effect.
-
-        :raises ValueError: when the state is not that of n episodes of this network
-        """
-        self.set_training_mode(False)
-        rows, is_batch = self.obs_to_tensor(observation)
-        assert isinstance(rows, th.Tensor)
-        *hidden, steps = self._state_of(len(rows), state)
-        begins = np.zeros(len(rows), dtype=bool)
-        if episode_start is not None:
-            begins = np.asarray(episode_start, dtype=bool).reshape(-1)
-        if len(begins) != len(rows):
-            raise ValueError(f"episode_start has {len(begins)} entries for {len(rows)} observations")
+    def act(self, rows: th.Tensor, begins: np.ndarray, state: State | None) -> tuple[np.ndarray, State]:
+        """See :class:`StatefulPolicy`; ValueError when the state is not that of n episodes of this network."""
+        initial, n = self.initial_state(len(rows)), len(rows)
+        wanted, found = ([np.shape(part) for part in parts] for parts in (initial, initial if state is None else state))
+        if found != wanted:
+            raise ValueError(f"state has arrays of shapes {found}: this network's, for {n} observations, have {wanted}")
+        *hidden, steps = initial if state is None else state
         if self.restart_every is not None:
             begins = begins | (steps >= self.restart_every)
         kept = [np.where(begins[None, :, None], np.float32(0.0), part) for part in hidden]
         with th.no_grad():
             before = tuple(th.as_tensor(part, device=self.device) for part in kept)
-            outputs, after = self(self.normalized(rows.float().flatten(1))[:, None], before)
-        shape = self.action_space.shape or ()
-        actions = np.asarray(self.unscale_action(outputs[:, 0].clamp(-1, 1).cpu().numpy().reshape(-1, *shape)))
+            outputs, after = self(self.normalized(rows)[:, None], before)
         next_state = *(part.cpu().numpy() for part in after), np.where(begins, 0, steps) + 1
-        return actions if is_batch else actions[0], next_state
-
-    def _state_of(self, n: int, state: tuple[np.ndarray, ...] | None) -> tuple[np.ndarray, ...]:
-        initial = self.initial_state(n)
-        if state is None:
-            return initial
-        wanted, found = [part.shape for part in initial], [np.shape(part) for part in state]
-        if found != wanted:
-            raise ValueError(f"state has arrays of shapes {found}: this network's, for {n} observations, have {wanted}")
-        return state
+        return outputs[:, 0].cpu().numpy(), next_state
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         """The first step of an episode; :meth:`predict` carries the state."""

@@ -1,23 +1,17 @@
 """What baselines share: demonstrations that fit the task, and, off policy, a share of them in every batch."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 from typing import Any
 
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_actpc.actpc.arguments import Share, checked
-from sb3_actpc.baselines.demonstration_buffers import (
-    DemonstrationDictReplayBuffer,
-    WithDemonstrations,
-    demonstration_buffer_class,
-)
+from sb3_actpc.baselines.demonstration_buffers import WithDemonstrations, demonstration_buffer_class
 from sb3_actpc.demonstrations import Demonstrations, fit_demonstrations
 
 
@@ -89,7 +83,7 @@ class DemonstratedAlgorithm(LearnsFromDemonstrations, OffPolicyAlgorithm):
         size = self.buffer_size
         demonstrations = None
         if self.env is None:
-            kind = DemonstrationDictReplayBuffer if issubclass(kind, DictReplayBuffer) else kind  # which needs none
+            kind = demonstration_buffer_class(None, self.observation_space)  # which needs none
             kwargs, size = {}, self.n_envs
         else:
             if self.demonstrations is not None:

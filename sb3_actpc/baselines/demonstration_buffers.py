@@ -1,7 +1,5 @@
 """SB3's replay buffers with a share of demonstrations in every batch, for any SB3 off-policy algorithm."""
 
-from __future__ import annotations
-
 from operator import itemgetter
 from typing import Any, ClassVar
 
@@ -55,7 +53,6 @@ class WithDemonstrations(ReplayBuffer):
     :raises ValueError: for a share out of range
     """
 
-    _demonstrated_class: ClassVar[type[ReplayBuffer]]
     _own_keywords: ClassVar[tuple[str, ...]] = ()  # of a subclass, not for the demonstrations' buffer
 
     @checked
@@ -68,7 +65,7 @@ class WithDemonstrations(ReplayBuffer):
         if demonstrations is not None:
             skipped = {"n_envs", "optimize_memory_usage", *self._own_keywords}
             kwargs = {key: value for key, value in kwargs.items() if key not in skipped}
-            kind: Any = self._demonstrated_class
+            kind: Any = next(one for one in type(self).__mro__ if one.__module__.startswith("stable_baselines3."))
             self.demonstrated = kind(len(demonstrations), *args[1:], n_envs=1, **kwargs)
             assert isinstance(self.action_space, spaces.Box)
             fill_with_demonstrations(self.demonstrated, demonstrations, self.observation_space, self.action_space)
@@ -92,25 +89,17 @@ class WithDemonstrations(ReplayBuffer):
 class DemonstrationReplayBuffer(WithDemonstrations):
     """SB3's replay buffer with demonstrations; see :class:`WithDemonstrations`."""
 
-    _demonstrated_class = ReplayBuffer
-
 
 class DemonstrationNStepReplayBuffer(WithDemonstrations, NStepReplayBuffer):
     """SB3's n-step replay buffer with demonstrations, whose returns are n-step too."""
-
-    _demonstrated_class = NStepReplayBuffer
 
 
 class DemonstrationDictReplayBuffer(WithDemonstrations, DictReplayBuffer):
     """SB3's replay buffer for Dict observations with demonstrations."""
 
-    _demonstrated_class = DictReplayBuffer
-
 
 class DemonstrationHerReplayBuffer(WithDemonstrations, HerReplayBuffer):
     """SB3's hindsight replay buffer with demonstrations, which are relabelled as the agent's own transitions are."""
-
-    _demonstrated_class = HerReplayBuffer
 
     def set_env(self, env: VecEnv) -> None:
         """:param env: the environment whose ``compute_reward`` relabels"""
@@ -127,10 +116,10 @@ def demonstration_buffer_class(
     is_dict = isinstance(observation_space, spaces.Dict)
     if n_steps > 1 and (is_dict or given is not None):
         raise ValueError(f"n_steps={n_steps} works with vector observations and replay_buffer_class=None alone; use n_steps=1")
+    if n_steps > 1:
+        return DemonstrationNStepReplayBuffer
     if given is None:
-        if is_dict:
-            return DemonstrationDictReplayBuffer
-        return DemonstrationNStepReplayBuffer if n_steps > 1 else DemonstrationReplayBuffer
+        given = DictReplayBuffer if is_dict else ReplayBuffer
     if isinstance(given, type) and issubclass(given, WithDemonstrations):
         return given
     same: dict[Any, type[WithDemonstrations]] = {
@@ -148,11 +137,10 @@ def demonstration_buffer_class(
 def join_batches(own: Any, shown: Any) -> Any:
     """Two batches of SB3's, named tuples of tensors (B, ...) and (C, ...), as one, (B + C, ...); fields that SB3 leaves at
     None stay None."""
-    columns: dict[str, Any] = {}
-    for name, mine in own._asdict().items():
-        theirs = getattr(shown, name)
+
+    def join(mine: Any, theirs: Any) -> Any:
         if isinstance(mine, dict):
-            columns[name] = {key: th.cat([part, theirs[key]]) for key, part in mine.items()}
-        else:
-            columns[name] = None if mine is None else th.cat([mine, theirs])
-    return own._replace(**columns)
+            return {key: th.cat([part, theirs[key]]) for key, part in mine.items()}
+        return None if mine is None else th.cat([mine, theirs])
+
+    return own._replace(**{name: join(mine, getattr(shown, name)) for name, mine in own._asdict().items()})

@@ -1,7 +1,5 @@
 """Hindsight experience replay with demonstrations, as the paper's baseline has it."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

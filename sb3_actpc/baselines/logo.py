@@ -1,7 +1,5 @@
 """LOGO: TRPO on the sparse reward, then a second trust-region step towards the demonstrations."""
 
-from __future__ import annotations
-
 import copy
 from collections import deque
 from functools import partial
@@ -25,20 +23,13 @@ _NETS = ("discriminator", "guidance_value", "discriminator_optimizer", "guidance
 
 
 class Guidance(NamedTuple):
-    """What the guidance step needs of one iteration: N = n_steps x n_envs transitions, those of the first environment first.
+    """What the guidance step needs of one iteration: N = n_steps x n_envs transitions, the first environment's first."""
 
-    :param observations: (N, *obs_shape)
-    :param actions: (N, A)
-    :param log_probs: (N,), of the policy that acted
-    :param advantages: (N,), of the discriminator's reward, mean 0 and standard deviation 1
-    :param returns: (N,), targets of the guidance value net
-    """
-
-    observations: th.Tensor
-    actions: th.Tensor
-    log_probs: th.Tensor
-    advantages: th.Tensor
-    returns: th.Tensor
+    observations: th.Tensor  # (N, *obs_shape)
+    actions: th.Tensor  # (N, A)
+    log_probs: th.Tensor  # (N,), of the policy that acted
+    advantages: th.Tensor  # (N,), of the discriminator's reward, mean 0 and standard deviation 1
+    returns: th.Tensor  # (N,), targets of the guidance value net
 
 
 class LOGO(LearnsFromDemonstrations, TRPO):
@@ -98,8 +89,6 @@ class LOGO(LearnsFromDemonstrations, TRPO):
         self._past_returns: deque[float] = deque(maxlen=10)
         super().__init__(*args, **{"cg_max_steps": 10, "line_search_shrinking_factor": 0.5, **options})
 
-    # ------------------------------------------------------------------ setting up
-
     def _setup_model(self) -> None:
         super()._setup_model()
         self._shown: th.Tensor | None = None
@@ -125,8 +114,6 @@ class LOGO(LearnsFromDemonstrations, TRPO):
         super().set_env(env, force_reset)
         if self.demonstrations is not None:
             self._load_demonstrations()
-
-    # ------------------------------------------------------------------ learning
 
     def _update_info_buffer(self, infos: list[dict[str, Any]], dones: np.ndarray | None = None) -> None:
         super()._update_info_buffer(infos, dones)
@@ -199,8 +186,7 @@ class LOGO(LearnsFromDemonstrations, TRPO):
         self.logger.record("train/guidance_value_loss", loss.item())
 
     def _trust_region_step(self, guidance: Guidance, max_kl: float) -> bool:
-        """Move the policy along the natural gradient of the guidance's surrogate objective, at most a mean divergence of
-        ``max_kl`` far; whether the line search found a better policy. If not, the policy is as it was."""
+        """Move the policy along the natural gradient, at most ``max_kl`` far; if no better one is found it stays: False."""
         with th.no_grad():
             old = copy.copy(self.policy.get_distribution(guidance.observations))
         objective, divergence = self._surrogate(guidance, old)
@@ -240,8 +226,6 @@ class LOGO(LearnsFromDemonstrations, TRPO):
                 self.delta = max(self.delta * self.guidance_decay, self.guidance_delta_min)
             self._past_returns.append(mean)
         self._iteration_returns = []
-
-    # ------------------------------------------------------------------ saving
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_shown", *_NETS]

@@ -1,7 +1,5 @@
 """What the offline baselines share: they learn from demonstrations alone, by steps that do nothing in the environment."""
 
-from __future__ import annotations
-
 from abc import abstractmethod
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar

@@ -1,7 +1,5 @@
 """Hindsight replay with priorities (Schaul et al., arXiv 1511.05952; Andrychowicz et al., arXiv 1707.01495)."""
 
-from __future__ import annotations
-
 from typing import Any, ClassVar
 
 import numpy as np
@@ -104,9 +102,7 @@ class PrioritizedHerReplayBuffer(HerReplayBuffer):
 
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> DictReplayBufferSamples:  # type: ignore[override]
         """B transitions, those with their own goals first; ``importance_weights`` then holds their weights, (B, 1).
-
-        :raises RuntimeError: before the end of the first episode
-        """
+        RuntimeError before the end of the first episode."""
         if not self._tree.total:
             raise RuntimeError("no whole episode is stored yet: choose a learning_starts greater than an episode's steps")
         drawn = self._tree.draw(batch_size)

@@ -1,7 +1,5 @@
 """SAC with demonstrations in the way of RLPD: what a practitioner would try first today."""
 
-from __future__ import annotations
-
 from typing import Any, ClassVar
 
 import torch as th

@@ -1,7 +1,5 @@
 """TD3 and DDPG with demonstrations; actor and critic have rates, optimisers and target rates of their own, as in the paper."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Iterable
 from typing import Any
@@ -81,8 +79,6 @@ class TD3Demo(DemonstratedAlgorithm, TD3):
             if own is not None:
                 for group in optimizer.param_groups:
                     group["lr"] = own * progress
-
-    # ------------------------------------------------------------------ learning
 
     def train(self, gradient_steps: int, batch_size: int = 100) -> None:
         """TD3's updates: so many of the critic; the actor and the targets follow every ``policy_delay``."""
@@ -171,7 +167,6 @@ class DDPGDemo(TD3Demo):
     :param q_filter: clone only what the critic values above the actor's own action
     :param demonstration_fraction: share of each batch; Nair et al. take 128 of 1152
     :param options: further keywords of :class:`TD3Demo`
-    :raises ValueError: as :class:`TD3Demo`
     """
 
     @checked

@@ -4,13 +4,7 @@ Nothing here uses pickle: weights are safetensors, buffers ``.npy``, everything 
 """
 
 from sb3_actpc.checkpoints.bundle import Bundle, DamagedCheckpoint, find_bundle, list_bundles
-from sb3_actpc.checkpoints.callback import (
-    CheckpointCallback,
-    between_updates,
-    continue_learning,
-    restore,
-    why_no_checkpoints,
-)
+from sb3_actpc.checkpoints.callback import CheckpointCallback, between_updates, continue_learning, restore, why_no_checkpoints
 from sb3_actpc.checkpoints.interrupts import EXIT_STOPPED, StopSignals, TrainingStopped
 from sb3_actpc.checkpoints.state import Restored
 from sb3_actpc.checkpoints.weights import load_checkpoint, load_weights, save_weights

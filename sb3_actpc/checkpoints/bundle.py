@@ -1,7 +1,5 @@
 """The folder of a checkpoint: written under a temporary name, hashed, renamed when whole, checked when read."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os
@@ -31,7 +29,7 @@ class DamagedCheckpoint(ValueError):
 
 
 def warn(line: str) -> None:
-    """:param line: what there is to report, where nobody has said to whom"""
+    """Where nobody has said to whom to report."""
     warnings.warn(line, stacklevel=3)
 
 
@@ -76,12 +74,8 @@ def _hash_file(path: Path) -> str:
 
 
 class Bundle:
-    """A checkpoint on the disk.
-
-    :param path: its folder
-    :raises DamagedCheckpoint: when the manifest is missing or not whole
-    :raises ValueError: when another version of the format wrote it
-    """
+    """A checkpoint on the disk, by its folder. DamagedCheckpoint when the manifest is missing or not whole, ValueError when
+    another version of the format wrote it."""
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path)
@@ -92,13 +86,14 @@ class Bundle:
         """Environment steps of the run until then."""
         return int(self.manifest["num_timesteps"])
 
-    def verify(self) -> None:
-        """:raises DamagedCheckpoint: naming the first file that is missing or not what was written"""
+    def verify(self) -> "Bundle":
+        """The checkpoint itself; DamagedCheckpoint names the first file that is missing or not what was written."""
         for name, digest in self.manifest["files"].items():
             if not (self.path / name).is_file():
                 raise DamagedCheckpoint(f"{self.path}: {name} is missing")
             if _hash_file(self.path / name) != digest:
                 raise DamagedCheckpoint(f"{self.path}: {name} does not have the recorded SHA-256")
+        return self
 
     def read_bytes(self, name: str) -> bytes:
         """A file's content."""
@@ -116,10 +111,8 @@ class Bundle:
 @contextmanager
 def write_bundle(folder: Path, num_timesteps: int, keep: int, manifest: Mapping[str, Any]) -> Iterator[BundleWriter]:
     """Write a checkpoint; it appears in ``folder``, that of a run's checkpoints, only when the block and everything after it
-    has worked. ``keep`` of them stay; ``manifest`` holds what else to record, plain values.
-
-    :raises OSError: when the disk is full or the folder cannot be written; nothing is left behind then
-    """
+    has worked. ``keep`` of them stay; ``manifest`` holds what else to record, plain values. OSError when the disk is full or
+    the folder cannot be written; nothing is left behind then."""
     folder.mkdir(parents=True, exist_ok=True)
     for left in folder.glob(f"{_TEMPORARY}*"):  # of a killed process
         shutil.rmtree(left, ignore_errors=True)
@@ -134,13 +127,13 @@ def write_bundle(folder: Path, num_timesteps: int, keep: int, manifest: Mapping[
             writer.add_json(MANIFEST, {**record, "sha256": _manifest_hash(record)})
             writer.files()
         _sync_folder(temporary)
-        numbers = [number for number, _ in _list(folder)]
-        os.replace(temporary, folder / f"{max(numbers, default=0) + 1:06d}_step_{num_timesteps}")
+        number = 1 + max(map(_number, list_bundles(folder)), default=0)
+        os.replace(temporary, folder / f"{number:06d}_step_{num_timesteps}")
         _sync_folder(folder)
     except BaseException:
         shutil.rmtree(temporary, ignore_errors=True)
         raise
-    for _, old in _list(folder)[:-keep]:  # renamed first: a bundle never has its name while half of it is gone
+    for old in list_bundles(folder)[:-keep]:  # renamed first: a bundle never has its name while half of it is gone
         doomed = folder / f"{_TEMPORARY}{uuid.uuid4().hex[:12]}"
         os.replace(old, doomed)
         shutil.rmtree(doomed, ignore_errors=True)
@@ -148,46 +141,32 @@ def write_bundle(folder: Path, num_timesteps: int, keep: int, manifest: Mapping[
 
 def list_bundles(folder: str | os.PathLike[str]) -> list[Path]:
     """Folders of all checkpoints of a run, oldest first; empty when there are none."""
-    return [path for _, path in _list(Path(folder))]
+    found = Path(folder).glob("*_step_*")
+    return sorted((path for path in found if _NAME.fullmatch(path.name) and path.is_dir()), key=_number)
 
 
 def find_bundle(path: str | os.PathLike[str], report: Report = warn) -> Bundle:
-    """The checkpoint at ``path``, or the newest whole one of those in it; damaged ones are named and skipped.
-
-    :param path: one checkpoint, or the folder of a run's checkpoints
-    :param report: given a line for every damaged one
-    :return: the checkpoint, verified
-    :raises FileNotFoundError: when there is none
-    :raises DamagedCheckpoint: when all are damaged, or ``path`` is one that is
-    :raises ValueError: when the newest was written in another version of the format
-    """
+    """The checkpoint at ``path``, or the newest whole one of those in it, verified; damaged ones are skipped, and ``report``
+    is given a line for each. FileNotFoundError when there is none, DamagedCheckpoint when all are damaged, or ``path`` is one
+    that is, ValueError when the newest was written in another version of the format."""
     path = Path(path)
     bundles = list_bundles(path)
     if not bundles and (path / MANIFEST).exists():
-        return _verified(path)
+        return Bundle(path).verify()
     if not bundles:
         if _NAME.fullmatch(path.name) and path.is_dir():
             raise DamagedCheckpoint(f"{path}: {MANIFEST} is missing")
         raise FileNotFoundError(f"no checkpoint in {path}")
     for candidate in reversed(bundles):
         try:
-            return _verified(candidate)
+            return Bundle(candidate).verify()
         except DamagedCheckpoint as error:
             report(f"damaged checkpoint skipped: {error}")
     raise DamagedCheckpoint(f"{path}: all of its {len(bundles)} checkpoints are damaged")
 
 
-def _verified(path: Path) -> Bundle:
-    bundle = Bundle(path)
-    bundle.verify()
-    return bundle
-
-
-def _list(folder: Path) -> list[tuple[int, Path]]:
-    if not folder.is_dir():
-        return []
-    matches = [(_NAME.fullmatch(entry.name), entry) for entry in folder.iterdir()]
-    return sorted((int(match.group(1)), entry) for match, entry in matches if match and entry.is_dir())
+def _number(path: Path) -> int:
+    return int(path.name.partition("_")[0])
 
 
 def _read_manifest(path: Path) -> dict[str, Any]:

@@ -1,7 +1,5 @@
 """Checkpoints while an SB3 algorithm learns, and going on from them."""
 
-from __future__ import annotations
-
 import os
 import tempfile
 from collections.abc import Callable
@@ -10,7 +8,7 @@ from typing import Any
 
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EventCallback
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.type_aliases import MaybeCallback
@@ -87,12 +85,18 @@ class CheckpointCallback(BaseCallback):
             self.report(f"step {model.num_timesteps:>8}  saved in {path}")
         return path
 
-    # ------------------------------------------------------------------ hooks
-
     def _init_callback(self) -> None:
         if why_no_checkpoints(type(self.model)):
             raise ValueError(f"{type(self.model).__name__} {why_no_checkpoints(type(self.model))}: leave the callback out")
-        check_writable(self.folder)
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryFile(dir=self.folder):
+                pass
+        except OSError as error:
+            reason = error.strerror or error
+            raise ValueError(
+                f"folder={str(self.folder)!r}: no checkpoint can be written there ({reason}): choose another folder"
+            ) from error
         if self.handle_signals:
             self.signals.install()
 
@@ -156,11 +160,9 @@ def why_no_checkpoints(algorithm: type[BaseAlgorithm]) -> str:
 
 
 def between_updates(callback: BaseCallback) -> Callable[[], None]:
-    """For algorithms that learn before their first rollout, in ``_setup_learn``, where SB3 calls no callback.
-
-    :param callback: of this ``learn``, as SB3's ``_setup_learn`` returns it
-    :return: to be called before each of those updates: goes on from a checkpoint taken there, and saves and stops on a signal
-    """
+    """For algorithms that learn before their first rollout, in ``_setup_learn``, where SB3 calls no callback: given what SB3's
+    ``_setup_learn`` returns, what is to be called before each of those updates. It goes on from a checkpoint taken there, and
+    saves and stops on a signal."""
     savers = [one for one in callback_tree(callback) if isinstance(one, CheckpointCallback)]
     for saver in savers:
         saver._follow(callback)
@@ -170,9 +172,6 @@ def between_updates(callback: BaseCallback) -> Callable[[], None]:
             saver._resume_or_stop()
 
     return resume_or_stop
-
-
-# ---------------------------------------------------------------------- going on
 
 
 def restore(model: BaseAlgorithm, path: str | os.PathLike[str], report: Report = warn) -> Restored:
@@ -214,24 +213,9 @@ def continue_learning(restored: Restored, callback: MaybeCallback = None, **opti
 
 def callback_tree(callback: Any) -> list[BaseCallback]:
     """A callback and all in it, lists left out, in the order in which they are called."""
-    if callback is None or not isinstance(callback, BaseCallback):
+    if isinstance(callback, CallbackList):
+        return [one for child in callback.callbacks for one in callback_tree(child)]
+    if not isinstance(callback, BaseCallback):
         return []
-    children = callback.callbacks if isinstance(callback, CallbackList) else []
-    if isinstance(callback, EventCallback) and callback.callback is not None:
-        children = [callback.callback]
-    # SB3's EvalCallback has two
-    after = getattr(callback, "callback_on_new_best", None)
-    own = [] if isinstance(callback, CallbackList) else [callback]
-    return [*own, *(one for child in [*children, after] for one in callback_tree(child))]
-
-
-def check_writable(folder: Path) -> None:
-    """Make the folder of checkpoints; ValueError when nothing can be written there."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            pass
-    except OSError as error:
-        raise ValueError(
-            f"folder={str(folder)!r}: no checkpoint can be written there ({error.strerror or error}): choose another folder"
-        ) from error
+    children = [getattr(callback, name, None) for name in ("callback", "callback_on_new_best")]  # SB3's EvalCallback has both
+    return [callback, *(one for child in children for one in callback_tree(child))]

@@ -1,7 +1,5 @@
 """Plain values to JSON and arrays, and back: what a checkpoint can hold without running code when it is read."""
 
-from __future__ import annotations
-
 import math
 import random
 import types
@@ -23,34 +21,19 @@ from stable_baselines3.common.vec_env.stacked_observations import StackedObserva
 
 _NOT_NUMBERS = {"nan": math.nan, "inf": math.inf, "-inf": -math.inf}
 _ARRAY_KINDS = "biuf"
+_BIT_GENERATORS = ("MT19937", "PCG64", "Philox")
 # what a value of these types holds is made anew by the constructors, or never changes
-_LEFT_ALONE: tuple[type, ...] = (
-    type,
-    np.dtype,
-    Enum,
-    EnvSpec,
-    ResultsWriter,
-    gym.Env,
-    types.FunctionType,
-    types.MethodType,
-    types.BuiltinFunctionType,
-    types.ModuleType,
-    th.device,
-)
+_LEFT_ALONE: tuple[type, ...] = (type, np.dtype, th.device, Enum, EnvSpec, ResultsWriter, gym.Env)
+_LEFT_ALONE += (types.FunctionType, types.MethodType, types.BuiltinFunctionType, types.ModuleType)
 _LEFT_ALONE_NAMES = ("mujoco._structs.MjModel", "gymnasium.envs.mujoco.mujoco_rendering.MujocoRenderer")
 # objects whose attributes are written one by one into an object of the same class that is there already
 _TRANSPARENT: tuple[type, ...] = (RunningMeanStd, StackedObservations, ActionNoise)
 
 
 class OpaqueValue(ValueError):
-    """A value that cannot be written without running code when it is read.
-
-    :param where: path of the value
-    :param value: the value
-    """
+    """A value that cannot be written without running code when it is read."""
 
     def __init__(self, where: str, value: Any) -> None:
-        self.where = where
         super().__init__(f"{where}: a {type(value).__module__}.{type(value).__qualname__} cannot be stored as plain data")
 
 
@@ -67,10 +50,8 @@ class Encoder:
         self._open: set[int] = set()
 
     def encode(self, value: Any, where: str) -> Any:
-        """JSON of a value; its path names the arrays in it.
-
-        :raises OpaqueValue: when it, or something in it, is of another kind or contains itself
-        """
+        """JSON of a value; its path names the arrays in it. OpaqueValue when it, or something in it, is of another kind or
+        contains itself."""
         if value is None or isinstance(value, (bool, str)) or type(value) is int:
             return value
         if type(value) is float:
@@ -94,9 +75,9 @@ class Encoder:
             name = f"{where}#{len(self.tensors)}"
             self.tensors[name] = value.detach()
             return {"tensor": name}
+        if isinstance(value, np.ndarray) and value.dtype == object and value.size == 0:
+            return {"empty": list(value.shape)}
         if value.dtype.kind not in _ARRAY_KINDS or value.dtype.itemsize > 8:
-            if isinstance(value, np.ndarray) and value.dtype == object and value.size == 0:
-                return {"empty": list(value.shape)}
             raise OpaqueValue(where, value)
         name = f"{where}#{len(self.arrays)}"
         self.arrays[name] = np.asarray(value)
@@ -130,7 +111,9 @@ class Encoder:
         if isinstance(value, bytes):
             return {"bytes": value.hex()}
         if isinstance(value, spaces.Space):
-            return {"space": self.encode(space_generators(value), where)}
+            generators = [part._np_random for part in _subspaces(value)]  # None where it has not been used
+            states = [None if one is None else dict(one.bit_generator.state) for one in generators]
+            return {"space": self.encode(states, where)}
         if isinstance(value, _LEFT_ALONE) or f"{type(value).__module__}.{type(value).__qualname__}" in _LEFT_ALONE_NAMES:
             return {"left": type(value).__qualname__}
         if isinstance(value, _TRANSPARENT):
@@ -146,10 +129,8 @@ class Decoder:
 
     def decode(self, node: Any, existing: Any = None) -> Any:
         """The value of JSON that :meth:`Encoder.encode` returned, new where it can be; of ``existing``, the value that is
-        there now, generators, spaces and objects are changed in place.
-
-        :raises ValueError: when the JSON is of another form, or the existing value of another kind
-        """
+        there now, generators, spaces and objects are changed in place. ValueError for JSON of another form, or an existing
+        value of another kind."""
         if not isinstance(node, (dict, list)):
             return node
         if isinstance(node, list):
@@ -183,15 +164,12 @@ class Decoder:
     def _generator(self, node: dict[str, Any], existing: Any) -> np.random.Generator:
         state = self.decode(node["generator"])
         name = state["bit_generator"]
-        if isinstance(existing, np.random.Generator) and existing.bit_generator.state["bit_generator"] == name:
-            existing.bit_generator.state = state
-            return existing
-        kinds: dict[str, Any] = {kind.__name__: kind for kind in (np.random.PCG64, np.random.MT19937, np.random.Philox)}
-        if name not in kinds:
-            raise ValueError(f"the generator {name!r} is unknown; expected one of {sorted(kinds)}")
-        generator = np.random.Generator(kinds[name]())
-        generator.bit_generator.state = state
-        return generator
+        if not isinstance(existing, np.random.Generator) or type(existing.bit_generator).__name__ != name:
+            if name not in _BIT_GENERATORS:
+                raise ValueError(f"the generator {name!r} is unknown; expected one of {sorted(_BIT_GENERATORS)}")
+            existing = np.random.Generator(getattr(np.random, name)())
+        existing.bit_generator.state = state
+        return existing
 
     def _random_state(self, node: dict[str, Any], existing: Any) -> np.random.RandomState:
         made = existing if isinstance(existing, np.random.RandomState) else np.random.RandomState()
@@ -205,7 +183,9 @@ class Decoder:
 
     def _space(self, node: dict[str, Any], existing: Any) -> Any:
         if isinstance(existing, spaces.Space):
-            restore_space_generators(existing, self.decode(node["space"]))
+            for part, state in zip(_subspaces(existing), self.decode(node["space"]), strict=True):
+                if state is not None:
+                    part.np_random.bit_generator.state = state
         return existing
 
     def _object(self, node: dict[str, Any], existing: Any) -> Any:
@@ -232,21 +212,6 @@ _PLAIN_KINDS: dict[str, Callable[[Decoder, dict[str, Any]], Any]] = {
 
 def _subspaces(space: spaces.Space) -> list[spaces.Space]:
     """The space and all spaces in it, in a fixed order."""
-    parts: list[spaces.Space] = []
-    if isinstance(space, spaces.Dict):
-        parts = list(space.spaces.values())
-    elif isinstance(space, (spaces.Tuple, spaces.OneOf)):
-        parts = list(space.spaces)
+    parts: Any = space.spaces if isinstance(space, (spaces.Dict, spaces.Tuple, spaces.OneOf)) else ()
+    parts = parts.values() if isinstance(space, spaces.Dict) else parts
     return [space, *(inner for part in parts for inner in _subspaces(part))]
-
-
-def space_generators(space: spaces.Space) -> list[dict[str, Any] | None]:
-    """The state of the generator of a space and of each space in it, None where it has not been used."""
-    return [None if part._np_random is None else dict(part._np_random.bit_generator.state) for part in _subspaces(space)]
-
-
-def restore_space_generators(space: spaces.Space, states: list[dict[str, Any] | None]) -> None:
-    """Put back what :func:`space_generators` returned, into a space of the same form."""
-    for part, state in zip(_subspaces(space), states, strict=True):
-        if state is not None:
-            part.np_random.bit_generator.state = state

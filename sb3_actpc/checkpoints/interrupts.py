@@ -1,7 +1,5 @@
 """Stopping a run by SIGTERM or SIGINT: a note is made at once, and acted upon at the next step."""
 
-from __future__ import annotations
-
 import signal
 import threading
 from types import FrameType
@@ -47,7 +45,7 @@ class StopSignals:
             number, old = self._old.popitem()
             signal.signal(number, signal.SIG_DFL if old is None else old)
 
-    def __enter__(self) -> StopSignals:
+    def __enter__(self) -> "StopSignals":
         self.install()
         return self
 

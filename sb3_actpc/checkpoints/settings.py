@@ -1,7 +1,5 @@
 """Constructor settings as plain values. Classes go by their names; reading one runs no code and imports nothing."""
 
-from __future__ import annotations
-
 import os
 import sys
 from collections.abc import Mapping
@@ -12,12 +10,7 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.noise import (
-    ActionNoise,
-    NormalActionNoise,
-    OrnsteinUhlenbeckActionNoise,
-    VectorizedActionNoise,
-)
+from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise, VectorizedActionNoise
 from stable_baselines3.common.type_aliases import TrainFreq
 from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
 
@@ -57,10 +50,7 @@ def constructor_settings(model: BaseAlgorithm) -> dict[str, Any]:
 
 def read_settings(record: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
     """Keywords of the constructor, ``policy`` among them, from what :func:`constructor_settings` returned; ``overrides``
-    replace them.
-
-    :raises ValueError: when a value has no name in this version, or a keyword that could not be stored is not given
-    """
+    replace them. ValueError when a value has no name in this version, or a keyword that could not be stored is not given."""
     missing = [name for name in record["unnamed"] if name not in overrides]
     if missing:
         raise ValueError(f"{', '.join(missing)} could not be stored as plain values: pass the same again, {missing[0]}=...")
@@ -105,18 +95,15 @@ def _name_object(value: Any) -> dict[str, Any]:
     for name, (kind, attributes) in _SCHEDULES.items():
         if type(value) is kind:
             return {"schedule": [name, *(float(getattr(value, attribute)) for attribute in attributes)]}
-    if isinstance(value, ActionNoise):
-        for name, (kind, parameters) in _NOISES.items():
-            if type(value) is kind:
-                return {"noise": [name, {key: np.asarray(vars(value)[part]).tolist() for key, part in parameters.items()}]}
+    for name, (kind, parameters) in _NOISES.items():
+        if type(value) is kind:
+            return {"noise": [name, {key: np.asarray(vars(value)[part]).tolist() for key, part in parameters.items()}]}
     raise ValueError(f"{value!r} has no name here")
 
 
 def read_value(node: Any) -> Any:
-    """The value of one keyword as :func:`constructor_settings` stored it.
-
-    :raises ValueError: for a class, a schedule or a noise that is not allowed
-    """
+    """The value of one keyword as :func:`constructor_settings` stored it; ValueError for a class, schedule or noise not
+    allowed."""
     if isinstance(node, list):
         return [read_value(part) for part in node]
     if not isinstance(node, dict):

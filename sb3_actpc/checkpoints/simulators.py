@@ -1,7 +1,5 @@
 """Environments in the middle of an episode: simulator, wrappers' counters and generators, as plain data."""
 
-from __future__ import annotations
-
 import importlib
 from typing import Any
 
@@ -17,23 +15,18 @@ _SKIPPED |= {"t_start"}
 # under this name, what an environment's own checkpoint_state() returned
 _OWN_STATE = "checkpoint_state()"
 _GENERATORS = {"generator", "random_state", "random", "space"}  # kinds of stored values
-_IN_ARENA = ("efc_", "contact", "iefc_", "iM", "iLD", "iacc", "ifrc_")  # of MuJoCo's data
+# of MuJoCo's data: made anew in each step, and where there are none their memory belongs to something else
+_IN_ARENA = ("efc_", "contact", "iefc_", "iM", "iLD", "iacc", "ifrc_")
 
 
 def vec_env_layers(env: VecEnv) -> list[VecEnv]:
     """The environment, the one it wraps, and so on, outermost first."""
-    layers = [env]
-    while isinstance(layers[-1], VecEnvWrapper):
-        layers.append(layers[-1].venv)
-    return layers
+    return [env, *vec_env_layers(env.venv)] if isinstance(env, VecEnvWrapper) else [env]
 
 
 def env_layers(env: gym.Env[Any, Any]) -> list[gym.Env[Any, Any]]:
     """The wrappers of one environment, outermost first, and the environment itself."""
-    layers = [env]
-    while isinstance(layers[-1], gym.Wrapper):
-        layers.append(layers[-1].env)
-    return layers
+    return [env, *env_layers(env.env)] if isinstance(env, gym.Wrapper) else [env]
 
 
 def env_name(env: VecEnv) -> str:
@@ -42,37 +35,31 @@ def env_name(env: VecEnv) -> str:
     if spec is not None:
         return str(spec.id)
     innermost = vec_env_layers(env)[-1]
-    if isinstance(innermost, DummyVecEnv):
-        return type(innermost.envs[0].unwrapped).__qualname__
-    return type(innermost).__qualname__
+    return type(innermost.envs[0].unwrapped if isinstance(innermost, DummyVecEnv) else innermost).__qualname__
 
 
 def capture_vec_env(env: VecEnv, encoder: Encoder, where: str) -> dict[str, Any]:
     """The training environment with its wrappers as JSON; environments whose state cannot be stored are named in it with
     the reason."""
     *wrappers, innermost = vec_env_layers(env)
-    record: dict[str, Any] = {"wrappers": [], "envs": []}
+    record: dict[str, Any] = {"wrappers": []}
     # what the next reset will be given
     record["seeds"] = encoder.encode([innermost._seeds, innermost._options], f"{where}.seeds")
     for index, wrapper in enumerate(wrappers):
         kind, kept = type(wrapper).__qualname__, {name: one for name, one in vars(wrapper).items() if name not in _SKIPPED}
         # these hold settings besides what is known to change
         record["wrappers"].append({"class": kind, "attributes": encoder.encode_some(kept, f"{where}.{kind}{index}")})
-    if not isinstance(innermost, DummyVecEnv):
+    if isinstance(innermost, DummyVecEnv):
+        record["envs"] = [capture_env(one, encoder, f"{where}.{index}") for index, one in enumerate(innermost.envs)]
+    else:
         reason = f"the environments of a {type(innermost).__qualname__} run in other processes"
         record["envs"] = [{"reason": reason} for _ in range(env.num_envs)]
-        return record
-    for index, one in enumerate(innermost.envs):
-        record["envs"].append(capture_env(one, encoder, f"{where}.{index}"))
     return record
 
 
 def restore_vec_env(env: VecEnv, record: dict[str, Any], decoder: Decoder) -> list[tuple[int, str]]:
-    """Put back what :func:`capture_vec_env` returned into an environment made as the captured one was.
-
-    :return: (index, reason) of each environment whose episode must start again
-    :raises ValueError: when the environment is wrapped in another way
-    """
+    """Put back what :func:`capture_vec_env` returned into an environment made as the captured one was: (index, reason) of each
+    environment whose episode must start again. ValueError when it is wrapped in another way."""
     *wrappers, innermost = vec_env_layers(env)
     kinds, stored = [type(wrapper).__qualname__ for wrapper in wrappers], [entry["class"] for entry in record["wrappers"]]
     if kinds != stored or len(record["envs"]) != env.num_envs:
@@ -95,9 +82,6 @@ def restore_vec_env(env: VecEnv, record: dict[str, Any], decoder: Decoder) -> li
     return lost
 
 
-# ------------------------------------------------------------------ one environment
-
-
 def capture_env(env: gym.Env[Any, Any], encoder: Encoder, where: str) -> dict[str, Any]:
     """The state of one environment and its wrappers as JSON, ``where`` being its path in the checkpoint; with a "reason"
     where it cannot be stored."""
@@ -106,8 +90,12 @@ def capture_env(env: gym.Env[Any, Any], encoder: Encoder, where: str) -> dict[st
     for depth, layer in enumerate(layers):
         attributes: dict[str, Any] = {}
         for name, value in _layer_values(layer).items():
+            path = f"{where}.{depth}.{name}"
             try:
-                attributes[name] = _encode_attribute(value, encoder, f"{where}.{depth}.{name}")
+                if type(value).__name__ == "MjData" and type(value).__module__.startswith("mujoco"):
+                    attributes[name] = {"physics": encoder.encode(capture_physics(value.model, value), path)}
+                else:
+                    attributes[name] = encoder.encode(value, path)
             except OpaqueValue as error:
                 record.setdefault("reason", str(error))
         record["layers"].append(attributes)
@@ -115,17 +103,10 @@ def capture_env(env: gym.Env[Any, Any], encoder: Encoder, where: str) -> dict[st
 
 
 def _layer_values(layer: gym.Env[Any, Any]) -> dict[str, Any]:
-    """What to store of an environment or a wrapper: its attributes and, first, what it says of the objects that it hides
-    (``checkpoint_state()``; the attributes named in ``checkpoint_skipped`` hold them)."""
+    """Attributes but those in ``checkpoint_skipped``, and first what the layer says of the objects that these hold."""
     skipped = {*_SKIPPED, *getattr(layer, "checkpoint_skipped", ())}
     own = {_OWN_STATE: layer.checkpoint_state()} if hasattr(layer, "checkpoint_state") else {}
     return own | {name: value for name, value in vars(layer).items() if name not in skipped}
-
-
-def _encode_attribute(value: Any, encoder: Encoder, where: str) -> Any:
-    if type(value).__name__ == "MjData" and type(value).__module__.startswith("mujoco"):
-        return {"physics": encoder.encode(capture_physics(value.model, value), where)}
-    return encoder.encode(value, where)
 
 
 def _layers_mismatch(env: gym.Env[Any, Any] | None, entry: dict[str, Any]) -> str | None:
@@ -159,9 +140,6 @@ def set_attribute(owner: Any, name: str, node: Any, decoder: Decoder) -> None:
         setattr(owner, name, value)
 
 
-# ------------------------------------------------------------------ MuJoCo
-
-
 def capture_physics(model: Any, data: Any) -> dict[str, np.ndarray]:
     """The full integration state of an ``MjData``, (n,) float64 under "", and every other array of it by its name, since
     some of them lag behind the state."""
@@ -176,10 +154,10 @@ def restore_physics(model: Any, data: Any, arrays: dict[str, np.ndarray]) -> Non
     """Put back what :func:`capture_physics` returned; ValueError when it is of another simulation."""
     mujoco = importlib.import_module("mujoco")
     kind = mujoco.mjtState.mjSTATE_INTEGRATION
-    if len(arrays[""]) != mujoco.mj_stateSize(model, kind):
+    size, own = len(arrays[""]), mujoco.mj_stateSize(model, kind)
+    if size != own:
         raise ValueError(
-            f"the checkpoint's simulator has a state of size {len(arrays[''])}, this one of "
-            f"{mujoco.mj_stateSize(model, kind)}: use the same task and the same MuJoCo"
+            f"the checkpoint's simulator has a state of size {size}, this one of {own}: use the same task and the same MuJoCo"
         )
     mujoco.mj_setState(model, data, arrays[""], kind)
     mujoco.mj_forward(model, data)
@@ -190,11 +168,7 @@ def restore_physics(model: Any, data: Any, arrays: dict[str, np.ndarray]) -> Non
 
 
 def _physics_arrays(data: Any) -> dict[str, np.ndarray]:
-    """Real arrays of the model's sizes; indices are scratch memory.
-
-    Those in MuJoCo's arena are left out: constraints, contacts and what is ordered by islands are made anew in each step, and
-    where there are none their memory belongs to something else.
-    """
+    """Real arrays of the model's sizes; indices are scratch memory."""
     named = {name: getattr(data, name) for name in dir(data) if not name.startswith(("_", *_IN_ARENA))}
-    fixed = {name: value for name, value in named.items() if isinstance(value, np.ndarray) and value.dtype.kind == "f"}
-    return {name: value for name, value in fixed.items() if value.size}
+    arrays = {name: value for name, value in named.items() if isinstance(value, np.ndarray)}
+    return {name: value for name, value in arrays.items() if value.dtype.kind == "f" and value.size}

@@ -1,7 +1,5 @@
 """What a checkpoint holds of an SB3 algorithm, and how it is put back."""
 
-from __future__ import annotations
-
 import inspect
 import random
 import warnings
@@ -65,10 +63,7 @@ class Restored:
 
 def capture_model(model: BaseAlgorithm, callbacks: Sequence[BaseCallback], writer: BundleWriter) -> None:
     """Write everything that the rest of the training depends on, between two rollouts, or between two updates before the
-    first.
-
-    :raises ValueError: when a weight is not finite
-    """
+    first; ValueError when a weight is not finite."""
     check_weights(model)
     encoder = Encoder()
     assert model.env is not None
@@ -122,13 +117,8 @@ def check_weights(model: BaseAlgorithm) -> None:
 
 def named(callbacks: Sequence[BaseCallback]) -> list[tuple[str, BaseCallback]]:
     """Each callback with its class's name and its number among those of that class."""
-    seen: dict[str, int] = {}
-    result = []
-    for callback in callbacks:
-        kind = type(callback).__qualname__
-        seen[kind] = seen.get(kind, 0) + 1
-        result.append((f"{kind}{seen[kind]}", callback))
-    return result
+    kinds = [type(callback).__qualname__ for callback in callbacks]
+    return [(f"{kind}{1 + kinds[:index].count(kind)}", callbacks[index]) for index, kind in enumerate(kinds)]
 
 
 def _generators(model: BaseAlgorithm) -> dict[str, Any]:
@@ -138,23 +128,14 @@ def _generators(model: BaseAlgorithm) -> dict[str, Any]:
     return states
 
 
-def _restore_generators(model: BaseAlgorithm, states: dict[str, Any]) -> None:
-    random.setstate(states["python"])
-    np.random.set_state(states["numpy"])
-    th.set_rng_state(states["torch"])
-    if "cuda" in states and model.device.type == "cuda":
-        th.cuda.set_rng_state(states["cuda"], model.device)
-
-
 def _capture_torch(model: BaseAlgorithm, encoder: Encoder) -> dict[str, Any]:
     dicts, variables = model._get_torch_save_params()
-    record = {
+    matrices = _noise_matrices(model)
+    return {
         "dicts": {name: encoder.encode(dict(recursive_getattr(model, name).state_dict()), name) for name in dicts},
         "variables": {name: encoder.encode(recursive_getattr(model, name), name) for name in variables},
+        "noise": {name: encoder.encode(getattr(matrices, name), name) for name in _NOISE_MATRICES if matrices},
     }
-    matrices = _noise_matrices(model)
-    record["noise"] = {name: encoder.encode(getattr(matrices, name), name) for name in _NOISE_MATRICES if matrices}
-    return record
 
 
 def _noise_matrices(model: BaseAlgorithm) -> Any:
@@ -176,14 +157,11 @@ def replay_buffer(model: BaseAlgorithm) -> ReplayBuffer | None:
 
 def buffer_arrays(buffer: ReplayBuffer) -> dict[str, np.ndarray]:
     """A replay buffer's arrays with a row per step, (buffer_size, n_envs, ...), by name; dictionaries' as ``name.key``."""
-    arrays: dict[str, np.ndarray] = {}
+    parts = {name: value for name, value in vars(buffer).items() if name not in _BUFFER_CURSORS}
     for name, value in vars(buffer).items():
-        parts = {f"{name}.{key}": part for key, part in value.items()} if isinstance(value, dict) else {name: value}
-        for path, part in parts.items():
-            if isinstance(part, np.ndarray) and part.dtype != object and name not in _BUFFER_CURSORS:
-                if part.shape[:1] == (buffer.buffer_size,):
-                    arrays[path] = part
-    return arrays
+        parts |= {f"{name}.{key}": part for key, part in value.items()} if isinstance(value, dict) else {}
+    arrays = {name: part for name, part in parts.items() if isinstance(part, np.ndarray) and part.dtype != object}
+    return {name: array for name, array in arrays.items() if array.shape[:1] == (buffer.buffer_size,)}
 
 
 def _capture_buffer(buffer: ReplayBuffer, encoder: Encoder, writer: BundleWriter) -> dict[str, Any]:
@@ -298,19 +276,16 @@ def _restore_logger(model: BaseAlgorithm, record: dict[str, Any], decoder: Decod
         output.file.truncate()
         output.file.write(text)
         output.file.flush()
-        header = text.partition("\n")[0]
-        output.keys = header.split(",") if header else []
+        output.keys = list(filter(None, text.partition("\n")[0].split(",")))
 
 
 # ------------------------------------------------------------------ reading
 
 
 def restore_model(model: BaseAlgorithm, bundle: Bundle, report: Report) -> Restored:
-    """Put everything back into an agent that was made with the same settings. Nothing is changed when the two do not fit.
-
-    :return: the agent, and what :func:`restore_learning` puts back once ``learn(..., reset_num_timesteps=False)`` has begun
-    :raises ValueError: when the checkpoint is of another algorithm, task, network or buffer
-    """
+    """Put everything back into an agent that was made with the same settings, but for what :func:`restore_learning` puts back
+    once ``learn(..., reset_num_timesteps=False)`` has begun. ValueError, and nothing is changed, when the checkpoint is of
+    another algorithm, task, network or buffer."""
     assert model.env is not None
     state, buffer = bundle.read_json("state.json"), replay_buffer(model)
     _check_fit(describe_model(model, env_name(model.env))["agent"], bundle)
@@ -364,7 +339,7 @@ def _check_fit(mine: dict[str, Any], bundle: Bundle) -> None:
                 "with the settings and the task of the stopped run"
             )
     theirs, own = stored["weights"], mine["weights"]
-    for name in [*own, *(name for name in theirs if name not in own)]:
+    for name in {**own, **theirs}:
         if theirs.get(name) != own.get(name):
             raise ValueError(
                 f"{bundle.path} is a checkpoint of another network: {name} has shape {theirs.get(name)}, the agent's "
@@ -392,7 +367,12 @@ def _restore_noise(model: BaseAlgorithm, node: Any, decoder: Decoder) -> None:
 
 def _restore_random(model: BaseAlgorithm, state: dict[str, Any], decoder: Decoder) -> None:
     decoder.decode(state["spaces"], [model.action_space, model.observation_space])
-    _restore_generators(model, decoder.decode(state["generators"]))
+    states = decoder.decode(state["generators"])
+    random.setstate(states["python"])
+    np.random.set_state(states["numpy"])
+    th.set_rng_state(states["torch"])
+    if "cuda" in states and model.device.type == "cuda":
+        th.cuda.set_rng_state(states["cuda"], model.device)
 
 
 def _start_episodes_again(model: BaseAlgorithm, lost: list[tuple[int, str]], report: Report) -> None:

@@ -1,7 +1,5 @@
 """Agents made from files alone: from a checkpoint, or from a file of weights that cannot run code."""
 
-from __future__ import annotations
-
 import json
 import os
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The command ``sb3-actpc``. Sub-commands import what they need when they run, so that ``--help`` is quick."""
 
-from __future__ import annotations
-
 import argparse
 import importlib
 import pkgutil
@@ -15,11 +13,8 @@ RUN_OPTIONS = ("steps", "demonstrations", "gym_packages", "eval_freq", "eval_epi
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line.
-
-    :param argv: arguments, by default those of the process
-    :return: exit code: 0, or 2 for a mistake of the user's (one line on stderr says which), or 130 when interrupted
-    """
+    """Run the command line, by default that of the process. The exit code is 0, or 2 for a mistake of the user's (one line on
+    stderr says which), or 130 when interrupted."""
     args = build_parser().parse_args(argv)
     try:
         return int(importlib.import_module(f"{__name__}.{args.command}").run(args))
@@ -34,12 +29,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def build_parser() -> argparse.ArgumentParser:
-    """The parser with all its sub-commands: the modules of this package.
-
-    Each has ``add_parser(subparsers)`` and ``run(args)``, which returns the exit code or raises one of :func:`user_errors`.
-
-    :return: the parser; the parsed ``command`` is the name of the sub-command's module
-    """
+    """The parser with all its sub-commands: the modules of this package, whose names are then its ``command``. Each has
+    ``add_parser(subparsers)`` and ``run(args)``, which returns the exit code or raises one of :func:`user_errors`."""
     parser = argparse.ArgumentParser(prog="sb3-actpc", description="Active predictive coding for Stable-Baselines3.")
     parser.add_argument("--version", action="version", version=f"sb3-actpc {__version__}")
     parser.add_argument("--debug", action="store_true", help="show where an error came from")

@@ -1,13 +1,10 @@
 """``sb3-actpc baselines``: what the baselines of other packages need."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the sub-command."""
+def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
     parser = subparsers.add_parser("baselines", help="install what the baselines of other packages need")
     commands = parser.add_subparsers(dest="baselines_command", required=True, metavar="{install}")
     install = commands.add_parser(

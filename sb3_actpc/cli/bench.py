@@ -1,8 +1,6 @@
 """``sb3-actpc bench``: what one update costs, as ratios to SB3's TD3 and to the matrix products alone; by choice also what a
 step of training or acting costs, and growth with sizes; with ``--robosuite``, robosuite tasks over robosuite's own loop."""
 
-from __future__ import annotations
-
 import argparse
 import json
 from pathlib import Path
@@ -10,7 +8,6 @@ from typing import Any
 
 
 def add_parser(subparsers: Any) -> None:
-    """Add the sub-command."""
     parser = subparsers.add_parser("bench", help="time one update of ActPC against SB3's TD3")
     parser.add_argument("--rounds", type=int, default=40, help="interleaved measurements of every entry")
     parser.add_argument("--threads", type=int, default=None, help="torch threads (default: torch's own choice)")

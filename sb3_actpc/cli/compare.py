@@ -1,20 +1,14 @@
 """``sb3-actpc compare``: many runs, brought to their end however often they are stopped."""
 
-from __future__ import annotations
-
 import argparse
 import sys
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 from sb3_actpc.cli import add_run_options, given
 
-if TYPE_CHECKING:
-    from sb3_actpc.experiments.comparison.schedule import Summary
 
-
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the sub-command."""
+def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
     parser = subparsers.add_parser(
         "compare",
         help="train several algorithms on several tasks with several seeds",
@@ -40,52 +34,32 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def run(args: argparse.Namespace) -> int:
     """Bring the runs to their end; 1 when runs have failed, 75 when a signal or a full disk stopped the command."""
+    from sb3_actpc.checkpoints import EXIT_STOPPED
     from sb3_actpc.experiments.comparison import plan_runs, read_comparison
     from sb3_actpc.experiments.comparison.display import Display, describe_runs
     from sb3_actpc.experiments.comparison.engines import make_engine
-    from sb3_actpc.experiments.comparison.schedule import run_comparison
-
-    comparison = read_comparison(_given(args))
-    runs, folder = plan_runs(comparison), Path(comparison.output)
-    if args.dry_run:
-        print(describe_runs(runs))
-        return 0
-    threads = max(run.threads for run in runs)
-    with Display(not args.no_progress) as display:
-        summary = run_comparison(
-            runs,
-            folder,
-            lambda: make_engine(args.engine, args.workers, threads, args.address),
-            display,
-            args.retry_failed,
-        )
-    return _conclude(summary, folder)
-
-
-def _given(args: argparse.Namespace) -> dict[str, Any]:
     from sb3_actpc.experiments.comparison.plan import read_comparison_file
+    from sb3_actpc.experiments.comparison.schedule import run_comparison
 
     from_file = {} if args.file is None else read_comparison_file(Path(args.file))
     options = given(args, "envs", "algos", "ablate", "seeds", "first_seed", "output")
     if "steps" in options:  # a file may call them n_timesteps
         from_file.pop("n_timesteps", None)
-    return {**from_file, **options}
-
-
-def _conclude(summary: Summary, folder: Path) -> int:
-    """The last lines, and the exit code."""
-    from sb3_actpc.checkpoints import EXIT_STOPPED
-
-    n_runs = len(summary.finished) + len(summary.failed) + len(summary.unfinished)
-    print(f"{len(summary.finished)} of {n_runs} runs are finished; see them with: sb3-actpc report {folder}")
+    comparison = read_comparison({**from_file, **options})
+    runs, folder = plan_runs(comparison), Path(comparison.output)
+    if args.dry_run:
+        print(describe_runs(runs))
+        return 0
+    engine = partial(make_engine, args.engine, args.workers, max(run.threads for run in runs), args.address)
+    with Display(not args.no_progress) as display:
+        summary = run_comparison(runs, folder, engine, display, args.retry_failed)
+    print(f"{len(summary.finished)} of {len(runs)} runs are finished; see them with: sb3-actpc report {folder}")
     for run, message in summary.failed:
         print(f"sb3-actpc: failed: {run.label} ({run.folder}): {message}", file=sys.stderr)
     if summary.stopped_by is not None:
         reason = f"the disk is full ({summary.message}), free some space" if summary.message else summary.stopped_by
-        print(
-            f"sb3-actpc: stopped by {reason}; {len(summary.unfinished)} runs are left, the same command goes on with them",
-            file=sys.stderr,
-        )
+        left = f"{len(summary.unfinished)} runs are left, the same command goes on with them"
+        print(f"sb3-actpc: stopped by {reason}; {left}", file=sys.stderr)
         return EXIT_STOPPED
     if summary.failed:
         print("sb3-actpc: try failed runs again with --retry-failed", file=sys.stderr)

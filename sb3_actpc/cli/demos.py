@@ -3,6 +3,7 @@
 import argparse
 import shlex
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,10 +15,10 @@ if TYPE_CHECKING:
 Subparsers = Any  # argparse's own type is private
 
 HDF5_SUFFIXES = (".hdf5", ".h5")
+_report = partial(print, flush=True)
 
 
 def add_parser(subparsers: Subparsers) -> None:
-    """Add the sub-command."""
     parser = subparsers.add_parser("demos", help="make or look at demonstration files")
     commands = parser.add_subparsers(dest="demos_command", required=True, metavar="{collect,convert,download,info}")
     _add_collect(commands)
@@ -35,91 +36,74 @@ def _add_collect(commands: Subparsers) -> None:
         "record its successful episodes. A finished training is not repeated, a stopped one of sac or td3 goes on. Robosuite "
         "tasks: record scripted demonstrators.",
     )
-    collect.add_argument("--env", required=True, metavar="ID", help="Gymnasium id, such as SparseHopper-v5")
-    collect.add_argument(
-        "--demonstrator",
-        choices=["trained", "scripted"],
-        help="who demonstrates (default: scripted for robosuite tasks, else trained)",
-    )
-    collect.add_argument("--episodes", type=int, help="episodes to record (default: 20; scripted 50, or 300 when mixed)")
-    collect.add_argument("--max-tries", type=int, help="episodes to play at most (default: ten times --episodes)")
-    collect.add_argument(
-        "--mixed",
-        action="store_true",
-        help="several demonstrators in turn: a trained one and itself when it stood at half the return, or six scripted ones "
-        "of three proficiencies",
-    )
-    collect.add_argument("--seed", type=int, default=0, help="of the demonstrator and of the recording (default: 0)")
-    collect.add_argument("--output", type=Path, metavar="FILE", help="file to write (default: sparse_<task>.npz)")
-    trained = collect.add_argument_group("trained demonstrators")
-    trained.add_argument("--algo", default="ppo", metavar="{ppo,sac,td3,trpo}", help="algorithm (default: ppo)")
-    trained.add_argument("--steps", type=float, help="training steps (default: 2000 full episodes)")
-    trained.add_argument("--target-return", type=float, help="stop training at this mean dense return (default: never)")
-    trained.add_argument(
-        "--quality", type=float, help="stop training at this share of the dense return of the package's demonstrations"
-    )
-    trained.add_argument("--stochastic", action="store_true", help="sample the actions, not the most likely ones")
-    trained.add_argument(
-        "--work-dir", type=Path, metavar="DIR", help="folder of the training run (default: demonstrators/<task>_<algo>_<seed>)"
-    )
-    trained.add_argument("--save-every", type=int, default=50_000, help="steps between two evaluations (default: 50000)")
-    trained.add_argument("--n-envs", type=int, default=1, help="parallel environments of the training (default: 1)")
-    trained.add_argument("--gym-packages", nargs="+", default=[], metavar="MODULE", help="modules that register the task")
-    scripted = collect.add_argument_group("scripted demonstrators")
-    scripted.add_argument("--proficiency", type=float, metavar="P", help="from 0 (clumsy) to 1 (sure, the default)")
-    scripted.add_argument("--obs", metavar="LAYOUT", help="of the task, paper or robomimic (default: paper)")
+    add = collect.add_argument
+    add("--env", required=True, metavar="ID", help="Gymnasium id, such as SparseHopper-v5")
+    who = "who demonstrates (default: scripted for robosuite tasks, else trained)"
+    add("--demonstrator", choices=["trained", "scripted"], help=who)
+    add("--episodes", type=int, help="episodes to record (default: 20; scripted 50, or 300 when mixed)")
+    add("--max-tries", type=int, help="episodes to play at most (default: ten times --episodes)")
+    several = "a trained one and itself when it stood at half the return, or six scripted ones of three proficiencies"
+    add("--mixed", action="store_true", help=f"several demonstrators in turn: {several}")
+    add("--seed", type=int, default=0, help="of the demonstrator and of the recording (default: 0)")
+    add("--output", type=Path, metavar="FILE", help="file to write (default: sparse_<task>.npz)")
+    add = collect.add_argument_group("trained demonstrators").add_argument
+    add("--algo", default="ppo", metavar="{ppo,sac,td3,trpo}", help="algorithm (default: ppo)")
+    add("--steps", type=float, help="training steps (default: 2000 full episodes)")
+    add("--target-return", type=float, help="stop training at this mean dense return (default: never)")
+    add("--quality", type=float, help="stop training at this share of the dense return of the package's demonstrations")
+    add("--stochastic", action="store_true", help="sample the actions, not the most likely ones")
+    folder = "folder of the training run (default: demonstrators/<task>_<algo>_<seed>)"
+    add("--work-dir", type=Path, metavar="DIR", help=folder)
+    add("--save-every", type=int, default=50_000, help="steps between two evaluations (default: 50000)")
+    add("--n-envs", type=int, default=1, help="parallel environments of the training (default: 1)")
+    add("--gym-packages", nargs="+", default=[], metavar="MODULE", help="modules that register the task")
+    add = collect.add_argument_group("scripted demonstrators").add_argument
+    add("--proficiency", type=float, metavar="P", help="from 0 (clumsy) to 1 (sure, the default)")
+    add("--obs", metavar="LAYOUT", help="of the task, paper or robomimic (default: paper)")
 
 
 def _add_convert(commands: Subparsers) -> None:
-    convert = commands.add_parser(
+    add = commands.add_parser(
         "convert",
         help="HDF5 of robomimic or robosuite to .npz, or .npz to robomimic's HDF5",
         description="Reads robomimic's low-dimensional files and robosuite's demo.hdf5 (its states are replayed), "
         "or writes a .npz file as a robomimic file.",
-    )
-    convert.add_argument("file", type=Path, metavar="FILE", help=".hdf5 or .npz")
-    convert.add_argument("--env", metavar="ID", help=f"task of an .hdf5 file, one of {', '.join(ROBOSUITE_IDS)}")
-    convert.add_argument("--obs", default="paper", metavar="LAYOUT", help="observations, paper or robomimic (default: paper)")
-    convert.add_argument("--filter-key", metavar="KEY", help="only robomimic's mask/KEY, such as better or 20_percent")
-    convert.add_argument("--output", type=Path, metavar="FILE", help="file to write (default: FILE with the other suffix)")
+    ).add_argument
+    add("file", type=Path, metavar="FILE", help=".hdf5 or .npz")
+    add("--env", metavar="ID", help=f"task of an .hdf5 file, one of {', '.join(ROBOSUITE_IDS)}")
+    add("--obs", default="paper", metavar="LAYOUT", help="observations, paper or robomimic (default: paper)")
+    add("--filter-key", metavar="KEY", help="only robomimic's mask/KEY, such as better or 20_percent")
+    add("--output", type=Path, metavar="FILE", help="file to write (default: FILE with the other suffix)")
 
 
 def _add_download(commands: Subparsers) -> None:
-    download = commands.add_parser(
+    add = commands.add_parser(
         "download",
         help="fetch robomimic's human demonstrations and convert them",
         description="Fetches robomimic's file of low-dimensional observations (MIT licence, 30 to 130 MB), checks it and "
         "converts it. Without a network: download the address it names elsewhere, and use `sb3-actpc demos convert`.",
-    )
-    download.add_argument("--env", required=True, metavar="ID", help=f"one of {', '.join(ROBOSUITE_IDS)}")
-    download.add_argument(
-        "--kind", default="mh", metavar="{mh,ph}", help="mh: 300 by six humans of three levels (default); ph: 200 by one"
-    )
-    download.add_argument("--url", help="another address of such a file")
-    download.add_argument("--obs", default="paper", metavar="LAYOUT", help="observations, paper or robomimic (default: paper)")
-    download.add_argument("--output", type=Path, metavar="FILE", help=".npz file to write (default: <task>_<kind>.npz)")
+    ).add_argument
+    add("--env", required=True, metavar="ID", help=f"one of {', '.join(ROBOSUITE_IDS)}")
+    kinds = "mh: 300 by six humans of three levels (default); ph: 200 by one"
+    add("--kind", default="mh", metavar="{mh,ph}", help=kinds)
+    add("--url", help="another address of such a file")
+    add("--obs", default="paper", metavar="LAYOUT", help="observations, paper or robomimic (default: paper)")
+    add("--output", type=Path, metavar="FILE", help=".npz file to write (default: <task>_<kind>.npz)")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run the sub-command."""
     commands = {"collect": _collect, "convert": _convert, "download": _download, "info": _info}
     return commands[args.demos_command](args)
 
 
-def _report(line: str) -> None:
-    print(line, flush=True)
-
-
 def _collect(args: argparse.Namespace) -> int:
-    """Record and save."""
     demonstrator = args.demonstrator or ("scripted" if args.env in ROBOSUITE_IDS else "trained")
     if demonstrator == "trained" and (args.proficiency is not None or args.obs is not None):
         raise ValueError("--proficiency and --obs are for scripted demonstrators of robosuite tasks: leave them out")
     if demonstrator == "scripted" and (args.stochastic or args.quality is not None or args.target_return is not None):
         raise ValueError("--stochastic, --quality and --target-return are for trained demonstrators: give --proficiency")
-    output = args.output or _default_output(args.env)
     demonstrations = _collect_scripted(args) if demonstrator == "scripted" else _collect_trained(args)
-    return _save(demonstrations, output)
+    return _save(demonstrations, args.output or _default_output(args.env))
 
 
 def _default_output(env_id: str, suffix: str = "") -> Path:
@@ -156,7 +140,6 @@ def _collect_scripted(args: argparse.Namespace) -> "Demonstrations":
 
 
 def _collect_trained(args: argparse.Namespace) -> "Demonstrations":
-    """Train and roll out."""
     from sb3_actpc.experiments import demonstrators
 
     target = args.target_return
@@ -198,7 +181,6 @@ def command_line(args: argparse.Namespace, options: Sequence[str]) -> str:
 
 
 def _convert(args: argparse.Namespace) -> int:
-    """Between .npz and HDF5."""
     from sb3_actpc.demonstrations import Demonstrations, write_robomimic
 
     if args.file.suffix != ".npz":
@@ -225,8 +207,7 @@ def _read_hdf5(args: argparse.Namespace) -> "Demonstrations":
 
 
 def _download(args: argparse.Namespace) -> int:
-    """Fetch, check, convert."""
-    from sb3_actpc.demonstrations.download import download_robomimic, robomimic_url
+    from sb3_actpc.demonstrations.robomimic import download_robomimic, robomimic_url
 
     url = args.url or robomimic_url(args.env, args.kind)
     output = args.output or _default_output(args.env, f"_{args.kind}")
@@ -234,7 +215,6 @@ def _download(args: argparse.Namespace) -> int:
 
 
 def _info(args: argparse.Namespace) -> int:
-    """Print what a file holds."""
     from sb3_actpc.demonstrations import Demonstrations
 
     if not args.file.is_file():

@@ -1,20 +1,17 @@
 """``sb3-actpc evaluate``: replay a trained agent, with a video where the machine can render."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the sub-command."""
+def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
     parser = subparsers.add_parser(
         "evaluate",
         help="replay the agent of a run",
         description="Play episodes with the agent of a run folder. Its model.zip is unpickled: open only runs you trust.",
     )
     add = parser.add_argument
-    add("folder", metavar="RUN", help="run folder, as written by sb3-actpc train")
+    add("folder", type=Path, metavar="RUN", help="run folder, as written by sb3-actpc train")
     add("--episodes", type=int, default=10, metavar="N", help="episodes to play (default: %(default)s)")
     add("--seed", type=int, default=0, help="seed of the first episode (default: %(default)s)")
     add("--video", metavar="FILE", help="video of the first episode, .mp4 or .gif, or a .png strip (default: RUN/video.mp4)")
@@ -26,49 +23,37 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def run(args: argparse.Namespace) -> int:
     """Play, print the table, record; a machine that cannot render is no error."""
-    from sb3_actpc.experiments.runs.video import check_video_path, choose_gl_backend
+    from sb3_actpc.experiments.runs.video import RenderingUnavailable, check_video_path, choose_gl_backend, record_video
 
-    folder = Path(args.folder)
+    folder = args.folder
     video = None if args.no_video else Path(args.video or folder / "video.mp4")
     if video is not None:
-        _check_video_options(args)
+        for option, value in (("--frames", args.frames), ("--size", args.size)):
+            if value is not None and value < 1:
+                raise ValueError(f"{option} must be at least 1, found {value}")
         check_video_path(video)
         choose_gl_backend()  # before MuJoCo is imported
 
-    from sb3_actpc.experiments.runs import evaluate_run
+    from sb3_actpc.demonstrations import resolve
+    from sb3_actpc.experiments.runs import evaluate_run, load_run
+    from sb3_actpc.experiments.runs.presets import find_demonstrations
     from sb3_actpc.experiments.runs.summary import result_table
 
     print(result_table(evaluate_run(folder, args.episodes, args.seed)), flush=True)
-    if video is not None:
-        _record(folder, video, args)
-    return 0
-
-
-def _check_video_options(args: argparse.Namespace) -> None:
-    """:raises ValueError: when a number is too small"""
-    for option, value in (("--frames", args.frames), ("--size", args.size)):
-        if value is not None and value < 1:
-            raise ValueError(f"{option} must be at least 1, found {value}")
-
-
-def _record(folder: Path, video: Path, args: argparse.Namespace) -> None:
-    from sb3_actpc.demonstrations import resolve
-    from sb3_actpc.experiments.runs.presets import find_demonstrations
-    from sb3_actpc.experiments.runs.run import load_run
-    from sb3_actpc.experiments.runs.video import RenderingUnavailable, record_video
-
+    if video is None:
+        return 0
     run, model = load_run(folder)
     size = {} if args.size is None else {"width": args.size, "height": args.size}
-    demonstrations = None
+    env_kwargs, demonstrations = {**run.env_kwargs, **size}, None
     if args.beside_demonstrator:
         source = find_demonstrations(run.env, run.demonstrations)
         if source is None:
             raise ValueError(f"{folder} was trained without demonstrations: leave --beside-demonstrator out")
         demonstrations = resolve(source)
-    env_kwargs = {**run.env_kwargs, **size}
     try:
         n_frames = record_video(model, run.env, env_kwargs, video, args.seed, args.frames, demonstrations)
     except RenderingUnavailable as error:
         print(f"no video: rendering is not available here ({' '.join(str(error).split())})")
     else:
         print(f"video of {n_frames} frames written to {video}")
+    return 0

@@ -1,15 +1,12 @@
 """``sb3-actpc list``: what there is to choose from."""
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Iterator
 
 KINDS = ("tasks", "algos", "presets", "demos")
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the sub-command."""
+def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
     parser = subparsers.add_parser("list", help="what there is: tasks, algorithms, presets, demonstrations")
     parser.add_argument("kind", choices=KINDS, help="tasks (--env), algos (--algo, and variants of compare), presets, demos")
 

@@ -1,21 +1,15 @@
 """``sb3-actpc train``: train an agent and watch it being evaluated."""
 
-from __future__ import annotations
-
 import argparse
 import shlex
 import sys
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from sb3_actpc.cli import add_run_options, given
 
-if TYPE_CHECKING:
-    from sb3_actpc.experiments.runs import Run
 
-
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the sub-command."""
+def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
     parser = subparsers.add_parser(
         "train",
         help="train an agent on a sparse-reward task",
@@ -23,38 +17,42 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     task = parser.add_mutually_exclusive_group(required=True)
     task.add_argument("--env", help="Gymnasium id, such as SparseHalfCheetah-v5")
-    task.add_argument(
-        "--resume",
-        metavar="DIR",
-        help="go on with the run in this folder, with its settings; a finished one with --steps MORE",
-    )
-    parser.add_argument("--algo", help="algorithm (default: actpc)")
-    parser.add_argument("--preset", metavar="NAME", help="file of hyperparams/, or a path ending in .yml (default: ALGO)")
-    parser.add_argument(
-        "--set",
-        action="append",
-        metavar="KEY=VALUE",
-        help="replace a setting of the preset, such as gamma=0.98 or policy_kwargs.net_arch=[64,64]",
-    )
-    parser.add_argument("--env-kwarg", action="append", metavar="KEY=VALUE", help="keyword of the environment")
-    parser.add_argument("--seed", type=int, help="seed (default: 0)")
-    parser.add_argument("--output", metavar="DIR", help="run folder (default: runs/ENV/ALGO_PRESET_seedSEED)")
-    parser.add_argument("--n-envs", type=int, metavar="N", help="parallel environments (default: the preset's, or 1)")
+    going_on = "go on with the run in this folder, with its settings; a finished one with --steps MORE"
+    task.add_argument("--resume", metavar="DIR", help=going_on)
+    add = parser.add_argument
+    add("--algo", help="algorithm (default: actpc)")
+    add("--preset", metavar="NAME", help="file of hyperparams/, or a path ending in .yml (default: ALGO)")
+    setting = "replace a setting of the preset, such as gamma=0.98 or policy_kwargs.net_arch=[64,64]"
+    add("--set", action="append", metavar="KEY=VALUE", help=setting)
+    add("--env-kwarg", action="append", metavar="KEY=VALUE", help="keyword of the environment")
+    add("--seed", type=int, help="seed (default: 0)")
+    add("--output", metavar="DIR", help="run folder (default: runs/ENV/ALGO_PRESET_seedSEED)")
+    add("--n-envs", type=int, metavar="N", help="parallel environments (default: the preset's, or 1)")
     add_run_options(parser, eval_episodes=5)
 
 
 def run(args: argparse.Namespace) -> int:
     """Train, then print the table; 75 when a signal stopped the run after everything was saved."""
     from sb3_actpc.checkpoints import EXIT_STOPPED, TrainingStopped
-    from sb3_actpc.experiments.runs import resume_run, train_run
+    from sb3_actpc.experiments.runs import Run, resume_run, train_run
+    from sb3_actpc.experiments.runs.presets import parse_assignments
     from sb3_actpc.experiments.runs.summary import result_table
 
+    report = partial(print, flush=True)
     try:
         if args.resume is None:
-            result = train_run(_run(args), report=_report)
+            settings, env_kwargs = parse_assignments(args.set or ()), parse_assignments(args.env_kwarg or ())
+            chosen = given(args, "env", "algo", "preset", "seed", "output", "n_envs")
+            run = Run(**chosen, settings=settings, env_kwargs=env_kwargs, progress=not args.no_progress)
+            result = train_run(run, report)
         else:
-            _check_only_resume(args)
-            result = resume_run(Path(args.resume), _report, not args.no_progress, more_steps=args.steps or 0)
+            others = set(vars(args)) - {"resume", "steps", "no_progress", "command", "debug"}
+            if wrong := sorted(name for name in others if getattr(args, name) is not None):
+                option = "--" + wrong[0].replace("_", "-")
+                raise ValueError(
+                    f"{option} cannot be given with --resume: the run goes on with its own settings, leave it out"
+                )
+            result = resume_run(Path(args.resume), report, not args.no_progress, more_steps=args.steps or 0)
     except TrainingStopped as stop:
         run_folder = Path(stop.checkpoint).parents[1]
         print(f"sb3-actpc: {stop}; go on with: sb3-actpc train --resume {shlex.quote(str(run_folder))}", file=sys.stderr)
@@ -62,25 +60,3 @@ def run(args: argparse.Namespace) -> int:
     written = "model.zip, progress.csv, episodes.csv, learning_curve.png"
     print(f"\n{result_table(result)}\n\nwritten to {result['folder']}: {written}")
     return 0
-
-
-def _report(line: str) -> None:
-    print(line, flush=True)
-
-
-def _check_only_resume(args: argparse.Namespace) -> None:
-    """:raises ValueError: when an option is given that the run's own settings decide"""
-    others = set(vars(args)) - {"resume", "steps", "no_progress", "command", "debug"}
-    wrong = sorted(name for name in others if getattr(args, name) is not None)
-    if wrong:
-        option = "--" + wrong[0].replace("_", "-")
-        raise ValueError(f"{option} cannot be given with --resume: the run goes on with its own settings, leave it out")
-
-
-def _run(args: argparse.Namespace) -> Run:
-    from sb3_actpc.experiments.runs import Run
-    from sb3_actpc.experiments.runs.presets import parse_assignments
-
-    settings, env_kwargs = parse_assignments(args.set or ()), parse_assignments(args.env_kwarg or ())
-    chosen = given(args, "env", "algo", "preset", "seed", "output", "n_envs")
-    return Run(**chosen, settings=settings, env_kwargs=env_kwargs, progress=not args.no_progress)

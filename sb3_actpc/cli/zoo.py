@@ -18,8 +18,6 @@ rl_zoo3 gives its training and its evaluation environments one seed, so that an 
 trained on; here the evaluation has another, as in ``sb3-actpc train``.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import sys
@@ -47,13 +45,15 @@ LOG_FOLDER = "logs"  # rl_zoo3's own default when it trains
 NET_ARCHS = {"small": [64, 64], "medium": [256, 256], "big": [400, 300]}
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the sub-command."""
+def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    commands = "\n".join(f"  {name:15s} {about}" for name, (_, about) in SCRIPTS.items())
     parser = subparsers.add_parser(
         "zoo",
         help="train, enjoy, optimize and plot with rl-zoo3",
         formatter_class=argparse.RawDescriptionHelpFormatter,
-        description=_description(),
+        description="rl-zoo3's scripts with this package's algorithms, settings and tasks:\n\n"
+        f"{commands}\n\nEvery option of theirs works: sb3-actpc zoo train --help.\n"
+        "rl-zoo3 unpickles models and evaluates settings: use it on runs that you trust.",
         usage="sb3-actpc zoo COMMAND ...",
     )
     parser.add_argument("zoo_command", metavar="COMMAND", choices=SCRIPTS, help=argparse.SUPPRESS)
@@ -72,15 +72,6 @@ def run(args: argparse.Namespace) -> int:
         return _run(SCRIPTS[command][0], _playing_arguments(arguments))
     with tempfile.TemporaryDirectory(prefix="sb3_actpc_zoo_") as folder:
         return _run(SCRIPTS[command][0], _training_arguments(arguments, Path(folder), optimize=command == "optimize"))
-
-
-def _description() -> str:
-    commands = "\n".join(f"  {name:15s} {about}" for name, (_, about) in SCRIPTS.items())
-    return (
-        "rl-zoo3's scripts with this package's algorithms, settings and tasks:\n\n"
-        f"{commands}\n\nEvery option of theirs works: sb3-actpc zoo train --help.\n"
-        "rl-zoo3 unpickles models and evaluates settings: use it on runs that you trust."
-    )
 
 
 def register_algorithms() -> None:
@@ -106,7 +97,7 @@ def register_algorithms() -> None:
 
 
 def _evaluate_on_other_seeds(manager: Any) -> None:
-    """:param manager: rl_zoo3's class, whose method that makes environments is replaced"""
+    """Replace the method of rl_zoo3's class that makes environments."""
     from sb3_actpc.experiments.runs.run import EVALUATION_SEED_OFFSET
 
     create_envs = manager.create_envs
@@ -123,7 +114,7 @@ def _evaluate_on_other_seeds(manager: Any) -> None:
 
 
 def _keep_the_best_trial(manager: Any) -> None:
-    """:param manager: as :func:`_evaluate_on_other_seeds`'s; its search then also writes a preset"""
+    """Let the search of rl_zoo3's class also write a preset."""
     from sb3_actpc.experiments.runs.presets import load_preset
 
     search = manager.hyperparameters_optimization
@@ -172,12 +163,10 @@ def sample_actpc_params(trial: Any, n_actions: int, n_envs: int, additional_args
 
 def convert_actpc_params(sampled: dict[str, Any]) -> dict[str, Any]:
     """Keywords of ActPC from the parameters of a trial, as :func:`sample_actpc_params` named them."""
-    params = {name: sampled[name] for name in ("learning_rate", "tau", "actor_pressure", "refresh_weight")}
+    as_they_are = ("learning_rate", "tau", "actor_pressure", "refresh_weight", "alpha_ep", "alpha_in")
     return {
-        **params,
+        **{name: sampled[name] for name in as_they_are},
         "refresh_kwargs": {"noise": sampled["refresh_noise"], "weighting": sampled["refresh_weighting"]},
-        "alpha_ep": sampled["alpha_ep"],
-        "alpha_in": sampled["alpha_in"],
         "gamma": 1.0 - sampled["one_minus_gamma"],
         "batch_size": 2 ** sampled["batch_size_pow"],
         "policy_kwargs": {
@@ -194,9 +183,6 @@ def _with_one_learning_rate(sample: Callable[..., dict[str, Any]]) -> Callable[.
         return {**sample(*arguments), "actor_kwargs": None, "critic_kwargs": None}
 
     return sample_params
-
-
-# ---------------------------------------------------------------------- arguments
 
 
 def _training_arguments(arguments: Sequence[str], folder: Path, optimize: bool) -> list[str]:
@@ -220,8 +206,7 @@ def _training_arguments(arguments: Sequence[str], folder: Path, optimize: bool) 
         conf_file = folder / f"{ours.algo}.yml"
         conf_file.write_text(yaml.safe_dump({ours.env: _zoo_settings(ours)}, sort_keys=False), encoding="utf-8")
         ours.conf_file = str(conf_file)
-    passed = ["--algo", ours.algo, "--env", ours.env, "--conf-file", ours.conf_file, "--log-folder", ours.log_folder]
-    passed += ["--gym-packages", *ours.gym_packages] if ours.gym_packages else []
+    passed = ["--gym-packages", *ours.gym_packages] if ours.gym_packages else []
     if optimize:
         samplers = import_extra("rl_zoo3.hyperparams_opt", "zoo").HYPERPARAMS_SAMPLER
         if ours.algo not in samplers:
@@ -231,7 +216,7 @@ def _training_arguments(arguments: Sequence[str], folder: Path, optimize: bool) 
         ours.study_name = ours.study_name or f"{ours.algo}_{ours.env}"
         # a journal: several processes can work on it, and a stopped search goes on
         ours.storage = ours.storage or os.path.join(ours.log_folder, ours.algo, f"{ours.study_name}.log")
-    for option in ("trained_agent", "storage", "study_name"):
+    for option in ("algo", "env", "conf_file", "log_folder", "trained_agent", "storage", "study_name"):
         passed += [f"--{option.replace('_', '-')}", getattr(ours, option)] if getattr(ours, option) else []
     return [*passed, *rest]
 
@@ -288,9 +273,6 @@ def _zoo_settings(ours: argparse.Namespace) -> dict[str, Any]:
     if ours.trained_agent and "learning_starts" in known and not uses_hindsight:
         settings["learning_starts"] = 0
     return settings
-
-
-# ---------------------------------------------------------------------- handing over
 
 
 def _plot(script: str, arguments: Sequence[str]) -> int:

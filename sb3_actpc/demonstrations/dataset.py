@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 
 DATA_FOLDER = Path(__file__).resolve().parents[1] / "data"
 ACTION_TOLERANCE = 1e-4
+# the fields with one row for each transition
 COLUMNS = ("observations", "actions", "next_observations", "rewards", "terminations", "dense_rewards")
-"""The fields with one row for each transition."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -83,23 +83,16 @@ class Demonstrations:
         object.__setattr__(self, "metadata", self._json_metadata())
 
     def __len__(self) -> int:
-        """Number of transitions N."""
         return len(self.observations)
 
     def __repr__(self) -> str:
-        """What there is, in one line."""
         returns = f"mean return {self.episode_returns.mean():.1f}"
         if self.dense_returns is not None:
             returns += f" (dense {self.dense_returns.mean():.1f})"
-        parts = [
-            f"{self.n_episodes} episodes",
-            f"{len(self)} transitions",
-            f"observations of {self.observations.shape[1]}",
-            f"actions of {self.actions.shape[1]}",
-            returns,
-            *([f"from {self.source}"] if self.source else []),
-        ]
-        return f"Demonstrations({self.env_id}: {', '.join(parts)})"
+        sizes = f"observations of {self.observations.shape[1]}, actions of {self.actions.shape[1]}"
+        source = f", from {self.source}" if self.source else ""
+        counts = f"{self.n_episodes} episodes, {len(self)} transitions"
+        return f"Demonstrations({self.env_id}: {counts}, {sizes}, {returns}{source})"
 
     @property
     def n_episodes(self) -> int:
@@ -131,13 +124,9 @@ class Demonstrations:
         metadata: Mapping[str, Any] | None = None,
         source: str = "",
     ) -> Demonstrations:
-        """:param episodes: columns of each episode, by the names of ``COLUMNS``; dense rewards count where all have them
-        :param env_id: Gymnasium id of the environment that was recorded
-        :param metadata: JSON values
-        :param source: where they come from, for error messages
-        :return: the episodes end to end
-        :raises ValueError: when there are none, or they do not fit together
-        """
+        """The episodes end to end, from the columns of each, by the names of ``COLUMNS`` (dense rewards count where all have
+        them), recorded in the environment ``env_id``; ``metadata`` are JSON values, ``source`` is for error messages.
+        ValueError when there are none, or they do not fit together."""
         if not episodes:
             raise field_error(source, "observations", "at least one episode", "none")
         columns = {}
@@ -196,14 +185,11 @@ class Demonstrations:
         observation_space: spaces.Space[Any] | None = None,
         final_reward: float | None = None,
     ) -> Demonstrations:
-        """Take over trajectories of the ``imitation`` library, or objects like them, recorded in ``env_id``.
-
-        :param trajectories: each with ``obs`` (n + 1 rows), ``acts`` (n rows), ``infos`` (or None), ``terminal``, and perhaps
-            ``rews``. A last info with ``TimeLimit.truncated`` is no termination; ``dense_reward`` in every info is kept
-        :param observation_space: the environment's, needed for dict observations
-        :param final_reward: what the last step of each is paid, and all others 0, where they have no ``rews``
-        :raises ValueError: when something needed is missing, or does not fit together
-        """
+        """Take over trajectories of the ``imitation`` library, or objects like them, recorded in ``env_id``: each has ``obs``
+        (n + 1 rows), ``acts`` (n rows), ``infos`` (or None), ``terminal``, and perhaps ``rews``; where it has none, the last
+        step is paid ``final_reward`` and all others 0. A last info with ``TimeLimit.truncated`` is no termination;
+        ``dense_reward`` in every info is kept. Dict observations need the environment's ``observation_space``. ValueError when
+        something needed is missing, or does not fit together."""
         columns = [trajectory_columns(trajectory, observation_space, final_reward) for trajectory in trajectories]
         return cls.from_episodes(columns, env_id, source="trajectories")
 
@@ -230,13 +216,9 @@ class Demonstrations:
             yield {name: column[start:end] for name, column in columns.items()}
 
     def select(self, n_episodes: int | None = None, n_transitions: int | None = None) -> Demonstrations:
-        """The first episodes, or the first transitions; the last episode is then cut short where the limit falls.
-
-        :param n_episodes: how many episodes to keep, or None for all
-        :param n_transitions: how many transitions to keep of those, or None for all
-        :return: the selection (its arrays are views)
-        :raises ValueError: when a number is not a whole number of at least 1, or is more than there is
-        """
+        """The first ``n_episodes``, or of those the first ``n_transitions`` (None for all): the last episode is then cut short
+        where the limit falls, and the arrays are views. ValueError when a number is not a whole one of at least 1, or is more
+        than there is."""
         end = len(self)
         if n_episodes is not None:
             self._check_count("n_episodes", n_episodes, self.n_episodes)
@@ -248,14 +230,10 @@ class Demonstrations:
         return dataclasses.replace(self, **columns, episode_starts=self.episode_starts[self.episode_starts < end])
 
     def check(self, observation_space: spaces.Space[Any], action_space: spaces.Space[Any], env_id: str | None = None) -> None:
-        """Check that the demonstrations fit an environment.
-
-        :param observation_space: space whose flattened size must be obs_dim
-        :param action_space: Box whose flattened size must be action_dim; the actions may leave its bounds by at most
-            ``ACTION_TOLERANCE``
-        :param env_id: id of the environment, or None to skip it; the version (``-v5``) may differ from the recorded one
-        :raises ValueError: naming the field that does not fit, what was found and what was expected
-        """
+        """ValueError, which names the field, what was found and what was expected, when the demonstrations do not fit an
+        environment: obs_dim must be the flattened size of its observation space, action_dim that of its action space, a Box,
+        whose bounds the actions may leave by at most ``ACTION_TOLERANCE``; the version (``-v5``) of ``env_id`` may differ from
+        the recorded one (None: not compared)."""
         if env_id is not None and base_name(env_id) != base_name(self.env_id):
             raise self._error("env_id", f"{env_id!r} (any version)", repr(self.env_id))
         obs_dim = flat_size(observation_space)
@@ -265,7 +243,12 @@ class Demonstrations:
             raise self._error("actions", "a Box action space", repr(action_space))
         if self.actions.shape[1] != flat_size(action_space):
             raise self._error("actions", f"{flat_size(action_space)} values a row", f"{self.actions.shape[1]}")
-        self._check_action_bounds(action_space.low.reshape(-1), action_space.high.reshape(-1))
+        low, high, actions = action_space.low.ravel(), action_space.high.ravel(), self.actions.astype(np.float64)
+        outside = (actions < low - ACTION_TOLERANCE) | (actions > high + ACTION_TOLERANCE)
+        if outside.any():
+            row, column = (int(index) for index in np.argwhere(outside)[0])
+            expected = f"values in [{low[column]}, {high[column]}] in column {column}"
+            raise self._error("actions", expected, f"{self.actions[row, column]} at transition {row}")
 
     def rewarded_by(self, env: VecEnv) -> Demonstrations:
         """The same transitions with the rewards that ``env`` gives for them, under its own condition and threshold, by its
@@ -281,12 +264,9 @@ class Demonstrations:
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Demonstrations:
-        """Read a file written by :meth:`save`, bit for bit as it was; never unpickles.
-
-        :raises FileNotFoundError: when there is no such file
-        :raises ValueError: when the file is empty, cut short, damaged, lacks a field, holds one of a wrong type, or has a
-            newer format; the message names the file and the field
-        """
+        """Read a file written by :meth:`save`, bit for bit as it was; never unpickles. FileNotFoundError when there is no such
+        file; ValueError names the file and the field when it is empty, cut short, damaged, lacks a field, holds one of a wrong
+        type, or has a newer format."""
         return cls(**read_npz(path))
 
     @classmethod
@@ -383,23 +363,11 @@ class Demonstrations:
             prefix = f"{self.source}: " if self.source else ""
             raise ValueError(f"{prefix}{name} must be a whole number from 1 to {available}, found {count!r}")
 
-    def _check_action_bounds(self, low: np.ndarray, high: np.ndarray) -> None:
-        actions = self.actions.astype(np.float64)
-        outside = (actions < low - ACTION_TOLERANCE) | (actions > high + ACTION_TOLERANCE)
-        if outside.any():
-            row, column = (int(index) for index in np.argwhere(outside)[0])
-            expected = f"values in [{low[column]}, {high[column]}] in column {column}"
-            raise self._error("actions", expected, f"{self.actions[row, column]} at transition {row}")
-
 
 def shipped_demonstrations(env_id: str, weak: bool = False) -> Path:
-    """The demonstrations file of a sparse task that comes with the package.
-
-    :param env_id: Gymnasium id, such as ``SparseHalfCheetah-v5``
-    :param weak: the file of a weaker demonstrator, with about half the return; only the HalfCheetah has one
-    :return: its path
-    :raises FileNotFoundError: when none is shipped; the message says how to collect them
-    """
+    """The demonstrations file of a sparse task, such as ``SparseHalfCheetah-v5``, that comes with the package; ``weak`` is
+    that of a weaker demonstrator, with about half the return, which only the HalfCheetah has. FileNotFoundError, which says
+    how to collect them, when none is shipped."""
     path = DATA_FOLDER / f"sparse_{base_name(env_id).removeprefix('Sparse').lower()}{'_weak' if weak else ''}.npz"
     if not path.is_file():
         raise FileNotFoundError(

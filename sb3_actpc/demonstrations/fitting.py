@@ -1,7 +1,5 @@
 """Demonstrations as an environment would have shown them, and as the rows of a buffer."""
 
-from __future__ import annotations
-
 import dataclasses
 import os
 import re
@@ -23,19 +21,18 @@ MINARI_ID = re.compile(r"([\w-]+/)*[\w-]+-v\d+")
 def resolve(
     source: str | os.PathLike[str] | Demonstrations, observation_space: spaces.Space[Any] | None = None
 ) -> Demonstrations:
-    """Demonstrations from the path of an ``.npz`` file or the id of a local Minari dataset, or as they are.
-
-    :param observation_space: the environment's, whose order a Minari dataset's Dict is flattened in; None for its own order
-    :raises FileNotFoundError: when there is no such file or dataset
-    :raises ImportError: when it is a Minari id and Minari is not installed
-    :raises ValueError: when the file is not valid, or ``source`` is neither
-    """
+    """Demonstrations from the path of an ``.npz`` file or the id of a local Minari dataset, whose Dict is flattened in the
+    order of the environment's ``observation_space`` (None for its own), or as they are. FileNotFoundError when there is no
+    such file or dataset, ImportError when Minari is not installed, ValueError when the file is not valid, or ``source`` is
+    neither."""
     if isinstance(source, Demonstrations):
         return source
     if is_minari_id(source):
         return Demonstrations.from_minari(source, observation_space=observation_space)
     if isinstance(source, (str, os.PathLike)):
-        return Demonstrations.load(_here(Path(source)))
+        path, parts = Path(source), PureWindowsPath(source).parts  # which knows both kinds of slash
+        is_shipped = not path.exists() and parts[-3:-1] == DATA_FOLDER.parts[-2:]  # where the agent was trained, elsewhere
+        return Demonstrations.load(DATA_FOLDER / parts[-1] if is_shipped else path)
     raise ValueError(f"demonstrations must be a file path, a Minari id or a Demonstrations object, found {source!r}")
 
 
@@ -44,30 +41,18 @@ def is_minari_id(source: Any) -> bool:
     return isinstance(source, str) and MINARI_ID.fullmatch(source) is not None and not os.path.exists(source)
 
 
-def _here(path: Path) -> Path:
-    """A file of the package lies elsewhere on the machine where an agent was trained."""
-    parts, own = PureWindowsPath(path).parts, DATA_FOLDER.parts[-2:]  # which knows both kinds of slash
-    return path if path.exists() or parts[-3:-1] != own else DATA_FOLDER / parts[-1]
-
-
 def fit_demonstrations(
     source: str | os.PathLike[str] | Demonstrations,
-    env: VecEnv | None,
+    env: "VecEnv | None",
     observation_space: spaces.Space[Any],
     action_space: spaces.Space[Any],
     n_episodes: int | None = None,
     n_transitions: int | None = None,
 ) -> Demonstrations:
-    """The demonstrations as an environment would have shown them: of its task, in its spaces, paid as it pays.
-
-    Those of the dense base task of a sparse one (such as Minari's ``mujoco/hopper/expert-v0``) fit too.
-
-    :param source: as of :func:`resolve`
-    :param env: the environment, whose goal version and rewards count; None where there is none yet
-    :param n_episodes: use only the first so many episodes, None for all; and likewise ``n_transitions``
-    :raises FileNotFoundError: when there is no such file
-    :raises ValueError: when they are damaged, fewer than asked for, or of another task
-    """
+    """The demonstrations, from a source of :func:`resolve`, as an environment would have shown them: of its task, in its
+    spaces, paid as it pays (None where there is none yet); the first ``n_episodes`` alone, or ``n_transitions``, None for all.
+    Those of the dense base task of a sparse one (such as Minari's ``mujoco/hopper/expert-v0``) fit too. FileNotFoundError when
+    there is no such file, ValueError when they are damaged, fewer than asked for, or of another task."""
     demonstrations = resolve(source, observation_space)
     try:
         demonstrations = demonstrations.select(n_episodes, n_transitions)
@@ -79,17 +64,11 @@ def fit_demonstrations(
             demonstrations = env.env_method("goal_demonstrations", demonstrations, indices=[0])[0]
         spec = env.get_attr("spec", indices=0)[0] if env.has_attr("spec") else None
         env_id = None if spec is None else spec.id
-        demonstrations = _with_dense_rewards(demonstrations, env_id)
+        if env_id in SPARSE_MUJOCO_IDS and base_name(dense_env_id(env_id)) == base_name(demonstrations.env_id):
+            sparse_id = f"Sparse{demonstrations.env_id.rpartition(':')[2]}"  # which then pays them anew
+            demonstrations = dataclasses.replace(demonstrations, env_id=sparse_id, dense_rewards=demonstrations.rewards)
     demonstrations.check(observation_space, action_space, env_id)
     return demonstrations if env is None else demonstrations.rewarded_by(env)
-
-
-def _with_dense_rewards(demonstrations: Demonstrations, env_id: str | None) -> Demonstrations:
-    """Demonstrations of a sparse task's dense base as those of the sparse task, which then pays them anew."""
-    if env_id not in SPARSE_MUJOCO_IDS or base_name(dense_env_id(env_id)) != base_name(demonstrations.env_id):
-        return demonstrations
-    recorded_id = f"Sparse{demonstrations.env_id.rpartition(':')[2]}"
-    return dataclasses.replace(demonstrations, env_id=recorded_id, dense_rewards=demonstrations.rewards)
 
 
 def scaled_actions(demonstrations: Demonstrations, action_space: spaces.Box) -> np.ndarray:

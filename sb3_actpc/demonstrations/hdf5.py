@@ -1,7 +1,5 @@
 """Opening other projects' HDF5 files so that every mistake in them is named: file, demonstration, key."""
 
-from __future__ import annotations
-
 import json
 import os
 import re
@@ -20,12 +18,8 @@ _READ_ERRORS = (OSError, RuntimeError, KeyError, ValueError, TypeError)
 
 @contextmanager
 def open_hdf5(path: str | os.PathLike[str]) -> Iterator[Any]:
-    """Open a file for reading; gives its ``data`` group, an ``h5py.Group``.
-
-    :raises FileNotFoundError: when there is no such file
-    :raises ValueError: when it is not a whole HDF5 file, or has no demonstrations
-    :raises ImportError: when h5py is not installed
-    """
+    """Open a file for reading; gives its ``data`` group, an ``h5py.Group``. FileNotFoundError when there is no such file,
+    ValueError when it is not a whole HDF5 file or has no demonstrations, ImportError when h5py is not installed."""
     h5py = import_extra("h5py", "robosuite")
     if not Path(path).is_file():
         raise FileNotFoundError(f"no demonstrations file at {path}")
@@ -51,10 +45,7 @@ def demo_names(data: Any) -> list[str]:
 
 def read_array(group: Any, key: str, source: str, size: int | None = None, length: int | None = None) -> np.ndarray:
     """A dataset of an ``h5py.Group``, (length, size) float64, or (length,) for a column; a length of None is any of at least
-    1.
-
-    :raises ValueError: when it is missing, cannot be read, has another shape or type, or holds NaN or infinity
-    """
+    1. ValueError when it is missing, cannot be read, has another shape or type, or holds NaN or infinity."""
     if key not in group:
         raise ValueError(f"{source}: key {key!r} is missing, only {', '.join(sorted(group)) or 'nothing'} is there")
     try:

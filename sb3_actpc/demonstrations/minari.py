@@ -1,7 +1,5 @@
 """Exchange with Minari, the Farama Foundation's format of offline data sets; episodes as arrays, in and out."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -91,11 +89,8 @@ def episode_buffer(episode: dict[str, Any], observation_space: spaces.Space[Any]
 
 
 def minari_files(dataset_id: str) -> list[Path]:
-    """The files that hold a Minari dataset.
-
-    :raises ImportError: when Minari is not installed
-    :raises FileNotFoundError: when there is no such dataset; the message says how to fetch it
-    """
+    """The files that hold a Minari dataset. ImportError when Minari is not installed, FileNotFoundError, which says how to
+    fetch it, when there is no such dataset."""
     import_extra("minari", "minari")
     from minari.storage import get_dataset_path
 

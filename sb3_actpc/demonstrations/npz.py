@@ -1,7 +1,5 @@
 """The ``.npz`` file format of demonstrations: compressed, without pickles, every mistake in a file named."""
 
-from __future__ import annotations
-
 import io
 import json
 import os
@@ -44,11 +42,9 @@ def write_npz(path: str | os.PathLike[str], fields: Mapping[str, Any]) -> None:
 
 
 def read_npz(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """The fields of a ``Demonstrations``, bit for bit as :func:`write_npz` wrote them; never unpickles.
-
-    :raises ValueError: when the file is empty, cut short, damaged, lacks an entry, holds one of a wrong type, or has a newer
-        format; the message names the file and the entry
-    """
+    """The fields of a ``Demonstrations``, bit for bit as :func:`write_npz` wrote them; never unpickles. ValueError names the
+    file and the entry when the file is empty, cut short, damaged, lacks an entry, holds one of a wrong type, or has a newer
+    format."""
     source = str(path)
     if not os.path.exists(path):
         raise FileNotFoundError(f"no demonstrations file at {source}")

@@ -1,7 +1,5 @@
 """Playing a task with whoever can do it: trained agents, scripted demonstrators, plain functions."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any

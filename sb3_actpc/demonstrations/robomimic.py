@@ -1,25 +1,28 @@
-"""robomimic's HDF5 files of low-dimensional observations (Mandlekar et al., arXiv 2108.03298), read and written with h5py.
+"""robomimic's HDF5 files of low-dimensional observations (Mandlekar et al., arXiv 2108.03298), fetched, read and written.
 
 Layout: ``data`` (attribute ``env_args``, JSON), ``data/demo_i/{actions,rewards,dones}``, ``data/demo_i/{obs,next_obs}/<key>``,
 and ``mask/<filter key>``, the names of some of the demonstrations.
 """
 
-from __future__ import annotations
-
 import io
 import json
 import os
+from collections import defaultdict
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from sb3_actpc.demonstrations import hdf5
 from sb3_actpc.demonstrations.dataset import ACTION_TOLERANCE, Demonstrations
-from sb3_actpc.demonstrations.recording import Columns
+from sb3_actpc.demonstrations.recording import Columns, Report, silent
 from sb3_actpc.envs.robosuite_layouts import ACTION_DIM, OBSERVATIONS, PROPRIOCEPTION, RobosuiteTask, robosuite_task
 from sb3_actpc.utils.extras import import_extra
 from sb3_actpc.utils.files import atomic_write
 
+REPOSITORY = "https://huggingface.co/datasets/robomimic/robomimic_datasets/resolve/main"
+KINDS = ("mh", "ph")  # 300 by six humans of three levels, 200 by one proficient human
+TIMEOUT_SECONDS = 30.0
 ROBOSUITE_TYPE = 1  # robomimic's EnvType
 ROBOSUITE_VERSION = "1.5.2"  # whose observations and controller these are
 # metres: the median over an episode of how much an object's two recorded distances from the gripper differ
@@ -62,15 +65,9 @@ def read_robomimic(
 
 
 def write_robomimic(demonstrations: Demonstrations, path: str | os.PathLike[str]) -> None:
-    """Write demonstrations of a robosuite task as robomimic stores them, all at once or not at all.
-
-    The filter keys of a mixed set (``metadata["filter_keys"]``) become masks.
-
-    :param demonstrations: of ``SparseLift-v0`` or ``SparsePickPlaceCan-v0``, with one of their ``obs``
-    :param path: file to write
-    :raises ValueError: when they are of another task or layout
-    :raises ImportError: when h5py is not installed
-    """
+    """Write demonstrations of ``SparseLift-v0`` or ``SparsePickPlaceCan-v0``, with one of their ``obs``, as robomimic stores
+    them, all at once or not at all. The filter keys of a mixed set (``metadata["filter_keys"]``) become masks. ValueError when
+    they are of another task or layout, ImportError when h5py is not installed."""
     h5py = import_extra("h5py", "robosuite")
     task = robosuite_task(demonstrations.env_id)
     layout = task.layout(task.obs_of_size(demonstrations.observations.shape[1]))
@@ -79,12 +76,55 @@ def write_robomimic(demonstrations: Demonstrations, path: str | os.PathLike[str]
         data = file.create_group("data")
         data.attrs["total"] = len(demonstrations)
         data.attrs["env_args"] = json.dumps(_env_args(task))
+        masks: dict[str, list[str]] = defaultdict(list)
+        filter_keys = [*demonstrations.metadata.get("filter_keys", []), *[()] * demonstrations.n_episodes]
         for index, (start, end) in enumerate(demonstrations.episode_bounds):
             _write_episode(data.create_group(f"demo_{index}"), demonstrations, slice(start, end), layout)
-        for key, members in _masks(demonstrations).items():
+            for key in filter_keys[index]:
+                masks[key].append(f"demo_{index}")
+        for key, members in masks.items():
             file.create_dataset(f"mask/{key}", data=np.array(members, dtype="S"))
     with atomic_write(path) as target:
         target.write(content.getvalue())
+
+
+def robomimic_url(env_id: str, kind: str = "mh") -> str:
+    """Address of a file of low-dimensional observations of a robosuite task and a key of ``KINDS`` (MIT licence; 30 to 130
+    MB)."""
+    folder = {"Lift": "lift", "PickPlaceCan": "can"}[robosuite_task(env_id).name]
+    if kind not in KINDS:
+        raise ValueError(f"kind={kind!r} is not one of {', '.join(KINDS)}: choose one of these")
+    return f"{REPOSITORY}/v1.5/{folder}/{kind}/low_dim_v15.hdf5"
+
+
+def download_robomimic(
+    env_id: str, path: str | os.PathLike[str], url: str, obs: str = "paper", report: Report = silent
+) -> Demonstrations:
+    """Download a robomimic file (http or https) to a path, unless it is there already, and read it, see
+    :func:`~sb3_actpc.demonstrations.read_robomimic`. The file appears under its name only when it is whole. OSError when it
+    cannot be fetched, ValueError when what arrived is not such a file, ImportError when h5py is not installed."""
+    import pooch
+
+    import_extra("h5py", "robosuite")  # before the long part
+    path = Path(path)
+    if not url.startswith(("http://", "https://")):
+        raise ValueError(f"url={url!r} must begin with http:// or https://")
+    if path.is_file():
+        report(f"{path} is there already")
+        return read_robomimic(path, env_id, obs)
+    report(f"fetching {url}")
+    pooch.get_logger().setLevel("WARNING")
+    try:
+        downloader = pooch.HTTPDownloader(timeout=TIMEOUT_SECONDS)
+        pooch.retrieve(url, known_hash=None, fname=path.name, path=path.parent, downloader=downloader)
+    except (OSError, ValueError) as error:
+        reason = " ".join(str(error).split())
+        raise OSError(
+            f"could not fetch {url}: where there is a network, download that address, then make demonstrations of the file "
+            f"here with `sb3-actpc demos convert FILE --env {env_id}` ({reason})"
+        ) from None
+    report(f"wrote {path} ({path.stat().st_size / 1e6:.1f} MB)")
+    return read_robomimic(path, env_id, obs)
 
 
 def _filtered(data: Any, filter_key: str, source: str) -> list[str]:
@@ -187,12 +227,3 @@ def _write_episode(group: Any, demonstrations: Demonstrations, rows: slice, layo
     for part, columns in layout.items():
         group[f"obs/{part}"] = demonstrations.observations[rows, columns]
         group[f"next_obs/{part}"] = demonstrations.next_observations[rows, columns]
-
-
-def _masks(demonstrations: Demonstrations) -> dict[str, list[str]]:
-    """Filter key -> names of its demonstrations."""
-    masks: dict[str, list[str]] = {}
-    for index, keys in enumerate(demonstrations.metadata.get("filter_keys", [])[: demonstrations.n_episodes]):
-        for key in keys:
-            masks.setdefault(key, []).append(f"demo_{index}")
-    return masks

@@ -1,7 +1,5 @@
 """robosuite's own ``demo.hdf5``: recorded simulator states and actions, from which the observations are made again."""
 
-from __future__ import annotations
-
 import os
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Between the observations of an environment and rows of numbers; how a wrong field of demonstrations is named."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -24,10 +22,7 @@ def flat_size(space: spaces.Space[Any]) -> int:
 
 def box_paths(space: spaces.Space[Any]) -> list[list[str]]:
     """The way to every Box, in the order of ``gymnasium.spaces.utils.flatten``: ``[[]]`` for a Box, ``[["goal"], ...]`` for a
-    Dict.
-
-    :raises ValueError: for other spaces
-    """
+    Dict; ValueError for other spaces."""
     if isinstance(space, spaces.Dict):
         return [[key, *rest] for key, part in space.items() for rest in box_paths(part)]
     if not isinstance(space, spaces.Box):
@@ -47,10 +42,8 @@ def split_observations(space: spaces.Space[Any], rows: np.ndarray) -> Any:
 
 
 def join_observations(observations: Any, paths: list[list[str]], source: str = "") -> np.ndarray:
-    """The inverse of :func:`split_observations`, given the way to every part (see :func:`box_paths`): (N, flat size).
-
-    :raises ValueError: when a part is missing
-    """
+    """The inverse of :func:`split_observations`, given the way to every part (see :func:`box_paths`): (N, flat size);
+    ValueError when a part is missing."""
     parts = []
     for path in paths:
         part = observations

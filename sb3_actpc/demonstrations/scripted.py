@@ -4,9 +4,6 @@
 six people, two worse, two okay and two better, 50 demonstrations each) can be made.
 """
 
-from __future__ import annotations
-
-from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass
 from typing import Any
@@ -31,6 +28,7 @@ CARRYING_HEIGHT = 1.05
 CAN_STANDING_HEIGHT = 0.86
 CAN_BIN_CENTRE = (robosuite_layouts.CAN_BIN_LOW + robosuite_layouts.CAN_BIN_HIGH)[:2] / 2.0
 
+# level and proficiency of each demonstrator of a mixed set
 MIXED_DEMONSTRATORS: tuple[tuple[str, float], ...] = (
     ("worse", 0.1),
     ("worse", 0.25),
@@ -39,65 +37,17 @@ MIXED_DEMONSTRATORS: tuple[tuple[str, float], ...] = (
     ("better", 0.85),
     ("better", 1.0),
 )
-"""Level and proficiency of each demonstrator of a mixed set."""
 
 
 @dataclass(frozen=True)
 class View:
-    """What a demonstrator reads from an observation: metres, radians, quaternions (x, y, z, w).
+    """What a demonstrator reads from an observation: metres, radians, quaternions (x, y, z, w)."""
 
-    :param eef_position: (3,) of the gripper
-    :param eef_quat: (4,)
-    :param finger_gap: distance of the fingers
-    :param object_position: (3,)
-    :param object_quat: (4,)
-    """
-
-    eef_position: np.ndarray
-    eef_quat: np.ndarray
-    finger_gap: float
-    object_position: np.ndarray
-    object_quat: np.ndarray
-
-    @property
-    def offset(self) -> np.ndarray:
-        """From the gripper to the object, (3,)."""
-        return self.object_position - self.eef_position
-
-
-@dataclass(frozen=True)
-class Skill:
-    """How well a demonstrator works, from its proficiency p in [0, 1].
-
-    :param speed: largest translation action
-    :param tremor: standard deviation of the correlated noise on the actions
-    :param pause_rate: probability of a pause, per step
-    :param detour_rate: probability of a detour, per stage
-    :param aim_error: standard deviation of a grasp's place, in metres
-    :param tolerance: distance from the place aimed at, in metres, at which the fingers go down
-    """
-
-    speed: float
-    tremor: float
-    pause_rate: float
-    detour_rate: float
-    aim_error: float
-    tolerance: float
-
-    @classmethod
-    def of(cls, proficiency: float) -> Skill:
-        """Of a proficiency in [0, 1]."""
-        if isinstance(proficiency, bool) or not isinstance(proficiency, int | float) or not 0.0 <= proficiency <= 1.0:
-            raise ValueError(f"proficiency={proficiency!r} must be a number from 0 (clumsy) to 1 (sure), or 'mixed'")
-        clumsiness = 1.0 - float(proficiency)
-        return cls(
-            speed=1.0 - 0.6 * clumsiness,
-            tremor=0.25 * clumsiness,
-            pause_rate=0.05 * clumsiness,
-            detour_rate=0.7 * clumsiness,
-            aim_error=0.01 * clumsiness,
-            tolerance=0.01 + 0.015 * clumsiness,
-        )
+    eef_position: np.ndarray  # (3,) of the gripper
+    eef_quat: np.ndarray  # (4,)
+    finger_gap: float  # distance of the fingers
+    object_position: np.ndarray  # (3,)
+    object_quat: np.ndarray  # (4,)
 
 
 class ScriptedDemonstrator:
@@ -112,22 +62,23 @@ class ScriptedDemonstrator:
 
     def __init__(self, env_id: str, obs: str = "paper", proficiency: float = 1.0, seed: int = 0) -> None:
         self.task: RobosuiteTask = robosuite_task(env_id)
-        self.proficiency = proficiency
-        self.skill = Skill.of(proficiency)
-        self.seed = seed
+        if isinstance(proficiency, bool) or not isinstance(proficiency, int | float) or not 0.0 <= proficiency <= 1.0:
+            raise ValueError(f"proficiency={proficiency!r} must be a number from 0 (clumsy) to 1 (sure), or 'mixed'")
+        self.proficiency, self.seed = proficiency, seed
+        clumsiness = 1.0 - float(proficiency)
+        self.speed = 1.0 - 0.6 * clumsiness  # largest translation action
+        self.tremor = 0.25 * clumsiness  # standard deviation of the correlated noise on the actions
+        self.pause_rate = 0.05 * clumsiness  # probability of a pause, per step
+        self.detour_rate = 0.7 * clumsiness  # probability of a detour, per stage
+        self.aim_error = 0.01 * clumsiness  # standard deviation of a grasp's place, in metres
+        self.tolerance = 0.01 + 0.015 * clumsiness  # metres from the place aimed at, within which the fingers go down
         self._layout = self.task.layout(obs)
         self._object_columns = self.task.object_columns()
         habits = np.random.default_rng([seed, 0])
         self._hover_height = habits.uniform(0.06, 0.12)
         self._lift_height = habits.uniform(0.1, 0.2)
-        self._stages: dict[str, Callable[[View], tuple[np.ndarray, float, bool]]] = {
-            "reach": self._reach,
-            "descend": self._descend,
-            "grasp": self._grasp,
-            "lift": self._lift,
-        }
-        if self.task.name == "PickPlaceCan":
-            self._stages |= {"carry": self._carry, "lower": self._lower, "release": self._release}
+        self._stages = ["reach", "descend", "grasp", "lift"]
+        self._stages += ["carry", "lower", "release"] if self.task.name == "PickPlaceCan" else []
         self.start(0)
 
     def start(self, seed: int) -> None:
@@ -144,13 +95,12 @@ class ScriptedDemonstrator:
         view = self._view(observation)
         if self.stage not in ("reach", "descend", "release") and self._has_lost(view):
             self._enter("reach")
-        target, fingers, is_done = self._stages[self.stage](view)
-        if is_done:
-            names = list(self._stages)
-            self._enter(names[min(names.index(self.stage) + 1, len(names) - 1)])
+        target, fingers, is_done = getattr(self, f"_{self.stage}")(view)
+        if is_done and self.stage != self._stages[-1]:
+            self._enter(self._stages[self._stages.index(self.stage) + 1])
         action = np.empty(ACTION_DIM)
         action[:3] = self._translation(view, target)
-        action[3:6] = self._rotation(view)
+        action[3:6] = np.clip(GAIN * self._turn(view) / RADIANS_PER_ACTION, -self.speed, self.speed)
         action[:6] = self._disturb(action[:6])
         action[6] = fingers
         self._last_gap = view.finger_gap
@@ -161,16 +111,16 @@ class ScriptedDemonstrator:
     def _reach(self, view: View) -> tuple[np.ndarray, float, bool]:
         """Over the object, the fingers open and turned along it."""
         target = view.object_position + self._aim + np.array([0.0, 0.0, self._hover_height])
-        distance, tolerance = np.linalg.norm((target - view.eef_position)[:2]), self.skill.tolerance
-        aligned = distance < tolerance and self._turn_left(view) < 10.0 * tolerance
+        distance, tolerance = np.linalg.norm((target - view.eef_position)[:2]), self.tolerance
+        aligned = distance < tolerance and np.linalg.norm(self._turn(view)) < 10.0 * tolerance
         return target, OPEN, bool(aligned and view.eef_position[2] < target[2] + 0.03)
 
     def _descend(self, view: View) -> tuple[np.ndarray, float, bool]:
         target = view.object_position + self._aim
         distance = np.linalg.norm((target - view.eef_position)[:2])
-        if distance > self.skill.tolerance + 0.02:
+        if distance > self.tolerance + 0.02:
             self._enter("reach")
-        elif distance > self.skill.tolerance + 0.005:  # wait above it, do not push it over
+        elif distance > self.tolerance + 0.005:  # wait above it, do not push it over
             target = target + np.array([0.0, 0.0, 0.05])
         depth = 0.01 if self.task.name == "Lift" else 0.02
         return target, OPEN, bool(self.stage == "descend" and view.eef_position[2] < view.object_position[2] + depth)
@@ -178,7 +128,8 @@ class ScriptedDemonstrator:
     def _grasp(self, view: View) -> tuple[np.ndarray, float, bool]:
         """Close until the fingers stand still."""
         is_still = self._last_gap - view.finger_gap < 5e-4
-        return view.eef_position, CLOSE, bool(is_still and self._steps() > 3)
+        self._stage_steps += is_still
+        return view.eef_position, CLOSE, bool(is_still and self._stage_steps > 3)
 
     def _lift(self, view: View) -> tuple[np.ndarray, float, bool]:
         height = CARRYING_HEIGHT if self.task.name == "PickPlaceCan" else robosuite_layouts.TABLE_HEIGHT + self._lift_height
@@ -186,42 +137,34 @@ class ScriptedDemonstrator:
         return target, CLOSE, bool(self.task.name == "PickPlaceCan" and view.object_position[2] > height)
 
     def _carry(self, view: View) -> tuple[np.ndarray, float, bool]:
-        to_bin = CAN_BIN_CENTRE - view.object_position[:2]
-        target = view.eef_position + np.array([*to_bin, CARRYING_HEIGHT - view.object_position[2]])
-        return target, CLOSE, bool(np.linalg.norm(to_bin) < 0.05)
+        way = np.array([*CAN_BIN_CENTRE, CARRYING_HEIGHT]) - view.object_position
+        return view.eef_position + way, CLOSE, bool(np.linalg.norm(way[:2]) < 0.05)
 
     def _lower(self, view: View) -> tuple[np.ndarray, float, bool]:
-        to_bin = CAN_BIN_CENTRE - view.object_position[:2]
-        target = view.eef_position + np.array([*to_bin, CAN_STANDING_HEIGHT - view.object_position[2]])
-        return target, CLOSE, bool(view.object_position[2] < CAN_STANDING_HEIGHT + 0.02)
+        way = np.array([*CAN_BIN_CENTRE, CAN_STANDING_HEIGHT]) - view.object_position
+        return view.eef_position + way, CLOSE, bool(view.object_position[2] < CAN_STANDING_HEIGHT + 0.02)
 
     def _release(self, view: View) -> tuple[np.ndarray, float, bool]:
         """Open, then move up and away, which ends the episode."""
         up = 0.2 if view.finger_gap > 0.07 else 0.0
-        if self._steps() > 40:
+        self._stage_steps += 1
+        if self._stage_steps > 40:
             self._enter("reach")
         return view.eef_position + np.array([0.0, 0.0, up]), OPEN, False
-
-    # ------------------------------------------------------------------ parts
 
     def _enter(self, stage: str) -> None:
         self.stage = stage
         self._stage_steps = 0
         if stage == "reach":
-            self._aim = np.array([*self._rng.normal(0.0, self.skill.aim_error, 2), 0.0])
+            self._aim = np.array([*self._rng.normal(0.0, self.aim_error, 2), 0.0])
         self._detour: np.ndarray | None = None
         self._detour_left = LONGEST_DETOUR
-        if stage in ("reach", "carry") and self._rng.random() < self.skill.detour_rate:
+        if stage in ("reach", "carry") and self._rng.random() < self.detour_rate:
             self._detour = self._rng.uniform([-0.08, -0.08, 0.0], [0.08, 0.08, 0.06])
-
-    def _steps(self) -> int:
-        """Counts the steps of a stage."""
-        self._stage_steps += 1
-        return self._stage_steps
 
     def _has_lost(self, view: View) -> bool:
         """Whether the fingers have closed on nothing, or the object has slipped out of them."""
-        return view.finger_gap < 0.01 or bool(np.linalg.norm(view.offset) > 0.06)
+        return view.finger_gap < 0.01 or bool(np.linalg.norm(view.object_position - view.eef_position) > 0.06)
 
     def _translation(self, view: View, target: np.ndarray) -> np.ndarray:
         if self._detour is not None:
@@ -230,36 +173,29 @@ class ScriptedDemonstrator:
             if np.linalg.norm(target - view.eef_position) < 0.03 or self._detour_left == 0:
                 self._detour = None
         command = GAIN * (target - view.eef_position) / METRES_PER_ACTION
-        return command * min(1.0, self.skill.speed / max(float(np.abs(command).max()), 1e-9))
+        return command * min(1.0, self.speed / max(float(np.abs(command).max()), 1e-9))
 
-    def _rotation(self, view: View) -> np.ndarray:
-        """Turn towards pointing straight down, along the object's edges."""
-        error = rotation_between(view.eef_quat, multiply(about_z(self._target_yaw(view)), POINTING_DOWN))
-        return np.clip(GAIN * error / RADIANS_PER_ACTION, -self.skill.speed, self.skill.speed)
+    def _turn(self, view: View) -> np.ndarray:
+        """Rotation vector (3,) that is left until the gripper points straight down, along the object's edges."""
+        return rotation_between(view.eef_quat, multiply(about_z(self._target_yaw(view)), POINTING_DOWN))
 
     def _target_yaw(self, view: View) -> float:
         """The cube's angle modulo a quarter turn, nearest to the gripper's first one; for the round can, the gripper's own."""
         if self.task.name == "PickPlaceCan":
             return yaw_of(multiply(view.eef_quat, POINTING_DOWN * CONJUGATE))
         if self._yaw is None or self.stage == "reach":
-            start = 0.0 if self._yaw is None else self._yaw
-            quarter = np.pi / 2.0
-            turn = yaw_of(view.object_quat) - start
-            self._yaw = start + (turn + quarter / 2.0) % quarter - quarter / 2.0
+            start, quarter = self._yaw or 0.0, np.pi / 2.0
+            self._yaw = start + (yaw_of(view.object_quat) - start + quarter / 2.0) % quarter - quarter / 2.0
         return self._yaw
-
-    def _turn_left(self, view: View) -> float:
-        target = multiply(about_z(self._target_yaw(view)), POINTING_DOWN)
-        return float(np.linalg.norm(rotation_between(view.eef_quat, target)))
 
     def _disturb(self, command: np.ndarray) -> np.ndarray:
         """Pauses and tremor; an autocorrelated noise, weaker on the rotation."""
-        if self._pause == 0 and self._rng.random() < self.skill.pause_rate:
+        if self._pause == 0 and self._rng.random() < self.pause_rate:
             self._pause = int(self._rng.integers(3, 12))
         if self._pause > 0:
             self._pause -= 1
             command = np.zeros_like(command)
-        scale = self.skill.tremor * np.array([1.0, 1.0, 1.0, 0.3, 0.3, 0.3])
+        scale = self.tremor * np.array([1.0, 1.0, 1.0, 0.3, 0.3, 0.3])
         self._noise = 0.8 * self._noise + 0.6 * self._rng.normal(0.0, 1.0, len(command))
         return command + scale * self._noise
 

@@ -27,12 +27,8 @@ _REACHER_DIFFERENCE = slice(8, 10)  # fingertip minus target; -v4 has its height
 
 
 class GoalTask(gym.Wrapper[Any, np.ndarray, Any, np.ndarray]):
-    """A sparse task as a goal task: the same physics, time limits and ``info``.
-
-    :param env: the sparse task
-    :param n_own: size of ``observation``
-    :param n_goal: size of a goal
-    """
+    """A sparse task as a goal task: the same physics, time limits and ``info``; ``n_own`` is the size of ``observation``,
+    ``n_goal`` that of a goal."""
 
     def __init__(self, env: gym.Env[np.ndarray, np.ndarray], n_own: int, n_goal: int) -> None:
         super().__init__(env)
@@ -86,14 +82,12 @@ class GoalTask(gym.Wrapper[Any, np.ndarray, Any, np.ndarray]):
 
     def _demonstrated_rows(self, demonstrations: Demonstrations) -> tuple[Observation, Observation]:
         """Observations and next observations of N transitions, (N, size) each."""
-        raise NotImplementedError
+        return self._goal_observation(demonstrations.observations), self._goal_observation(demonstrations.next_observations)
 
 
 class GoalReacher(GoalTask):
-    """Goals are positions of the fingertip in the plane, in metres, (2,).
-
-    :param env: a sparse Reacher; its threshold and ``miss_reward`` count
-    """
+    """Goals are positions of the fingertip in the plane, in metres, (2,); the sparse Reacher's threshold and ``miss_reward``
+    count."""
 
     def __init__(self, env: gym.Env[np.ndarray, np.ndarray]) -> None:
         super().__init__(env, len(_REACHER_OWN), 2)
@@ -112,16 +106,10 @@ class GoalReacher(GoalTask):
             "desired_goal": target,
         }
 
-    def _demonstrated_rows(self, demonstrations: Demonstrations) -> tuple[Observation, Observation]:
-        return self._goal_observation(demonstrations.observations), self._goal_observation(demonstrations.next_observations)
-
 
 class GoalLocomotion(GoalTask):
-    """A goal is a distance from the start along x, in metres, (1,): reached, and paid, at or beyond it.
-
-    :param env: a sparse locomotion task with the ``"displacement"`` condition; its threshold is the goal
-    :raises ValueError: for another condition
-    """
+    """A goal is a distance from the start along x, in metres, (1,): reached, and paid, at or beyond it. It is the threshold of
+    a sparse locomotion task with the ``"displacement"`` condition; ValueError for another condition."""
 
     def __init__(self, env: gym.Env[np.ndarray, np.ndarray]) -> None:
         task: Any = env.unwrapped

@@ -23,20 +23,16 @@ OBSERVATIONS: dict[str, tuple[str, ...]] = {
     # robomimic's low-dimensional keys: 19 and 23 numbers
     "robomimic": ("robot0_eef_pos", "robot0_eef_quat", "robot0_gripper_qpos", "object"),
 }
-ACTION_DIM = 7
-"""Translation (3), rotation (3) and gripper (1; positive closes), each in [-1, 1]; 1 is 5 cm or 0.5 rad."""
+ACTION_DIM = 7  # translation (3), rotation (3) and gripper (1; positive closes), each in [-1, 1]; 1 is 5 cm or 0.5 rad
 
 
 @dataclass(frozen=True)
 class RobosuiteTask:
-    """:param env_id: Gymnasium id
-    :param name: robosuite's name
-    :param object_parts: the parts of the object's state, in order, and their sizes
-    """
+    """What a task's observations hold, and when it is solved."""
 
-    env_id: str
-    name: str
-    object_parts: dict[str, int]
+    env_id: str  # Gymnasium id
+    name: str  # robosuite's
+    object_parts: dict[str, int]  # the parts of the object's state, in order, and their sizes
 
     @property
     def object_dim(self) -> int:

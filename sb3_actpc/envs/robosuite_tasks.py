@@ -9,8 +9,6 @@ the control step (robosuite's lag behind by one simulation step, 2 ms, and the c
 step); the random numbers are Gymnasium's.
 """
 
-from __future__ import annotations
-
 import logging
 import os
 from collections.abc import Iterator
@@ -93,12 +91,9 @@ class SparseRobosuiteEnv(gym.Env[np.ndarray, np.ndarray], utils.EzPickle):
         self._stage = 0
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
-        """Start an episode: the arm near its rest pose, the object at a random place.
-
-        :param seed: of the generator; the same seed gives the same state bit for bit, None goes on with the generator
-        :param options: not used
-        :return: observation (obs_dim,) and ``{"is_success": False, "stage": "start"}``
-        """
+        """Start an episode: the arm near its rest pose, the object at a random place; the same seed gives the same state bit
+        for bit, None goes on with the generator. ``options`` are not used; the info is ``{"is_success": False, "stage":
+        "start"}``."""
         super().reset(seed=seed)
         share_generator(self._simulation, self.np_random)
         self._randomize_model()
@@ -107,12 +102,9 @@ class SparseRobosuiteEnv(gym.Env[np.ndarray, np.ndarray], utils.EzPickle):
         return self._observe(), {"is_success": False, "stage": self.stages[0]}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Advance by one control step, 1/20 s.
-
-        :param action: (7,)
-        :return: observation (obs_dim,), reward (1 on success, else 0), terminated (success), truncated (the horizon), info
-            with ``dense_reward`` (float), ``is_success`` (bool) and ``stage`` (str)
-        """
+        """Advance by one control step, 1/20 s, with an action (7,): observation (obs_dim,), reward (1 on success, else 0),
+        terminated (success), truncated (the horizon), info with ``dense_reward`` (float), ``is_success`` (bool) and ``stage``
+        (str)."""
         dense_reward = float(self._simulation.step(np.asarray(action, dtype=np.float64))[1])
         self._elapsed_steps += 1
         observation = self._observe()
@@ -134,10 +126,8 @@ class SparseRobosuiteEnv(gym.Env[np.ndarray, np.ndarray], utils.EzPickle):
         return self._observe()
 
     def render(self) -> np.ndarray | None:
-        """The camera's view, (height, width, 3) uint8; None without a render mode.
-
-        :raises RuntimeError: (or what the OpenGL library raises) when the machine cannot render
-        """
+        """The camera's view, (height, width, 3) uint8; None without a render mode. RuntimeError (or what the OpenGL library
+        raises) when the machine cannot render."""
         if self.render_mode is None:
             return None
         if self._renderer is None:
@@ -315,8 +305,7 @@ def resize_cube(simulation: Any, half_edges: np.ndarray) -> None:
 
 @contextmanager
 def _quiet_import() -> Iterator[None]:
-    """Keep robosuite's greetings off the screen, and its choice of an OpenGL library out of the environment variables:
-    MuJoCo cannot be imported by child processes with the name of one that is not there."""
+    """Without robosuite's greetings, and its choice of an OpenGL library, with which child processes may not find MuJoCo's."""
     logger, backend = logging.getLogger("robosuite_logs"), os.environ.get("MUJOCO_GL")
 
     def is_error(record: logging.LogRecord) -> bool:

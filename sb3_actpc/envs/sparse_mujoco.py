@@ -47,12 +47,8 @@ class _SparseMujocoEnv(MujocoEnv, utils.EzPickle):
 
     # the base class promises NumPy floats; the reward here is a Python float
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:  # type: ignore[override]
-        """Advance the base task by one step.
-
-        :param action: (action_dim,) within the action space
-        :return: observation (obs_dim,), sparse reward, terminated (a fall), truncated, info with ``dense_reward`` (float)
-            and ``is_success`` (bool)
-        """
+        """Advance the base task by one step with an action (action_dim,): observation (obs_dim,), sparse reward, terminated (a
+        fall), truncated, info with ``dense_reward`` (float) and ``is_success`` (bool)."""
         observation, dense_reward, terminated, truncated, base_info = super().step(action)
         info: dict[str, Any] = dict(base_info)
         reward, is_success = self._sparse_reward(info)

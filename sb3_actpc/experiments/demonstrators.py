@@ -3,8 +3,6 @@
 So were those of Ororbia & Mali (arXiv 2209.09174): PPO, trained for 2000 episodes.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -5,8 +5,6 @@ respect to the action, against it, at random, or towards the action of the neare
 then played without noise. A critic that is worth following ranks the moved actions as the returns do.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -126,13 +124,9 @@ def examine(
 
 
 def examine_run(folder: Path, **options: Any) -> Examination:
-    """Examine the agent of a run and write the table into its folder, as ``examination.csv``.
-
-    The run's ``model.zip`` is unpickled: open only runs that you trust.
-
-    :param options: keywords of :func:`examine`
-    :raises ValueError: when its agent is not an ActPC, or learned from ``VecNormalize``
-    """
+    """Examine the agent of a run, with keywords of :func:`examine`, and write the table into its folder, as
+    ``examination.csv``. The run's ``model.zip`` is unpickled: open only runs that you trust. ValueError when its agent is not
+    an ActPC, or learned from ``VecNormalize``."""
     from sb3_actpc.actpc import ActPC
     from sb3_actpc.experiments.runs.environments import make_env
     from sb3_actpc.experiments.runs.run import load_run
@@ -243,8 +237,7 @@ def _visited_states(agent: _Agent, envs: Sequence[gym.Env[Any, Any]], n_states: 
 
 
 def _demonstrated_states(model: Any, env: gym.Env[Any, Any], n_states: int, seed: int) -> list[_Start]:
-    """States of demonstrated episodes, their positions and velocities rebuilt from what was observed; none of other tasks
-    than gymnasium's MuJoCo ones, or where the recording does not tell how far the demonstrator had come."""
+    """States of demonstrated episodes; none where they cannot be rebuilt from what was recorded."""
     known = resolve(model.demonstrations).select(model.n_demonstrations, model.n_demonstration_transitions)
     task = known.env_id.rpartition(":")[2].removeprefix("Sparse").removeprefix("Goal")
     simulation: Any = env.unwrapped
@@ -294,13 +287,6 @@ def _capture(env: gym.Env[Any, Any]) -> tuple[dict[str, Any], Decoder]:
     return record, Decoder(arrays, {name: tensor.clone() for name, tensor in encoder.tensors.items()})
 
 
-def _restore(env: gym.Env[Any, Any], captured: tuple[dict[str, Any], Decoder]) -> None:
-    restore_env(env, *captured)
-    for layer in env_layers(env):
-        if isinstance(layer, TimeLimit):
-            layer._elapsed_steps = 0  # type: ignore[assignment]  # each state has its whole horizon before it
-
-
 # ------------------------------------------------------------------ trying actions
 
 
@@ -328,7 +314,10 @@ def _roll_out(
 ) -> pd.DataFrame:
     """Side by side: the branch's actions for ``hold`` steps, then the policy's. A row each: value, paid, dense, rest, fell."""
     for env, start in zip(envs, starts, strict=False):
-        _restore(env, start.captured)
+        restore_env(env, *start.captured)
+        for layer in env_layers(env):
+            if isinstance(layer, TimeLimit):
+                layer._elapsed_steps = 0  # type: ignore[assignment]  # each state has its whole horizon before it
     gamma, n = agent.model.gamma, len(starts)
     observations = [start.observation for start in starts]
     memory, begins = _memories(starts)
@@ -360,11 +349,9 @@ def _roll_out(
 def _memories(starts: Sequence[_Start]) -> tuple[tuple[np.ndarray, ...] | None, np.ndarray]:
     """The agent's recurrent states at the starts, and where they are to be emptied."""
     held = [start.memory for start in starts]
-    template = next((memory for memory in held if memory is not None), None)
-    if template is None:
-        return None, np.ones(len(starts), dtype=bool)
-    stacked = zip(*(template if memory is None else memory for memory in held), strict=True)
-    return tuple(np.stack(parts) for parts in stacked), np.array([memory is None for memory in held])
+    template = next((memory for memory in held if memory is not None), ())  # stands in where one is to be emptied
+    parts = [np.stack(rows) for rows in zip(*(template if memory is None else memory for memory in held), strict=True)]
+    return tuple(parts) or None, np.array([memory is None for memory in held])
 
 
 # ------------------------------------------------------------------ judging
@@ -419,8 +406,7 @@ def _wins(first: pd.Series, second: pd.Series) -> np.ndarray:
 
 
 def _correlation(blocks: list[np.ndarray], column: int, rng: np.random.Generator) -> tuple[float, float]:
-    """Spearman's rank correlation between column 0 and another of all blocks (one for each state) together, and its standard
-    error over resampled states; NaN where one of the columns is constant."""
+    """Spearman's, of columns 0 and another of all blocks (one a state), and its standard error over states; or NaN."""
     from scipy.stats import spearmanr
 
     def correlation(parts: list[np.ndarray]) -> float:

@@ -1,7 +1,5 @@
 """What ``sb3-actpc bench`` measures, as ratios: updates, a settling, steps of training, acting, growth with sizes, memory."""
 
-from __future__ import annotations
-
 import copy
 import json
 import statistics
@@ -25,7 +23,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from sb3_actpc.actpc import ActPC
 from sb3_actpc.actpc.buffers import CombinedReplayBuffer
 from sb3_actpc.envs.robosuite_layouts import ROBOSUITE_TASKS
-from sb3_actpc.experiments.report.tables import markdown
+from sb3_actpc.experiments.report.page import markdown
 from sb3_actpc.experiments.runs.presets import preset, with_changes
 from sb3_actpc.ngc import NGCCircuit
 from sb3_actpc.ngc.products import has_bfloat16
@@ -87,9 +85,6 @@ def table(files: list[Path]) -> str:
         cells = [f"{about['ratios'][name][0]:.2f}" if name in about["ratios"] else "" for about in measured]
         rows.append([f"{name} / {unit}", *cells])
     return markdown(pd.DataFrame(rows, columns=heads))
-
-
-# ---------------------------------------------------------------------- one update
 
 
 def updates(device: str, compiled: bool) -> Group:
@@ -155,9 +150,6 @@ def _products(circuit: NGCCircuit, batch: int, of_update: bool = False) -> Calla
     return products
 
 
-# ---------------------------------------------------------------------- training and acting
-
-
 def training(device: str) -> list[Group]:
     """Every task's learners, one update for each environment step, batch and layers alike; SBX's where ``sbx-rl`` is
     installed."""
@@ -199,17 +191,14 @@ def acting() -> Group:
             h = np.clip(h @ weights.T + bias, 0.0, 6.0)
         return np.tanh(h @ layers[-1][0].T + layers[-1][1])
 
-    circuits = [agent.actor.circuit]
+    circuit = agent.actor.circuit
     entries: Entries = {
         "NumPy, one observation": by_numpy,
-        "the circuit, one observation": lambda: agent.actor.circuit.project(agent.inputs.tensor(observation)),
-        "collecting, one observation": lambda: agent.actor.roll_out(observation, None, None, circuits),
+        "the circuit, one observation": lambda: circuit.project(agent.inputs.tensor(observation)),
+        "collecting, one observation": lambda: agent.actor.roll_out(observation, None, None, [circuit]),
         "predict(), one observation": lambda: agent.predict(observation),
     }
     return entries, {"NumPy, one observation": "NumPy's time"}
-
-
-# ---------------------------------------------------------------------- growth
 
 
 def growth() -> list[Group]:
@@ -249,19 +238,13 @@ def memory_ratio() -> float:
     return ours / theirs
 
 
-# ---------------------------------------------------------------------- robosuite
-
-
 def robosuite(rounds: int) -> Iterator[str]:
-    """A line for each task: steps and resets, interleaved with those of robosuite's own environment at its defaults.
-
-    :raises ImportError: when robosuite is not installed
-    """
+    """A line for each task: steps and resets, interleaved with those of robosuite's own environment at its defaults;
+    ImportError when robosuite is not installed."""
     for env_id, task in ROBOSUITE_TASKS.items():
         times = _interleave(_robosuite_entries(env_id, task.name), rounds, lambda: None)
         medians = {name: statistics.median(seconds) for name, seconds in times.items()}
-        both = {name: times[name] for name in ("our steps", "robosuite's steps")}
-        ratio, _ = ratios(both, {"our steps": ""})["robosuite's steps"]
+        ratio, _ = ratios(times, {"our steps": ""})["robosuite's steps"]
         yield (
             f"{env_id}: {N_ENV_STEPS / medians['our steps']:.0f} steps/s, {ratio:.2f} x robosuite's own; "
             f"a reset takes {1000 * medians['our reset']:.1f} ms, robosuite's {1000 * medians['robosuite reset']:.0f} ms"

@@ -65,12 +65,8 @@ def nearest(name: str, known: Iterable[str]) -> str:
 
 @contextmanager
 def named_in_errors(what: str, *passed_on: type[Exception]) -> Iterator[None]:
-    """What a class of another package does not take becomes an error that says where the user gave it.
-
-    :param what: the keywords with their values
-    :param passed_on: errors that are clear already
-    :raises ValueError: for any other error
-    """
+    """What a class of another package does not take becomes a ValueError that says where the user gave it: ``what``, the
+    keywords with their values. Errors of the kinds ``passed_on`` are clear already."""
     try:
         yield
     except passed_on:

@@ -4,10 +4,8 @@ import inspect
 
 
 def constructor_keywords(kind: type) -> list[str]:
-    """:param kind: a class
-    :return: names of all keywords of its constructor: its own and, where it ends in ``**options``, those of the next class
-        in the order of inheritance that has a constructor, and so on; names that begin with an underscore are left out
-    """
+    """Names of all keywords of a class's constructor: its own and, where it ends in ``**options``, those of the next class in
+    the order of inheritance that has a constructor, and so on; names that begin with an underscore are left out."""
     names: dict[str, None] = {}
     for base in kind.__mro__:
         if "__init__" not in vars(base):

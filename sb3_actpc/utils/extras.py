@@ -5,10 +5,8 @@ from typing import Any
 
 
 def import_extra(module: str, extra: str) -> Any:
-    """Import a module that an extra of this package installs.
-
-    :raises ImportError: when it, or something that it needs, is not installed; the message says how to install it
-    """
+    """Import a module that an extra of this package installs; ImportError, which says how to install it, when it or something
+    that it needs is not there."""
     try:
         return importlib.import_module(module)
     except ImportError as error:

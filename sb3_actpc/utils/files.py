@@ -1,7 +1,5 @@
 """Writing files so that a reader never meets half of one."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import uuid
@@ -13,17 +11,11 @@ from typing import IO, Any, Literal
 
 @contextmanager
 def atomic_write(path: str | os.PathLike[str], mode: Literal["wb", "w"] = "wb") -> Iterator[IO[Any]]:
-    """Open ``path`` for writing; the file appears, or replaces the old one, only when the block ends without an error.
-
-    The data goes to a temporary name in the same folder, is flushed to the disk and then renamed. When the block
-    raises, the temporary file is removed and an old file at ``path`` stays as it was.
-
-    :param path: file to write; missing folders are created, a link is followed, an old file's permissions are kept
-    :param mode: ``"wb"`` for bytes, ``"w"`` for UTF-8 text with ``\\n`` line ends
-    :return: context manager that yields the open temporary file
-    :raises ValueError: for any other ``mode``
-    :raises OSError: when the folder cannot be written, or ``path`` is a folder
-    """
+    """Open ``path`` for writing, as bytes (``"wb"``) or UTF-8 text with ``\\n`` line ends (``"w"``); the file appears, or
+    replaces the old one, only when the block ends without an error. The data goes to a temporary name in the same folder, is
+    flushed to the disk and then renamed; when the block raises, an old file stays as it was. Missing folders are created, a
+    link is followed, an old file's permissions are kept. ValueError for another mode, OSError when the folder cannot be
+    written, or ``path`` is a folder."""
     if mode not in ("wb", "w"):
         raise ValueError(f"mode must be 'wb' or 'w', found {mode!r}")
     target = Path(os.path.realpath(path))

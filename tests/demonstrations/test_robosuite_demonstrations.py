@@ -17,7 +17,7 @@ import pytest
 from sb3_actpc.cli import main
 from sb3_actpc.demonstrations import ScriptedDemonstrator, collect_scripted, read_robomimic, read_robosuite, write_robomimic
 from sb3_actpc.demonstrations.dataset import Demonstrations, shipped_demonstrations
-from sb3_actpc.demonstrations.download import robomimic_url
+from sb3_actpc.demonstrations.robomimic import robomimic_url
 from sb3_actpc.demonstrations.scripted import MIXED_DEMONSTRATORS, about_z, multiply, rotation_between, yaw_of
 from sb3_actpc.envs import ROBOSUITE_IDS
 from sb3_actpc.envs.robosuite_layouts import ROBOSUITE_TASKS, RobosuiteTask

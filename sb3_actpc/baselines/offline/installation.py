@@ -1,7 +1,5 @@
 """Virtual environments of packages that pin other versions than this one does: ``sb3-actpc baselines install NAME``."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil
@@ -46,10 +44,7 @@ def environments_folder() -> Path:
 
 
 def environment_python(name: str, folder: Path | None = None) -> Path:
-    """The interpreter of the whole environment of a package.
-
-    :raises ImportError: when there is none; the message says how to make it
-    """
+    """The interpreter of the whole environment of a package; ImportError, which says how to make it, when there is none."""
     place = (environments_folder() if folder is None else folder) / name
     if not _is_complete(name, place):
         raise ImportError(f"{name} is not installed in {place}: run sb3-actpc baselines install {name}")
@@ -58,12 +53,8 @@ def environment_python(name: str, folder: Path | None = None) -> Path:
 
 def install(name: str, folder: Path | None = None, report: Callable[[str], None] = lambda line: None) -> Path:
     """Make the environment of a package; one that is there and whole stays as it is, any other is made anew, under another
-    name, and renamed when everything in it runs, so that a stopped command leaves no half of one.
-
-    :return: the environment's folder
-    :raises ValueError: when there is no such name
-    :raises OSError: when a step fails (no network, a full disk); the message is the last thing that it said
-    """
+    name, and renamed when everything in it runs, so that a stopped command leaves no half of one. Its folder; ValueError when
+    there is no such name, OSError, with the last thing that it said, when a step fails (no network, a full disk)."""
     if name not in RECIPES:
         raise ValueError(f"no recipe for {name!r}: choose one of {', '.join(sorted(RECIPES))}")
     folder = environments_folder() if folder is None else folder.absolute()

@@ -1,7 +1,5 @@
 """A program of :mod:`sb3_actpc.baselines.offline.servers`, in its own virtual environment, asked through a pipe."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import tempfile
@@ -20,14 +18,9 @@ class ServerFailed(OSError):
 
 
 class ServerProcess:
-    """A child process that answers questions; it ends with its parent, whose death closes the pipe.
-
-    :param command: its program and arguments
-    :param name: for messages
-    :param timeout: seconds that an answer may take
-    :param threads: of numerical libraries in it
-    :raises ServerFailed: when it cannot be started
-    """
+    """A child process, by the ``command`` that starts it, which answers questions, each within ``timeout`` seconds; it ends
+    with its parent, whose death closes the pipe. ``name`` is for messages, ``threads`` are those of numerical libraries in it.
+    ServerFailed when it cannot be started."""
 
     def __init__(self, command: Sequence[str], name: str, timeout: float, threads: int = 1) -> None:
         self.name, self.timeout = name, timeout
@@ -53,11 +46,8 @@ class ServerProcess:
             theirs.close()
 
     def ask(self, what: str, arrays: Arrays | None = None, **values: Any) -> tuple[Values, Arrays]:
-        """Values and arrays of the answer to a question of this name, with these arrays and plain values.
-
-        :raises ServerFailed: when there is none; the process is then ended
-        :raises ValueError: when the answer is that the question was wrong; likewise
-        """
+        """Values and arrays of the answer to a question of this name, with these arrays and plain values; ServerFailed when
+        there is none, ValueError when it is that the question was wrong, and the process is then ended."""
         if self._channel.closed:
             raise ServerFailed(f"{self.name} has ended before: close() the agent, which starts it again as it was last saved")
         is_answered = False

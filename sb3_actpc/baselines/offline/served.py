@@ -5,8 +5,6 @@ packages pin other versions than this one. Demonstrations go in and actions come
 (:mod:`sb3_actpc.baselines.offline.servers.frames`), so the episodes are played here, in our environments.
 """
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
@@ -18,7 +16,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import Schedule
 
 from sb3_actpc.actpc.arguments import Between, checked
-from sb3_actpc.baselines.bc_policies import LARGEST_INPUT, SMALLEST_SPREAD
+from sb3_actpc.baselines.bc_policies import LARGEST_INPUT, SMALLEST_SPREAD, State, StatefulPolicy
 from sb3_actpc.baselines.offline.installation import environment_python
 from sb3_actpc.baselines.offline.process import ServerProcess
 from sb3_actpc.baselines.offline.servers.frames import Arrays
@@ -30,11 +28,11 @@ D3RLPY_RATES = "actor_learning_rate, critic_learning_rate, ..."
 ROBOMIMIC_RATES = "actor.optim_params.policy.learning_rate.initial, ..."
 
 
-class ServedPolicy(BasePolicy):
-    """A policy whose actions another process chooses. ``predict`` takes and returns that process's state as SB3's recurrent
-    ``state``, arrays with a row for each environment; None where the method has none."""
+class ServedPolicy(StatefulPolicy):
+    """A policy whose actions another process chooses, as its package's own evaluation does; the state is that process's, None
+    where the method has none."""
 
-    owner: ServedAlgorithm
+    owner: "ServedAlgorithm"
 
     def __init__(self, observation_space: spaces.Space, action_space: spaces.Box, lr_schedule: Schedule) -> None:
         super().__init__(observation_space, action_space, squash_output=True)
@@ -42,21 +40,9 @@ class ServedPolicy(BasePolicy):
     def _predict(self, observation: Any, deterministic: bool = False) -> th.Tensor:
         raise NotImplementedError("the actions are another process's: call predict()")
 
-    def predict(
-        self,
-        observation: np.ndarray | dict[str, np.ndarray],
-        state: tuple[np.ndarray, ...] | None = None,
-        episode_start: np.ndarray | None = None,
-        deterministic: bool = False,
-    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
-        """As SB3's; ``deterministic`` has no effect: the packages' own evaluation is meant."""
-        rows, is_batch = self.obs_to_tensor(observation)
-        assert isinstance(rows, th.Tensor)
-        starts = np.full(len(rows), state is None) if episode_start is None else np.asarray(episode_start, dtype=bool)
-        scaled, after = self.owner.act(rows.flatten(1).cpu().numpy(), starts.reshape(-1), state)
-        shape = self.action_space.shape or ()
-        actions = np.asarray(self.unscale_action(np.clip(scaled, -1, 1).reshape(-1, *shape)))
-        return (actions if is_batch else actions[0]), after
+    def act(self, rows: th.Tensor, begins: np.ndarray, state: State | None) -> tuple[np.ndarray, State | None]:
+        """See :class:`~sb3_actpc.baselines.bc_policies.StatefulPolicy`."""
+        return self.owner.act(rows.cpu().numpy(), begins, state)
 
 
 class ServedAlgorithm(OfflineAlgorithm):
@@ -103,8 +89,6 @@ class ServedAlgorithm(OfflineAlgorithm):
         self._process: ServerProcess | None = None
         self._state_names: list[str] = []
         super().__init__(*args, batch_size=batch_size, **options)
-
-    # ------------------------------------------------------------------ setting up
 
     def _setup_model(self) -> None:
         if not isinstance(self.observation_space, spaces.Box):
@@ -185,8 +169,6 @@ class ServedAlgorithm(OfflineAlgorithm):
             self._process.close()
             self._process = None
 
-    # ------------------------------------------------------------------ learning and acting
-
     def train(self) -> None:
         """One gradient step of every part of the method."""
         losses, _ = self._server().ask("train")
@@ -196,14 +178,9 @@ class ServedAlgorithm(OfflineAlgorithm):
                 self.logger.record(f"train/{name}", float(loss))
             self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
 
-    def act(
-        self, observations: np.ndarray, starts: np.ndarray, state: tuple[np.ndarray, ...] | None
-    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+    def act(self, observations: np.ndarray, starts: np.ndarray, state: State | None) -> tuple[np.ndarray, State | None]:
         """Actions (n, A), about in [-1, 1], and the next state, for observations (n, obs_dim); ``starts`` (n,) is true where
-        an episode begins.
-
-        :raises OSError: when the other process has failed
-        """
+        an episode begins. OSError when the other process has failed."""
         arrays = {"observations": self._normalized(observations), "episode_starts": starts}
         if state is not None:
             arrays |= dict(zip(self._state_names, state, strict=True))
@@ -213,8 +190,6 @@ class ServedAlgorithm(OfflineAlgorithm):
             raise ValueError(f"{self.package}'s {self.method.upper()} has no finite action for every observation")
         self._state_names = list(answer)
         return actions, tuple(answer.values()) or None
-
-    # ------------------------------------------------------------------ saving
 
     def save(self, path: Any, exclude: Any = None, include: Any = None) -> None:
         """As SB3's; the networks are fetched first."""

@@ -1,9 +1,6 @@
 """How a comparison goes on, live in a terminal, line by line elsewhere; and what it consists of."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
-from statistics import median
 
 import pandas as pd
 from rich.console import Console
@@ -17,22 +14,19 @@ _WORDS = {LOST: "lost, will go on", STOPPED: "stopped, will go on", DISK_FULL: "
 
 
 class Display:
-    """A line for every run that begins or ends; in a terminal, bars of the runs under way and of the steps of all.
-
-    :param bars: False for lines alone
-    :param console: of rich
-    """
+    """A line for every run that begins or ends; in a terminal, and with ``bars``, also bars of the runs under way and of the
+    steps of all. ``console`` is rich's."""
 
     def __init__(self, bars: bool = True, console: Console | None = None) -> None:
         self.console = console or Console()
         columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
-        times, is_hidden = (TimeElapsedColumn(), TimeRemainingColumn()), not (bars and self.console.is_terminal)
-        self.progress = Progress(*columns, *times, console=self.console, disable=is_hidden)
+        times = (TimeElapsedColumn(), TimeRemainingColumn())
+        self.progress = Progress(*columns, *times, console=self.console, disable=not (bars and self.console.is_terminal))
         self.n_runs, self.n_finished = 0, 0
         self._bars: dict[str, TaskID] = {}
         self._steps: dict[str, int] = {}  # done by this command or before
 
-    def __enter__(self) -> Display:
+    def __enter__(self) -> "Display":
         self.progress.start()
         return self
 
@@ -75,17 +69,11 @@ class Display:
 def describe_runs(runs: Sequence[Run]) -> str:
     """The runs as a table, with the seconds that they took; those not finished with what finished runs of the same task,
     variant and steps took (the median), where there are any."""
-    status = {run.id: run_status(run.folder) for run in runs}
-    taken = {run.id: float(read_result(run.folder)["wall_seconds"]) for run in runs if status[run.id] == FINISHED}
-
-    def kind(run: Run) -> tuple[str | None, str | None, int | None]:
-        return run.task, run.name, run.n_timesteps
-
-    def seconds(run: Run) -> str:
-        alike = [taken[other.id] for other in runs if other.id in taken and kind(other) == kind(run)]
-        known = taken.get(run.id, median(alike) if alike else None)
-        return "" if known is None else f"{known:.0f}"
-
-    rows = [[run.id, run.task, run.name, run.seed, run.n_timesteps, status[run.id], seconds(run)] for run in runs]
-    table = pd.DataFrame(rows, columns=["id", "task", "variant", "seed", "steps", "state", "seconds"])
-    return f"{table.to_string(index=False)}\n\n{len(runs) - len(taken)} of {len(runs)} runs to do"
+    rows = [[run.id, run.task, run.name, run.seed, run.n_timesteps, run_status(run.folder)] for run in runs]
+    table = pd.DataFrame(rows, columns=["id", "task", "variant", "seed", "steps", "state"])
+    is_done = table["state"] == FINISHED
+    done = [run for run, finished in zip(runs, is_done, strict=True) if finished]
+    table.loc[is_done, "seconds"] = [float(read_result(run.folder)["wall_seconds"]) for run in done]
+    alike = table.groupby(["task", "variant", "steps"])["seconds"].transform("median")
+    table["seconds"] = table["seconds"].fillna(alike).map("{:.0f}".format).replace("nan", "")
+    return f"{table.to_string(index=False)}\n\n{len(runs) - len(done)} of {len(runs)} runs to do"

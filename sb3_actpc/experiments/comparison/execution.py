@@ -1,7 +1,5 @@
 """One run of a comparison in the present process: begun, gone on with, or found finished; and what came of it."""
 
-from __future__ import annotations
-
 import errno
 import json
 import time
@@ -30,13 +28,10 @@ REPORT_INTERVAL = 1.0  # seconds between two reports of the steps done
 
 @dataclass(frozen=True)
 class Outcome:
-    """:param status: ``"finished"``, ``"failed"``, ``"stopped"`` (by a signal, saved), ``"lost"`` (the process ended without a
-        word) or ``"disk full"``
-    :param message: what went wrong, one line
-    """
+    """What has become of a run."""
 
-    status: str
-    message: str = ""
+    status: str  # "finished", "failed", "stopped" (by a signal, saved), "lost" (its process ended without a word), "disk full"
+    message: str = ""  # what went wrong, one line
 
 
 class FolderBusy(ValueError):
@@ -45,11 +40,8 @@ class FolderBusy(ValueError):
 
 @contextmanager
 def folder_lock(folder: Path, wait: float, report: Callable[[str], None] = lambda line: None) -> Iterator[None]:
-    """Hold a folder, made when it does not exist; another process that holds it is waited for some seconds. The lock is the
-    operating system's: it is gone with the process that held it, however that ended.
-
-    :raises FolderBusy: when the other still holds it then
-    """
+    """Hold a folder, made when it does not exist; another process that holds it is waited for some seconds, then FolderBusy is
+    raised. The lock is the operating system's: it is gone with the process that held it, however that ended."""
     folder.mkdir(parents=True, exist_ok=True)
     lock = FileLock(folder / LOCK)
     try:

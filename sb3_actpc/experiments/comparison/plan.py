@@ -1,7 +1,5 @@
 """From tasks, algorithms and seeds to a list of runs, each with an id made from its content and a folder of its own."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -16,23 +14,14 @@ OWN_KEYS = ("envs", "algos", "ablate", "seeds", "first_seed", "output")
 
 
 class Comparison(Schema):
-    """Which runs are compared: every task with every variant and every seed.
+    """Which runs are compared: every task with every variant and every seed. ValueError for a wrong number of seeds."""
 
-    :param tasks: parts of runs, with ``env``
-    :param variants: parts of runs, with a name and an algorithm
-    :param seeds: how many seeds
-    :param first_seed: the first of them; settings that were chosen on some seeds are to be shown on others
-    :param shared: what holds for all runs; a task's own comes first, and a variant's before that
-    :param output: folder of the comparison
-    :raises ValueError: for a wrong number of seeds
-    """
-
-    tasks: tuple[Run, ...]
-    variants: tuple[Run, ...]
-    seeds: Count = 3
-    first_seed: Seed = 0
-    shared: Run = Run()
-    output: str = "runs/comparison"
+    tasks: tuple[Run, ...]  # parts of runs, with ``env``
+    variants: tuple[Run, ...]  # parts of runs, with a name and an algorithm
+    seeds: Count = 3  # how many
+    first_seed: Seed = 0  # settings that were chosen on some seeds are to be shown on others
+    shared: Run = Run()  # what holds for all runs; a task's own comes first, and a variant's before that
+    output: str = "runs/comparison"  # folder
 
 
 def read_comparison(given: Mapping[str, Any]) -> Comparison:
@@ -71,15 +60,10 @@ def read_comparison_file(path: Path) -> dict[str, Any]:
 
 
 def plan_runs(comparison: Comparison, folder: Path | None = None) -> list[Run]:
-    """Fill in and check every run before any is begun.
-
-    :param comparison: which runs
-    :param folder: where their folders go, as ``<task>/<variant>/seed<seed>_<id>``; by default the comparison's
-    :return: the runs: the first seed of everything, then the second, ...
-    :raises ValueError: when a name or a setting is unknown or wrong
-    :raises FileNotFoundError: when a preset or a demonstrations file does not exist
-    :raises gymnasium.error.Error: when a task is unknown
-    """
+    """Fill in and check every run before any is begun: the first seed of everything, then the second, ... Their folders are
+    ``<task>/<variant>/seed<seed>_<id>`` in ``folder``, by default the comparison's. ValueError when a name or a setting is
+    unknown or wrong, FileNotFoundError when a preset or a demonstrations file does not exist, gymnasium.error.Error when a
+    task is unknown."""
     folder = Path(comparison.output) if folder is None else folder
     filled = [_fill(comparison.shared, task, variant) for task in comparison.tasks for variant in comparison.variants]
     seeds = range(comparison.first_seed, comparison.first_seed + comparison.seeds)
@@ -99,8 +83,7 @@ def _fill(shared: Run, task: Run, variant: Run) -> Run:
 
 
 def _parse_task(entry: Any) -> Run:
-    if isinstance(entry, str):
-        return Run(env=entry)
+    entry = {"env": entry} if isinstance(entry, str) else entry
     if not isinstance(entry, Mapping) or "env" not in entry:
         raise ValueError(f"expected a Gymnasium id or a mapping with env, found {entry!r}")
     return part_of_run({str(key): value for key, value in entry.items()})

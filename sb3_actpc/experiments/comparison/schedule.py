@@ -1,7 +1,5 @@
 """From the table to finished runs: which are begun, gone on with, tried again or left alone."""
 
-from __future__ import annotations
-
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -11,7 +9,7 @@ from sb3_actpc.checkpoints import StopSignals
 from sb3_actpc.experiments.comparison import execution
 from sb3_actpc.experiments.comparison.display import Display
 from sb3_actpc.experiments.comparison.engines import Engine, Event
-from sb3_actpc.experiments.comparison.execution import FAILED, FINISHED, Outcome, folder_lock, is_disk_full, run_status
+from sb3_actpc.experiments.comparison.execution import FAILED, FINISHED, folder_lock, is_disk_full, run_status
 from sb3_actpc.experiments.runs import Run
 
 MAX_LOSSES = 3  # times that the process of one run may die before the run counts as failed
@@ -21,20 +19,13 @@ POLL = 0.5  # seconds
 
 @dataclass
 class Summary:
-    """What a command has come to.
+    """What a command has come to."""
 
-    :param finished: runs that are done, the ones done before among them
-    :param failed: runs that failed, now or before, with their errors
-    :param unfinished: runs that were not begun or not brought to their end
-    :param stopped_by: name of the signal that ended the command, or ``"disk full"``; None when it came to its end
-    :param message: of the full disk
-    """
-
-    finished: list[Run] = field(default_factory=list)
-    failed: list[tuple[Run, str]] = field(default_factory=list)
-    unfinished: list[Run] = field(default_factory=list)
-    stopped_by: str | None = None
-    message: str = ""
+    finished: list[Run] = field(default_factory=list)  # the ones done before among them
+    failed: list[tuple[Run, str]] = field(default_factory=list)  # now or before, with their errors
+    unfinished: list[Run] = field(default_factory=list)  # not begun, or not brought to their end
+    stopped_by: str | None = None  # name of the signal that ended the command, or ``"disk full"``
+    message: str = ""  # of the full disk
 
 
 def run_comparison(
@@ -44,14 +35,10 @@ def run_comparison(
     display: Display,
     retry_failed: bool = False,
 ) -> Summary:
-    """Bring every run of a table to its end that is not there yet. Stopped at any moment and called again, it loses no
-    finished run, repeats none, and goes on with the others from their last checkpoint.
-
-    :param make_engine: makes what executes the runs; not called when there is nothing to do
-    :param retry_failed: also try those again that failed before
-    :raises FolderBusy: when another process works in the folder
-    :raises OSError: when the folder cannot be written
-    """
+    """Bring every run of a table to its end that is not there yet, and with ``retry_failed`` those that failed before. Stopped
+    at any moment and called again, it loses no finished run, repeats none, and goes on with the others from their last
+    checkpoint. ``make_engine`` makes what executes the runs; it is not called when there is nothing to do. FolderBusy when
+    another process works in the folder, OSError when it cannot be written."""
     with folder_lock(folder, LOCK_WAIT, display.line):
         for run in runs:
             execution.repair_result(run.folder, display.line)
@@ -61,14 +48,10 @@ def run_comparison(
         summary = Summary()
         if to_do:
             _Scheduler(make_engine(), display, to_do, summary).run()
-        for run in runs:
-            status = run_status(run.folder)
-            if status == FINISHED:
-                summary.finished.append(run)
-            elif status == FAILED:
-                summary.failed.append((run, execution.read_error(run.folder)))
-            else:
-                summary.unfinished.append(run)
+        ends = [(run, run_status(run.folder)) for run in runs]
+        summary.finished = [run for run, status in ends if status == FINISHED]
+        summary.failed = [(run, execution.read_error(run.folder)) for run, status in ends if status == FAILED]
+        summary.unfinished = [run for run, status in ends if status not in (FINISHED, FAILED)]
         return summary
 
 
@@ -121,15 +104,11 @@ class _Scheduler:
         if event.outcome.status == execution.DISK_FULL:
             self._stop(execution.DISK_FULL, event.outcome.message)
         elif event.outcome.status in (execution.LOST, execution.STOPPED) and self.summary.stopped_by is None:
-            self._try_again(run, event.outcome)
-
-    def _try_again(self, run: Run, outcome: Outcome) -> None:
-        """Somebody ended the run's process, not the run."""
-        self.losses[run.id] += 1
-        if self.losses[run.id] < MAX_LOSSES:
-            self.waiting.appendleft(run)
-        else:
-            execution.write_error(run.folder, f"given up after {MAX_LOSSES} times: {outcome.message}")
+            self.losses[run.id] += 1  # somebody ended the run's process, not the run
+            if self.losses[run.id] < MAX_LOSSES:
+                self.waiting.appendleft(run)
+            else:
+                execution.write_error(run.folder, f"given up after {MAX_LOSSES} times: {event.outcome.message}")
 
     def _stop(self, reason: str, message: str = "") -> None:
         if self.summary.stopped_by is None:

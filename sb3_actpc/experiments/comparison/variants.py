@@ -1,7 +1,5 @@
 """Named ways of running an algorithm: each is a part of a :class:`~sb3_actpc.experiments.runs.Run`."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
@@ -27,11 +25,8 @@ def find_variant(name: str) -> Run:
 
 
 def parse_variant(entry: Any) -> Run:
-    """:param entry: a name, or a mapping with some of the keys of :class:`~sb3_actpc.experiments.runs.Run`; ``base`` names the
-        variant that it starts from
-    :return: the variant
-    :raises ValueError: when it is neither, or has an unknown key or a wrong value
-    """
+    """The variant of a name, or of a mapping with some of the keys of :class:`~sb3_actpc.experiments.runs.Run`, where ``base``
+    names the variant that it starts from; ValueError when it is neither, or has an unknown key or a wrong value."""
     if isinstance(entry, str):
         return find_variant(entry)
     if not isinstance(entry, Mapping):
@@ -47,10 +42,8 @@ def parse_variant(entry: Any) -> Run:
 
 
 def part_of_run(entry: Mapping[str, Any], also: Sequence[str] = ()) -> Run:
-    """A part of a run from its keys, with the nearest known one in the error; ``also`` are keys that stand beside them.
-
-    :raises ValueError: for an unknown key, a wrong value, or a key that the comparison itself decides
-    """
+    """A part of a run from its keys; ``also`` are keys that stand beside them. ValueError for an unknown key, with the nearest
+    known one, a wrong value, or a key that the comparison itself decides."""
     known = sorted({*also, *Run.known_keys()} - set(PLANNED))
     for key, value in entry.items():
         if key in PLANNED:

@@ -4,8 +4,6 @@ It reads the run as a line of JSON from its standard input and answers with line
 standard input closes (the command wants it to stop, or was killed) it saves a checkpoint and ends.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import signal

@@ -1,7 +1,5 @@
 """What each part of ActPC is worth: the base with every part beside the runs without each in turn."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -9,11 +7,10 @@ import pandas as pd
 
 from sb3_actpc.experiments.comparison.variants import ablation_variants
 from sb3_actpc.experiments.report.figures import MEASURE_NAMES, draw_ablation
-from sb3_actpc.experiments.report.page import Section
+from sb3_actpc.experiments.report.page import Section, interval, mean_and_deviation, number
 from sb3_actpc.experiments.report.references import measure_of
 from sb3_actpc.experiments.report.results import Results
 from sb3_actpc.experiments.report.statistics import mean_interval
-from sb3_actpc.experiments.report.tables import interval, mean_and_deviation, number
 
 NO_EFFECT = "NO: the part did nothing"
 

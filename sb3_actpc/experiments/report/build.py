@@ -1,8 +1,5 @@
 """The report of a comparison: tables, figures and a CSV file made from the folders of its runs, without any training."""
 
-from __future__ import annotations
-
-from collections.abc import Mapping
 from itertools import combinations
 from pathlib import Path
 
@@ -13,12 +10,10 @@ from sb3_actpc.experiments.comparison.execution import FINISHED
 from sb3_actpc.experiments.report import figures, statistics
 from sb3_actpc.experiments.report.ablations import ablation_sections
 from sb3_actpc.experiments.report.figures import MEASURE_NAMES
-from sb3_actpc.experiments.report.page import Section, write_pages
+from sb3_actpc.experiments.report.page import UNDEFINED, Section, interval, mean_and_deviation, number, write_pages
 from sb3_actpc.experiments.report.r_stability import N_EPISODES, WINDOW
 from sb3_actpc.experiments.report.references import measure_of, paper_results, reference_score
 from sb3_actpc.experiments.report.results import Results, load_results, write_runs
-from sb3_actpc.experiments.report.statistics import Scores
-from sb3_actpc.experiments.report.tables import UNDEFINED, interval, mean_and_deviation, number
 
 REFRESH_ALONE = "refresh_alone"
 LAST, TRAINING, STABILITY, PAPER = "last evaluation", f"last {WINDOW} training episodes", "R-stability", "paper"
@@ -46,16 +41,12 @@ _NOTE = (
 
 
 def write_report(folder: Path) -> list[Path]:
-    """Write ``report.md``, ``report.html`` (one file, which opens without a network), ``results.csv`` and figures.
-
-    :param folder: of a comparison, or of an export
-    :raises FileNotFoundError: when there are no runs
-    """
+    """Write ``report.md``, ``report.html`` (one file, which opens without a network), ``results.csv`` and figures into the
+    folder of a comparison, or of an export; FileNotFoundError when there are no runs."""
     results = load_results(folder)
     tasks = list(results.finished["task"].unique())
     sections = [Section(f"Comparison {folder.name}", _overview(results.runs), level=1)]
-    for task in tasks:
-        sections.append(_task_section(results, task, folder))
+    sections += [_task_section(results, task, folder) for task in tasks]
     if tasks:
         sections.append(Section(text=_NOTE))
     sections += _aggregate_sections(results, folder)
@@ -63,7 +54,9 @@ def write_report(folder: Path) -> list[Path]:
         sections += ablation_sections(results, task, folder)
     for task in tasks:
         sections += _diagnostic_section(results, task, folder)
-    sections += _open_run_section(results.runs)
+    missing = results.runs.loc[results.runs["status"] != FINISHED, ["task", "variant", "seed", "status", "steps", "error"]]
+    if len(missing):
+        sections.append(Section("Runs that are not in the tables", table=missing.astype(str)))
     files = [*write_pages(sections, folder), write_runs(results, folder)]
     return [*files, *(folder / section.picture for section in sections if section.picture)]
 
@@ -71,7 +64,7 @@ def write_report(folder: Path) -> list[Path]:
 def _overview(runs: pd.DataFrame) -> str:
     counts = runs["status"].value_counts().sort_index()
     begun = runs[runs["version"] != ""]
-    commits = begun["commit"].where(begun["commit"] != "", "an installed package")
+    commits = begun["commit"].replace("", "an installed package")
     return (
         f"{len(runs)} runs: {', '.join(f'{count} {status}' for status, count in counts.items())}. Environment steps: "
         f"{', '.join(f'{count:,}' for count in sorted(begun['planned_steps'].unique())) or 'none'}. sb3_actpc "
@@ -79,9 +72,6 @@ def _overview(runs: pd.DataFrame) -> str:
         f"{', '.join(sorted(commits.unique())) or 'unknown'}; "
         f"{begun['dirty'].sum()} runs from a source tree with uncommitted changes."
     )
-
-
-# ------------------------------------------------------------------ a task
 
 
 def _task_section(results: Results, task: str, folder: Path) -> Section:
@@ -123,9 +113,8 @@ def task_table(results: Results, task: str) -> pd.DataFrame:
             row |= papers(by_algo[first["algorithm"]]) if first["algorithm"] in by_algo else {}
         rows.append(row)
     rows += _reference_rows(results, task)
-    rows += [
-        {("", "variant"): f"{row.algorithm} (paper only)", **papers(row)} for algo, row in by_algo.items() if algo not in shown
-    ]
+    only = [row for algo, row in by_algo.items() if algo not in shown]
+    rows += [{("", "variant"): f"{row.algorithm} (paper only)", **papers(row)} for row in only]
     table = pd.DataFrame(rows, columns=pd.MultiIndex.from_tuples(columns)).fillna("")
     return table.loc[:, (table != "").any()]
 
@@ -143,23 +132,17 @@ def _reference_rows(results: Results, task: str) -> list[dict[tuple[str, str], s
     return rows
 
 
-# ------------------------------------------------------------------ across tasks
-
-
 def _aggregate_sections(results: Results, folder: Path) -> list[Section]:
     """Statistics over all tasks with reference scores, of the variants that were run on each of them."""
     scored = results.finished.dropna(subset="normalized")
     tasks = list(scored["task"].unique())
     by_label = {label: dict(tuple(runs.groupby("task")["normalized"])) for label, runs in scored.groupby("label")}
-    whole = {
-        str(label): [parts[task].to_numpy() for task in tasks] for label, parts in by_label.items() if len(parts) == len(tasks)
-    }
+    on_all = {str(label): parts for label, parts in by_label.items() if len(parts) == len(tasks)}
+    whole = {label: [parts[task].to_numpy() for task in tasks] for label, parts in on_all.items()}
     if not whole:
         return []
-    means = {
-        name: (statistics.interquartile_mean(scores), statistics.interquartile_mean_interval(scores))
-        for name, scores in whole.items()
-    }
+    mean, mean_interval = statistics.interquartile_mean, statistics.interquartile_mean_interval
+    means = {name: (mean(scores), mean_interval(scores)) for name, scores in whole.items()}
     figures.draw_aggregates(means, whole, folder / "aggregates.png")
     left_out = sorted(set(map(str, by_label)) - set(whole))
     missing = f" Left out, because not run on every one: {', '.join(left_out)}." if left_out else ""
@@ -174,20 +157,14 @@ def _aggregate_sections(results: Results, folder: Path) -> list[Section]:
     ]
     table = pd.DataFrame(rows, columns=["variant", "runs", "interquartile mean", "95 % interval"])
     caption = "interquartile means and performance profiles"
-    return [Section("Across tasks", text, table, "aggregates.png", caption), *_improvement_section(whole)]
-
-
-def _improvement_section(scores: Mapping[str, Scores]) -> list[Section]:
-    rows = []
-    for name, other in combinations(scores, 2):
-        value = statistics.probability_of_improvement(scores[name], scores[other])
-        bounds = statistics.probability_of_improvement_interval(scores[name], scores[other])
-        rows.append((f"{name} over {other}", number(value, ".2f"), interval(bounds, ".2f")))
-    table = pd.DataFrame(rows, columns=["pair", "probability", "95 % interval"])
-    return [Section("Probability of improvement", table=table, level=3)] if rows else []
-
-
-# ------------------------------------------------------------------ inside the agent, and what is missing
+    pairs = []
+    for name, other in combinations(whole, 2):
+        value = statistics.probability_of_improvement(whole[name], whole[other])
+        bounds = statistics.probability_of_improvement_interval(whole[name], whole[other])
+        pairs.append((f"{name} over {other}", number(value, ".2f"), interval(bounds, ".2f")))
+    improvement = pd.DataFrame(pairs, columns=["pair", "probability", "95 % interval"])
+    sections = [Section("Across tasks", text, table, "aggregates.png", caption)]
+    return sections + ([Section("Probability of improvement", table=improvement, level=3)] if pairs else [])
 
 
 def _diagnostic_section(results: Results, task: str, folder: Path) -> list[Section]:
@@ -197,8 +174,3 @@ def _diagnostic_section(results: Results, task: str, folder: Path) -> list[Secti
         return []
     caption = f"{task}: signals, energies, action-values, self-imitation memory"
     return [Section(f"Inside ActPC: {task}", picture=picture, caption=caption)]
-
-
-def _open_run_section(runs: pd.DataFrame) -> list[Section]:
-    rows = runs.loc[runs["status"] != FINISHED, ["task", "variant", "seed", "status", "steps", "error"]]
-    return [] if rows.empty else [Section("Runs that are not in the tables", table=rows.astype(str))]

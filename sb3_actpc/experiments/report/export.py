@@ -1,7 +1,5 @@
 """A comparison in a few small files."""
 
-from __future__ import annotations
-
 import gzip
 import json
 from pathlib import Path
@@ -15,14 +13,10 @@ from sb3_actpc.utils.files import atomic_write
 
 
 def export(folder: Path, target: Path) -> list[Path]:
-    """Write what is worth keeping of a comparison into a few small files, from which tables and figures can be made again.
-
+    """Write what is worth keeping of a comparison into a few small files, from which tables and figures can be made again:
     ``results.csv`` has a row for each run, ``curves.csv.gz`` their evaluations, ``settings.json`` what the ids of settings
-    stand for, ``curves_TASK.png`` the figure of each task.
-
-    :raises FileNotFoundError: when there are no runs
-    :raises OSError: when a file cannot be written
-    """
+    stand for, ``curves_TASK.png`` the figure of each task. FileNotFoundError when there are no runs, OSError when a file
+    cannot be written."""
     results = load_results(folder)
     settings: dict[str, Any] = {}
     for path in sorted(folder.glob(f"*/*/seed[0-9]*_*/{CONFIG}")):

@@ -1,7 +1,5 @@
 """The figures of a report: curves with 95 % intervals, profiles, bars. Every legend stands beside the axes or below them."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -48,9 +46,8 @@ def time_curve(results: Results, runs: pd.Index, measure: str = "dense_return") 
     until the first seed ends.
     """
     rows = results.evaluations[results.evaluations["run"].isin(runs)]
-    seeds = [
-        ((one["seconds"] - one["evaluation_seconds"]).to_numpy(), one[measure].to_numpy()) for _, one in rows.groupby("run")
-    ]
+    rows = rows.assign(trained=rows["seconds"] - rows["evaluation_seconds"])
+    seeds = [one[["trained", measure]].to_numpy().T for _, one in rows.groupby("run")]
     grid = np.linspace(max(seconds[0] for seconds, _ in seeds), min(seconds[-1] for seconds, _ in seeds), N_POINTS)
     return grid, np.stack([np.interp(grid, *seed) for seed in seeds])
 
@@ -68,10 +65,7 @@ def draw_curves(results: Results, task: str, path: Path) -> None:
     groups, measure = results.groups(task), measure_of(task)
     lines = reference_lines(results, task)
     order = sorted(results.finished["label"].unique())  # a variant looks the same on every task
-    panels: list[tuple[Any, str, str]] = [
-        (step_curve, "environment steps", "evaluation"),
-        (time_curve, "seconds of training", "evaluation"),
-    ]
+    panels: list[Any] = [(step_curve, "environment steps", "evaluation"), (time_curve, "seconds of training", "evaluation")]
     if len(results.episodes):
         panels.insert(0, (episode_curve, "episodes", f"training, mean of {WINDOW} episodes"))
     figure = _figure(5.0 * len(panels), 4.2)
@@ -159,17 +153,16 @@ def draw_diagnostics(results: Results, groups: Mapping[str, pd.DataFrame], task:
                     axes.plot(*one.T, color=_look(index)["color"], linestyle=style, linewidth=1, label=label)
         axes.set(title=title, xlabel="environment steps", yscale="log" if title == "energies" else "linear")
         if len(columns) > 1:  # what the styles mean, under the panel; the colours are in the figure's legend
-            named = zip(_STYLES, columns, strict=False)
-            handles = [axes.plot([], [], color="gray", linestyle=style, label=_short(column))[0] for style, column in named]
+            words = [
+                one.removeprefix("train/").replace("_", " ").removesuffix(" energy").removesuffix(" signal") for one in columns
+            ]
+            named = zip(_STYLES, words, strict=False)
+            handles = [axes.plot([], [], color="gray", linestyle=style, label=label)[0] for style, label in named]
             axes.legend(handles=handles, fontsize="small", loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2)
     figure.suptitle(task)
     _legend(figure, groups)
     _save(figure, path)
     return True
-
-
-def _short(column: str) -> str:
-    return column.removeprefix("train/").replace("_", " ").removesuffix(" energy").removesuffix(" signal")
 
 
 def _figure(width: float, height: float) -> Any:

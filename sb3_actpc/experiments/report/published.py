@@ -22,8 +22,6 @@ runs from a source tree with uncommitted changes. The variants ``demonstrators``
 everywhere.
 """
 
-from __future__ import annotations
-
 import re
 from functools import cache
 from pathlib import Path
@@ -34,9 +32,9 @@ import pandas as pd
 import yaml
 
 from sb3_actpc.experiments.report.figures import reference_lines
+from sb3_actpc.experiments.report.page import UNDEFINED, markdown, number
 from sb3_actpc.experiments.report.references import measure_of, paper_results
 from sb3_actpc.experiments.report.results import load_results
-from sb3_actpc.experiments.report.tables import UNDEFINED, markdown, number
 from sb3_actpc.utils.files import atomic_write
 
 _MARKER = re.compile(r"(<!-- table: (\S+) (\S+) -->\n).*?(<!-- /table -->)", re.DOTALL)
@@ -55,11 +53,8 @@ def write_tables(path: Path) -> bool:
 
 
 def fill_tables(text: str, folder: Path) -> str:
-    """A Markdown text with its tables written anew; ``folder`` is its own.
-
-    :raises ValueError: when a marker is not closed, or says something unknown
-    :raises FileNotFoundError: when the YAML file or an export is missing
-    """
+    """A Markdown text with its tables written anew; ``folder`` is its own. ValueError when a marker is not closed, or says
+    something unknown, FileNotFoundError when the YAML file or an export is missing."""
     found = len(_MARKER.findall(text))
     if not found == text.count("<!-- table:") == text.count("<!-- /table -->"):
         raise ValueError(
@@ -110,14 +105,11 @@ def _table(spec: dict[str, Any], folder: Path) -> str:
 def _cell(spec: dict[str, Any], folder: Path) -> str:
     if unknown := sorted(set(spec) - _KEYS):
         raise ValueError(f"unknown {', '.join(unknown)}; known are {', '.join(sorted(_KEYS))}")
-    runs = _runs(folder / spec["from"])
-    for key in _CHOOSING:
-        if key not in spec:
-            continue
-        if spec[key] not in (known := runs[key].unique()):
+    runs = exported = _runs(folder / spec["from"])
+    for key in [key for key in _CHOOSING if key in spec]:
+        if spec[key] not in (known := exported[key].unique()):
             raise ValueError(f"no {key} {spec[key]!r} in {spec['from']}: there are {', '.join(sorted(map(str, known)))}")
-    for key in _CHOOSING:
-        runs = runs[runs[key] == spec[key]] if key in spec else runs
+        runs = runs[runs[key] == spec[key]]
     if runs.empty:
         return ""
     if runs["seed"].duplicated().any():

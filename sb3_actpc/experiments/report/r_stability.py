@@ -10,8 +10,6 @@ What follows from the formula, and is not mended here: it divides by the best re
 beside a best of -2 gives 3). A poor agent that is always equally poor gets a good value.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -22,10 +20,8 @@ N_EPISODES = 2 * WINDOW
 
 
 def r_stability(returns: np.ndarray) -> float:
-    """:param returns: (N,) dense or sparse returns, or successes, of all training episodes in order
-    :return: R-stability; NaN with fewer than 200 episodes, where one of the last 200 is NaN, and where the best of the last
-        100 is 0
-    """
+    """R-stability of the dense or sparse returns, or successes, of all training episodes in order, (N,); NaN with fewer than
+    200 episodes, where one of the last 200 is NaN, and where the best of the last 100 is 0."""
     last = np.asarray(returns[-N_EPISODES:], dtype=np.float64)
     if len(last) < N_EPISODES or last[WINDOW:].max() == 0:
         return math.nan

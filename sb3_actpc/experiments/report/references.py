@@ -3,8 +3,6 @@
 ``python benchmarks/reference_scores.py`` measures the latter two again.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -19,16 +17,12 @@ _SUCCESS_TABLE = "tab:robosuite_metrics"  # its scores are rates of success in p
 
 @dataclass(frozen=True)
 class ReferenceScore:
-    """Means with which a task's evaluations are normalised.
+    """Means with which a task's evaluations are normalised."""
 
-    :param random: of uniformly random actions
-    :param demonstrators: of the demonstrations that ship with the package
-    :param measure: what is meant, a column of ``progress.csv``: ``"dense_return"``, or ``"success_rate"`` where the paper
-        gives success (an episode that ends with it has the smaller dense return the sooner it succeeds)
-    """
-
-    random: float
-    demonstrators: float
+    random: float  # of uniformly random actions
+    demonstrators: float  # of the demonstrations that ship with the package
+    # what is meant, a column of ``progress.csv``: ``"dense_return"``, or ``"success_rate"`` where the paper gives success (an
+    # episode that ends with it has the smaller dense return the sooner it succeeds)
     measure: str = "dense_return"
 
     def normalize(self, values: Any) -> Any:

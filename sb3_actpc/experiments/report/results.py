@@ -1,10 +1,7 @@
 """What the runs of a comparison have measured, as tables: read from their folders, or from the small files of an export."""
 
-from __future__ import annotations
-
 import io
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -86,30 +83,21 @@ def load_results(folder: Path) -> Results:
     found = sorted({path.parent for name in (CONFIG, ERROR) for path in folder.glob(f"*/*/seed[0-9]*_*/{name}")})
     if not found:
         raise FileNotFoundError(f"no runs in {folder}: make some with sb3-actpc compare --output {folder}")
-    rows = []
-    tables: dict[str, list[pd.DataFrame]] = {PROGRESS: [], EPISODES: [], DIAGNOSTICS: []}
-    for path in found:
-        name = path.relative_to(folder).as_posix()
-        own = {file: read_rows(path / file) for file in tables}
-        rows.append({"run": name, **_run_row(path, own[PROGRESS], own[EPISODES])})
-        for file, table in own.items():
-            tables[file].append(table.assign(run=name))
+    names = [path.relative_to(folder).as_posix() for path in found]
+    files = [[read_rows(path / file) for path in found] for file in (PROGRESS, EPISODES, DIAGNOSTICS)]
+    runs = pd.DataFrame([_run_row(*row) for row in zip(found, *files[:2], strict=True)], index=pd.Index(names, name="run"))
+    named = [[table.assign(run=name) for name, table in zip(names, tables, strict=True)] for tables in files]
     evaluations, episodes, diagnostics = (
-        pd.concat([part for part in parts if len(part)] or [_NO_ROWS], ignore_index=True) for parts in tables.values()
+        pd.concat([part for part in parts if len(part)] or [_NO_ROWS], ignore_index=True) for parts in named
     )
-    return Results(_labelled(pd.DataFrame(rows).set_index("run")), evaluations, episodes, diagnostics)
+    return Results(_labelled(runs), evaluations, episodes, diagnostics)
 
 
 def run_measures(task: str, evaluations: pd.DataFrame, episodes: pd.DataFrame) -> dict[str, float]:
-    """What one run has reached; NaN where it is undefined.
-
-    :param task: Gymnasium id
-    :param evaluations: rows of its ``progress.csv``
-    :param episodes: rows of its ``episodes.csv``
-    :return: of dense return, sparse return and success rate: the last evaluation's, the worst from 5,000 steps on, the mean of
-        the evaluations in the last half of the steps, the mean of the last 100 training episodes and their R-stability; the
-        measure by which the task is compared, 0 for random actions and 1 for the demonstrators; and what it took
-    """
+    """What one run on a task has reached, from the rows of its ``progress.csv`` and ``episodes.csv``; NaN where it is
+    undefined. Of dense return, sparse return and success rate: the last evaluation's, the worst from 5,000 steps on, the mean
+    of the evaluations in the last half of the steps, the mean of the last 100 training episodes and their R-stability; the
+    measure by which the task is compared, 0 for random actions and 1 for the demonstrators; and what it took."""
     values: dict[str, float] = {}
     steps = evaluations.get("timesteps", pd.Series(dtype=float))
     end = float(steps.max()) if len(steps) else 0.0
@@ -138,6 +126,7 @@ def _run_row(folder: Path, evaluations: pd.DataFrame, episodes: pd.DataFrame) ->
         config, error = {}, read_error(folder) or str(problem)
     task, variant = folder.parent.parent.name, folder.parent.name
     steps = evaluations["timesteps"].iloc[-1] if len(evaluations) else 0
+    versions = dict(config.get("versions", {}))
     return {
         "task": task,
         "variant": variant,
@@ -151,18 +140,11 @@ def _run_row(folder: Path, evaluations: pd.DataFrame, episodes: pd.DataFrame) ->
         "episodes": len(episodes),
         **run_measures(task, evaluations, episodes),
         "demonstrators_return": np.nan if config.get("demonstrators_return") is None else config["demonstrators_return"],
-        **_provenance(config),
-        "error": error,
-    }
-
-
-def _provenance(config: Mapping[str, Any]) -> dict[str, Any]:
-    versions = dict(config.get("versions", {}))
-    return {
         "version": versions.pop("sb3-actpc", ""),
         "versions": ", ".join(f"{name} {version}" for name, version in versions.items()),
         "commit": (config.get("git_commit") or "")[:10],
         "dirty": bool(config.get("dirty")),
+        "error": error,
     }
 
 

@@ -5,8 +5,6 @@ Intervals are percentile bootstraps, stratified: every task's runs are resampled
 does it for several samples, which however refuses a task with a single run). All are seeded.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 

@@ -1,7 +1,5 @@
 """The algorithms by name, and what their constructors take."""
 
-from __future__ import annotations
-
 import importlib
 from collections.abc import Mapping
 from typing import Any
@@ -51,10 +49,7 @@ def load_algorithm(name: str) -> type[BaseAlgorithm]:
 
 
 def check_keywords(algorithm: type[BaseAlgorithm], settings: Mapping[str, Any]) -> None:
-    """Check that a class takes these settings.
-
-    :raises ValueError: naming the first one that it does not take, or that has an option of its own
-    """
+    """ValueError for the first of the settings that a class does not take, or that has an option of its own."""
     known = constructor_keywords(algorithm)
     for name in settings:
         if name in _OPTION_OF:

@@ -1,7 +1,5 @@
 """The environments of a run: one way to make them, whatever the algorithm."""
 
-from __future__ import annotations
-
 import contextlib
 import importlib
 import io

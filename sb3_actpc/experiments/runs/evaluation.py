@@ -1,8 +1,5 @@
 """Playing whole episodes with a trained policy, and doing so every so often while it is trained."""
 
-from __future__ import annotations
-
-import csv
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -14,8 +11,8 @@ from typing import Any, Protocol, cast
 import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.callbacks import BaseCallback
 
+from sb3_actpc.experiments.runs.episode_log import CsvCallback
 from sb3_actpc.utils.files import atomic_write
 
 UNTRAINED_EPISODES = 5
@@ -44,28 +41,23 @@ class Predictor(Protocol):
 
 
 class NormalizedPredictor:
-    """A policy that learned from the observations of SB3's ``VecNormalize``, for those of the bare environment.
-
-    :param model: the policy
-    :param normalize: normalises n observations, (n, obs_dim)
-    """
+    """A policy that learned from the observations of SB3's ``VecNormalize``, for those of the bare environment: ``normalize``
+    is a function of n of them, (n, obs_dim)."""
 
     FILE = "normalization.npz"  # in a run's folder
 
     def __init__(self, model: Predictor, normalize: Callable[[np.ndarray], np.ndarray]) -> None:
         self.model, self.normalize = model, normalize
 
-    def predict(
-        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = False
-    ) -> tuple[Any, Any]:
+    def predict(self, observation: Any, *further: Any, **options: Any) -> tuple[Any, Any]:
         """See :class:`Predictor`."""
-        return self.model.predict(self.normalize(observation), state, episode_start, deterministic)
+        return self.model.predict(self.normalize(observation), *further, **options)
 
     @classmethod
     def wrap(cls, model: BaseAlgorithm) -> Predictor:
         """The agent itself, or with the present statistics of its environment where that normalises observations."""
         wrapper = model.get_vec_normalize_env()
-        return model if wrapper is None or not wrapper.norm_obs else cls(model, wrapper.normalize_obs)  # type: ignore[arg-type]
+        return cls(model, wrapper.normalize_obs) if wrapper is not None and wrapper.norm_obs else model  # type: ignore[arg-type]
 
     @classmethod
     def save(cls, model: BaseAlgorithm, folder: Path) -> None:
@@ -90,20 +82,13 @@ class NormalizedPredictor:
 
 @dataclass(frozen=True)
 class EpisodeStatistics:
-    """What happened in n episodes; each array is (n,) float64.
+    """What happened in n episodes; each array is (n,) float64."""
 
-    :param dense_returns: sums of ``info["dense_reward"]`` (of the reward, where the environment does not report it)
-    :param sparse_returns: sums of the reward
-    :param successes: 1 where ``info["is_success"]`` was true at the end, NaN where the environment does not report it
-    :param lengths: steps
-    :param stages: ``info["stage"]`` at the end of each, "" where the environment does not report it
-    """
-
-    dense_returns: np.ndarray
-    sparse_returns: np.ndarray
-    successes: np.ndarray
-    lengths: np.ndarray
-    stages: tuple[str, ...]
+    dense_returns: np.ndarray  # sums of ``info["dense_reward"]`` (of the reward, where the environment does not report it)
+    sparse_returns: np.ndarray  # sums of the reward
+    successes: np.ndarray  # 1 where ``info["is_success"]`` was true at the end, NaN where the environment does not report it
+    lengths: np.ndarray  # steps
+    stages: list[str]  # ``info["stage"]`` at the end of each, "" where the environment does not report it
 
     def summary(self) -> dict[str, float | None]:
         """Means and standard deviations over the episodes; ``success_rate`` is None where it is not reported."""
@@ -124,49 +109,38 @@ class EpisodeStatistics:
 
 
 def play_episodes(model: Predictor, envs: Sequence[gym.Env[Any, Any]], n_episodes: int, seed: int) -> EpisodeStatistics:
-    """Play whole episodes with the deterministic policy, carrying its recurrent state.
-
-    Episode i starts from ``reset(seed=seed + i)``, so that two calls with one seed start from the same states. The
-    environments are stepped side by side, each playing at most one episode at a time, so that the policy is asked once
-    for all of them and short episodes are not counted more often than long ones.
-
-    :param envs: at least one environment; as many episodes are played at a time
-    :return: returns, successes and lengths, in the order of the seeds
-    :raises ValueError: when ``n_episodes`` is less than 1 or there is no environment
-    """
+    """Play whole episodes with the deterministic policy, carrying its recurrent state; their numbers are in the order of the
+    seeds. Episode i starts from ``reset(seed=seed + i)``, so that two calls with one seed start from the same states. The
+    environments, at least one, are stepped side by side, each playing at most one episode at a time, so that the policy is
+    asked once for all of them and short episodes are not counted more often than long ones. ValueError for less than one
+    episode or environment."""
     if n_episodes < 1 or not envs:
         raise ValueError(f"expected at least one episode and one environment, found {n_episodes} and {len(envs)}")
-    rows: list[list[float]] = []
-    stages: list[str] = []
+    dense_returns, sparse_returns, successes, lengths = np.zeros((4, n_episodes))
+    played = EpisodeStatistics(dense_returns, sparse_returns, successes, lengths, [""] * n_episodes)
     for first in range(0, n_episodes, len(envs)):
-        n_playing = min(len(envs), n_episodes - first)
-        more_rows, more_stages = _play_side_by_side(model, envs[:n_playing], seed + first)
-        rows += more_rows
-        stages += more_stages
-    dense_returns, sparse_returns, successes, lengths = np.array(rows, dtype=np.float64).T
-    return EpisodeStatistics(dense_returns, sparse_returns, successes, lengths, tuple(stages))
+        _play_side_by_side(model, envs[: n_episodes - first], seed, first, played)
+    return played
 
 
-def _play_side_by_side(model: Predictor, envs: Sequence[gym.Env[Any, Any]], seed: int) -> tuple[list[list[float]], list[str]]:
-    """One episode in each environment: [dense return, sparse return, success, length] and the last stage of each."""
-    observations = [env.reset(seed=seed + i)[0] for i, env in enumerate(envs)]
-    rows = [[0.0, 0.0, float("nan"), 0.0] for _ in envs]
-    stages = ["" for _ in envs]
-    playing = np.ones(len(envs), dtype=bool)
-    episode_start = np.ones(len(envs), dtype=bool)
+def _play_side_by_side(
+    model: Predictor, envs: Sequence[gym.Env[Any, Any]], seed: int, first: int, played: EpisodeStatistics
+) -> None:
+    """Episodes ``first``, ``first + 1``, ..., one in each environment, noted in what has been ``played``."""
+    observations = [env.reset(seed=seed + first + i)[0] for i, env in enumerate(envs)]
+    playing, episode_start = np.ones((2, len(envs)), dtype=bool)
     state = None
     while playing.any():
         actions, state = model.predict(stacked(observations), state=state, episode_start=episode_start, deterministic=True)
         episode_start = np.zeros(len(envs), dtype=bool)
         for i in np.flatnonzero(playing):
             observations[i], reward, terminated, truncated, info = envs[i].step(actions[i])
-            rows[i][0] += float(info.get("dense_reward", reward))
-            rows[i][1] += float(reward)
-            rows[i][2] = float(info.get("is_success", np.nan))
-            rows[i][3] += 1
-            stages[i] = info.get("stage", "")
+            played.dense_returns[first + i] += float(info.get("dense_reward", reward))
+            played.sparse_returns[first + i] += float(reward)
+            played.successes[first + i] = info.get("is_success", np.nan)
+            played.lengths[first + i] += 1
+            played.stages[first + i] = info.get("stage", "")
             playing[i] = not (terminated or truncated)
-    return rows, stages
 
 
 def stacked(observations: Sequence[Any]) -> Any:
@@ -176,7 +150,7 @@ def stacked(observations: Sequence[Any]) -> Any:
     return np.stack(observations)
 
 
-class EvaluationCallback(BaseCallback):
+class EvaluationCallback(CsvCallback):
     """Evaluates the untrained agent (:meth:`begin`; offline methods excepted), then every ``eval_freq`` steps, and at the end.
 
     Each evaluation starts its episodes from the same seeds, appends a row to ``progress.csv`` and saves
@@ -191,6 +165,9 @@ class EvaluationCallback(BaseCallback):
     :param target_return: end the training at the first evaluation whose mean dense return reaches it; None for never
     """
 
+    columns = PROGRESS_COLUMNS
+    kept = ("evaluation_seconds", "best_return", "last_summary", "last_timesteps")
+
     def __init__(
         self,
         envs: Sequence[gym.Env[Any, Any]],
@@ -202,19 +179,14 @@ class EvaluationCallback(BaseCallback):
         keeps_best: bool = False,
         target_return: float | None = None,
     ) -> None:
-        super().__init__()
-        self.keeps_best = keeps_best
+        super().__init__(folder / PROGRESS)
+        self.envs, self.folder, self.seed, self.report = envs, folder, seed, report
+        self.eval_freq, self.eval_episodes, self.keeps_best = eval_freq, eval_episodes, keeps_best
         self.target_return = np.inf if target_return is None else target_return
         self.best_return = -np.inf
-        self.envs = envs
-        self.folder = folder
-        self.eval_freq = eval_freq
-        self.eval_episodes = eval_episodes
-        self.seed = seed
-        self.report = report
         self.evaluation_seconds = 0.0
         self.last_summary: dict[str, float | None] = {}
-        self._last_timesteps = -1
+        self.last_timesteps = -1
         self._started = time.perf_counter()
 
     def begin(self, model: BaseAlgorithm) -> None:
@@ -223,10 +195,9 @@ class EvaluationCallback(BaseCallback):
         and an offline method's, which has seen nothing, none."""
         self.model = model
         self._started = time.perf_counter()
-        with atomic_write(self.folder / PROGRESS, "w") as file:
-            csv.writer(file, lineterminator="\n").writerow(PROGRESS_COLUMNS)
+        self.begin_file()
         if getattr(model, "is_offline", False):
-            self._last_timesteps = 0
+            self.last_timesteps = 0
         else:
             self._evaluate(min(self.eval_episodes, UNTRAINED_EPISODES))
 
@@ -237,34 +208,22 @@ class EvaluationCallback(BaseCallback):
 
     def checkpoint_state(self) -> dict[str, Any]:
         """What a checkpoint keeps: timers, the last evaluation and the rows written so far."""
-        return {
-            "wall_seconds": self.wall_seconds,
-            "evaluation_seconds": self.evaluation_seconds,
-            "best_return": self.best_return,
-            "last_summary": self.last_summary,
-            "last_timesteps": self._last_timesteps,
-            "rows": (self.folder / PROGRESS).read_text(encoding="utf-8"),
-        }
+        return {**super().checkpoint_state(), "wall_seconds": self.wall_seconds}
 
     def restore_checkpoint_state(self, state: dict[str, Any]) -> None:
-        """Go on where the checkpoint was taken; rows written after it are dropped, they will be written again."""
+        """Go on where the checkpoint was taken, with its timers."""
+        super().restore_checkpoint_state(state)
         self._started = time.perf_counter() - state["wall_seconds"]
-        self.evaluation_seconds = state["evaluation_seconds"]
-        self.best_return = state["best_return"]
-        self.last_summary = state["last_summary"]
-        self._last_timesteps = state["last_timesteps"]
-        with atomic_write(self.folder / PROGRESS, "w") as file:
-            file.write(state["rows"])
 
     def _on_step(self) -> bool:
         # at the last step, the update that belongs to it is still to come
         is_last = self.num_timesteps >= self.model._total_timesteps
-        if not is_last and self.num_timesteps - self._last_timesteps >= self.eval_freq:
+        if not is_last and self.num_timesteps - self.last_timesteps >= self.eval_freq:
             self._evaluate()
         return self.best_return < self.target_return
 
     def _on_training_end(self) -> None:
-        if self._last_timesteps != self.num_timesteps:
+        if self.last_timesteps != self.num_timesteps:
             self._evaluate()
 
     def _evaluate(self, n_episodes: int | None = None) -> None:
@@ -272,10 +231,15 @@ class EvaluationCallback(BaseCallback):
         n_episodes = self.eval_episodes if n_episodes is None else n_episodes
         statistics = play_episodes(NormalizedPredictor.wrap(self.model), self.envs, n_episodes, self.seed)
         self.last_summary = statistics.summary()
-        self._keep_model(float(statistics.dense_returns.mean()))
+        dense_return = float(statistics.dense_returns.mean())
+        if not self.keeps_best or dense_return >= self.best_return:
+            NormalizedPredictor.save(self.model, self.folder)
+            with atomic_write(self.folder / "model.zip") as file:
+                self.model.save(cast(BufferedIOBase, file))
+        self.best_return = max(self.best_return, dense_return)
         now = time.perf_counter()
         self.evaluation_seconds += now - started
-        self._last_timesteps = self.num_timesteps
+        self.last_timesteps = self.num_timesteps
         row: dict[str, Any] = {
             **self.last_summary,
             "timesteps": self.num_timesteps,
@@ -283,26 +247,14 @@ class EvaluationCallback(BaseCallback):
             "seconds": round(self.wall_seconds, 2),
             "evaluation_seconds": round(self.evaluation_seconds, 2),
         }
-        with open(self.folder / PROGRESS, "a", newline="", encoding="utf-8") as file:
-            csv.DictWriter(file, PROGRESS_COLUMNS, lineterminator="\n").writerow(row)
+        self.append(row)
         for name in ("dense_return", "sparse_return", "success_rate"):
             if self.last_summary[name] is not None:
                 self.logger.record(f"eval/{name}", self.last_summary[name])
         self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
         self.logger.dump(self.num_timesteps)  # a row of the agent's own figures beside each evaluation
-        self.report(_evaluation_line(self.num_timesteps, self.last_summary))
-
-    def _keep_model(self, dense_return: float) -> None:
-        if not self.keeps_best or dense_return >= self.best_return:
-            NormalizedPredictor.save(self.model, self.folder)
-            with atomic_write(self.folder / "model.zip") as file:
-                self.model.save(cast(BufferedIOBase, file))
-        self.best_return = max(self.best_return, dense_return)
-
-
-def _evaluation_line(timesteps: int, summary: dict[str, float | None]) -> str:
-    success = summary["success_rate"]
-    return (
-        f"step {timesteps:>8}  dense return {summary['dense_return']:9.1f} ± {summary['dense_return_std']:<7.1f} "
-        f"sparse return {summary['sparse_return']:7.1f}  success {'n/a' if success is None else f'{success:.2f}'}"
-    )
+        summary, success = self.last_summary, self.last_summary["success_rate"]
+        self.report(
+            f"step {self.num_timesteps:>8}  dense return {summary['dense_return']:9.1f} ± {summary['dense_return_std']:<7.1f} "
+            f"sparse return {summary['sparse_return']:7.1f}  success {'n/a' if success is None else f'{success:.2f}'}"
+        )

@@ -1,7 +1,5 @@
 """Files of settings, and what they make of a run: everything that is not said comes from the preset."""
 
-from __future__ import annotations
-
 import copy
 import re
 from collections.abc import Iterable, Mapping
@@ -52,14 +50,9 @@ def read_yaml(text: str | bytes, source: str) -> Any:
 
 
 def load_preset(preset: str, env_id: str) -> dict[str, Any]:
-    """Settings of one environment in a preset file: its own entry, else ``default`` (never both).
-
-    :param preset: name of a file of ``hyperparams/`` without suffix, or a path ending in ``.yml`` or ``.yaml``
-    :param env_id: Gymnasium id
-    :return: a new dictionary of plain values
-    :raises FileNotFoundError: when there is no such preset
-    :raises ValueError: when the file is not a YAML mapping, or has neither entry
-    """
+    """Settings of one environment in a preset file (a name in ``hyperparams/``, or a path ending in ``.yml`` or ``.yaml``), a
+    new dictionary of plain values: its own entry, else ``default`` (never both). FileNotFoundError when there is no such
+    preset, ValueError when the file is not a YAML mapping, or has neither entry."""
     path = preset_path(preset)
     entries = read_yaml(path.read_bytes(), str(path))
     if not isinstance(entries, Mapping):
@@ -71,14 +64,10 @@ def load_preset(preset: str, env_id: str) -> dict[str, Any]:
 
 
 def resolve(run: Run) -> Run:
-    """Read the preset, put what the user said in its place, find the demonstrations, and check it all.
-
-    :param run: the user's choices, or a run that is filled in already
-    :return: the run with everything filled in
-    :raises FileNotFoundError: when the preset or the demonstrations file does not exist
-    :raises ValueError: when a setting is unknown or has a wrong value, or a sparse task has no demonstrations
-    :raises ImportError: when the algorithm is of another package that is not installed
-    """
+    """Read the preset, put what the user said in its place, find the demonstrations, and check it all: the run with everything
+    filled in; one that is already is returned as it is. FileNotFoundError when the preset or the demonstrations file does not
+    exist, ValueError when a setting is unknown or has a wrong value, or a sparse task has no demonstrations, ImportError when
+    the algorithm is of another package that is not installed."""
     if run.is_resolved:
         return run
     if not run.env:
@@ -203,14 +192,9 @@ def with_changes(settings: Mapping[str, Any], changes: Mapping[str, Any]) -> dic
 
 
 def find_demonstrations(env_id: str, choice: str) -> Path | str | None:
-    """The demonstrations of a run.
-
-    :param env_id: Gymnasium id of the task
-    :param choice: ``"shipped"`` (for a task whose name begins with ``Sparse``, or its goal version), ``"weak"`` (a weaker
-        demonstrator's), ``"none"``, a path, or the id of a Minari dataset
-    :return: the file, the id, or None for none
-    :raises FileNotFoundError: when the path does not exist, or a sparse task has no shipped file
-    """
+    """The demonstrations of a run, a file or the id of a Minari dataset, None for none: ``"shipped"`` (for a task whose name
+    begins with ``Sparse``, or its goal version), ``"weak"`` (a weaker demonstrator's), ``"none"``, a path, or such an id.
+    FileNotFoundError when the path does not exist, or a sparse task has no shipped file."""
     if choice == "none":
         return None
     if choice == "weak":

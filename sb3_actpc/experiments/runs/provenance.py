@@ -1,7 +1,5 @@
 """Where the numbers of a run come from: versions of the packages, and the commit of a source checkout."""
 
-from __future__ import annotations
-
 import hashlib
 import platform
 import subprocess

@@ -1,14 +1,11 @@
 """The two JSON files of a run folder: ``config.json``, the run itself, and ``result.json``, written last."""
 
-from __future__ import annotations
-
 import csv
 import json
 from pathlib import Path
 from typing import Any
 
 from sb3_actpc.experiments.runs.evaluation import PROGRESS
-from sb3_actpc.experiments.runs.presets import demonstrations_hash
 from sb3_actpc.experiments.runs.schema import VERSION, Run
 from sb3_actpc.utils.files import atomic_write
 
@@ -23,11 +20,8 @@ def write_config(run: Run) -> None:
 
 
 def read_config(folder: Path) -> dict[str, Any]:
-    """The content of ``config.json``, of whatever version.
-
-    :raises FileNotFoundError: when there is none
-    :raises ValueError: when it is not JSON or lacks what identifies a run
-    """
+    """The content of ``config.json``, of whatever version; FileNotFoundError when there is none, ValueError when it is not
+    JSON or lacks what identifies a run."""
     if not (folder / CONFIG).is_file():
         raise FileNotFoundError(f"no run in {folder}: {CONFIG} is missing")
     record, needed = _read_json(folder / CONFIG), {"env", "env_kwargs", "algo", "seed"}
@@ -37,11 +31,8 @@ def read_config(folder: Path) -> dict[str, Any]:
 
 
 def read_run(folder: Path) -> Run:
-    """The run in a folder.
-
-    :raises FileNotFoundError: when there is no ``config.json``
-    :raises ValueError: when it is damaged, or of another version
-    """
+    """The run in a folder; FileNotFoundError when there is no ``config.json``, ValueError when it is damaged, or of another
+    version."""
     record = read_config(folder)
     version = record.pop("schema", 1)
     if version != VERSION:
@@ -53,15 +44,6 @@ def read_run(folder: Path) -> Run:
         return Run(**record, output=str(folder))
     except ValueError as error:
         raise ValueError(f"{folder / CONFIG}: {error}") from error
-
-
-def check_demonstrations(run: Run) -> None:
-    """Check that the demonstrations of a run that goes on are those that it began with."""
-    if demonstrations_hash(run) != run.demonstrations_sha256:
-        raise ValueError(
-            f"{run.folder}: the demonstrations ({run.demonstrations}) are not those that the run began with: put them back, "
-            "or start the run again in another folder"
-        )
 
 
 def write_result(folder: Path) -> dict[str, Any]:
@@ -98,11 +80,7 @@ def write_result(folder: Path) -> dict[str, Any]:
 
 
 def read_result(folder: Path) -> dict[str, Any]:
-    """The content of ``result.json``.
-
-    :raises FileNotFoundError: when there is none: the run is not finished
-    :raises ValueError: when it is damaged
-    """
+    """The content of ``result.json``; FileNotFoundError when the run is not finished, ValueError when the file is damaged."""
     if not (folder / RESULT).is_file():
         raise FileNotFoundError(f"no result in {folder}: the run is not finished")
     result = _read_json(folder / RESULT)

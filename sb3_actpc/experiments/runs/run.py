@@ -1,7 +1,5 @@
 """One training run and its folder, and the replay of a finished one."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Sequence
 from contextlib import ExitStack
@@ -18,12 +16,17 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_actpc.checkpoints import CheckpointCallback, DamagedCheckpoint, list_bundles, restore, why_no_checkpoints
 from sb3_actpc.demonstrations import resolve as resolve_demonstrations
 from sb3_actpc.demonstrations.recording import Report, silent
-from sb3_actpc.experiments.runs import record
 from sb3_actpc.experiments.runs.algorithms import load_algorithm
 from sb3_actpc.experiments.runs.environments import check_env_id, make_eval_envs, make_train_env
 from sb3_actpc.experiments.runs.episode_log import EpisodeLog
 from sb3_actpc.experiments.runs.evaluation import PROGRESS, EvaluationCallback, NormalizedPredictor, Predictor, play_episodes
-from sb3_actpc.experiments.runs.presets import agent_keywords, find_demonstrations, fitting_policy, resolve
+from sb3_actpc.experiments.runs.presets import (
+    agent_keywords,
+    demonstrations_hash,
+    find_demonstrations,
+    fitting_policy,
+    resolve,
+)
 from sb3_actpc.experiments.runs.provenance import git_state, package_versions
 from sb3_actpc.experiments.runs.record import CONFIG, RESULT, read_result, read_run, write_config, write_result
 from sb3_actpc.experiments.runs.schema import Run, content_id
@@ -58,14 +61,10 @@ def train_run(run: Run, report: Report = silent, callbacks: Sequence[BaseCallbac
 def resume_run(
     folder: Path, report: Report = silent, progress: bool = True, callbacks: Sequence[BaseCallback] = (), more_steps: int = 0
 ) -> dict[str, Any]:
-    """Go on with a run from its newest whole checkpoint, with the settings in its ``config.json``.
-
-    :param report: given a line of text when the run goes on, after each evaluation and for each damaged checkpoint
-    :param more_steps: added to those that the run was to have; a finished run needs some
-    :return: as :func:`train_run`
-    :raises FileNotFoundError: when the folder is not that of a run
-    :raises ValueError: when the run is finished and gets no more steps, or its checkpoints do not fit or are all damaged
-    """
+    """Go on with a run from its newest whole checkpoint, with the settings in its ``config.json``, for the steps that it was
+    to have and ``more_steps``, of which a finished run needs some. ``report`` is given a line of text when the run goes on,
+    after each evaluation and for each damaged checkpoint; see :func:`train_run`. FileNotFoundError when the folder is not that
+    of a run, ValueError when the run is finished and gets no more steps, or its checkpoints do not fit or are all damaged."""
     run = read_run(folder).model_copy(update={"progress": progress})
     without = why_no_checkpoints(load_algorithm(run.algo))
     if without:
@@ -80,7 +79,11 @@ def resume_run(
             f"the run in {folder} is finished and kept no checkpoint to go on from: train another with more --steps"
         )
     check_env_id(run.env, run.gym_packages)
-    record.check_demonstrations(run)
+    if demonstrations_hash(run) != run.demonstrations_sha256:
+        raise ValueError(
+            f"{folder}: the demonstrations ({run.demonstrations}) are not those that the run began with: put them back, "
+            "or start the run again in another folder"
+        )
     if more_steps:
         run = run.model_copy(update={"n_timesteps": (run.n_timesteps or 0) + more_steps})
         write_config(run)
@@ -89,15 +92,19 @@ def resume_run(
 
 
 def finish_run(run: Run, report: Report = silent, callbacks: Sequence[BaseCallback] = ()) -> dict[str, Any]:
-    """Bring a run to its end, whatever has become of it: begun now, gone on with from its newest whole checkpoint, given more
-    steps when it ended with fewer, or left alone when it is done.
-
-    :param run: with its folder (``output``); for the rest see :func:`train_run`
-    :raises ValueError: when the folder holds another run, or for a wrong setting
-    """
+    """Bring a run with its folder (``output``) to its end, whatever has become of it: begun now, gone on with from its newest
+    whole checkpoint, given more steps when it ended with fewer, or left alone when it is done. See :func:`train_run`;
+    ValueError also when the folder holds another run."""
     check_env_id(run.env, run.gym_packages)
     run, folder = resolve(run), run.folder
-    stored = _stored_run(folder, report)
+    stored = None
+    try:
+        stored = read_run(folder)
+    except FileNotFoundError:
+        pass
+    except ValueError as error:
+        report(f"{error}: the run starts again")
+        (folder / CONFIG).unlink()
     if stored is not None and _content(stored) != _content(run):
         raise ValueError(f"{folder} holds another run, of other settings: choose another folder")
     if stored is not None and (folder / RESULT).is_file():
@@ -113,17 +120,6 @@ def finish_run(run: Run, report: Report = silent, callbacks: Sequence[BaseCallba
             report(f"{error}: the run starts again")
     shutil.rmtree(folder / CHECKPOINTS, ignore_errors=True)
     return train_run(run, report, callbacks)
-
-
-def _stored_run(folder: Path, report: Report) -> Run | None:
-    try:
-        return read_run(folder)
-    except FileNotFoundError:
-        return None
-    except ValueError as error:
-        report(f"{error}: the run starts again")
-        (folder / CONFIG).unlink()
-        return None
 
 
 def _content(run: Run) -> str:
@@ -153,12 +149,14 @@ def _train(
 ) -> dict[str, Any]:
     folder, checkpoints = run.folder, run.folder / CHECKPOINTS
     goes_on = resumes and bool(list_bundles(checkpoints))
-    restored = None
-    if goes_on:  # before any file of the run is touched
-        restored = restore(model, checkpoints, report)
+    restored = restore(model, checkpoints, report) if goes_on else None  # before any file of the run is touched
     folder.mkdir(parents=True, exist_ok=True)
     if not resumes:
-        run = _begun(run, model)
+        commit, dirty = git_state()
+        policy = fitting_policy(run.policy or "MlpPolicy", model.observation_space)
+        reference = demonstrators_return(find_demonstrations(run.env, run.demonstrations))
+        filled = {"policy": policy, "demonstrators_return": reference, "versions": package_versions()}
+        run = run.model_copy(update={**filled, "git_commit": commit, "dirty": dirty})
         write_config(run)
     model.set_logger(_logger(model, folder))
     seed = run.seed + EVALUATION_SEED_OFFSET
@@ -169,7 +167,7 @@ def _train(
     since = f" from step {model.num_timesteps}" if goes_on else ""
     report(f"{run.env}: {run.algo}, {run.n_timesteps} steps{since}, into {folder}")
     if not goes_on:
-        episodes.begin()
+        episodes.begin_file()
         evaluation.begin(model)
     saver = None
     if run.checkpoint_freq:
@@ -179,15 +177,6 @@ def _train(
     plot_learning_curve(folder / PROGRESS, folder / "learning_curve.png", f"{run.env}, {run.algo}", run.demonstrators_return)
     _keep_last_checkpoint(saver, run.continuable, report)
     return write_result(folder)
-
-
-def _begun(run: Run, model: BaseAlgorithm) -> Run:
-    """With what is known once the agent has been made."""
-    commit, dirty = git_state()
-    policy = fitting_policy(run.policy or "MlpPolicy", model.observation_space)
-    reference = demonstrators_return(find_demonstrations(run.env, run.demonstrations))
-    filled = {"policy": policy, "demonstrators_return": reference, "versions": package_versions()}
-    return run.model_copy(update={**filled, "git_commit": commit, "dirty": dirty})
 
 
 def _logger(model: BaseAlgorithm, folder: Path) -> Logger:
@@ -242,13 +231,9 @@ def evaluate_run(folder: Path, n_episodes: int = 10, seed: int = 0) -> dict[str,
 
 
 def load_run(folder: Path) -> tuple[Run, Predictor]:
-    """A run and its model. The model is unpickled: open only runs that you trust.
-
-    :return: the run, and the model on the CPU, with its normalisation of observations where it has one
-    :raises FileNotFoundError: when the folder, ``config.json`` or ``model.zip`` does not exist
-    :raises ValueError: when one of the two cannot be read
-    :raises gymnasium.error.Error: when its environment is unknown
-    """
+    """A run and its model, on the CPU, with its normalisation of observations where it has one. The model is unpickled: open
+    only runs that you trust. FileNotFoundError when the folder, ``config.json`` or ``model.zip`` does not exist, ValueError
+    when one of the two cannot be read, gymnasium.error.Error when its environment is unknown."""
     run = read_run(folder)
     if not (folder / "model.zip").is_file():
         raise FileNotFoundError(f"no run in {folder}: model.zip is missing")
@@ -259,10 +244,7 @@ def load_run(folder: Path) -> tuple[Run, Predictor]:
 
 def run_folder(run: Run) -> Path:
     """``run.output``, or ``runs/<env>/<algo>_<preset>_seed<seed>`` with ``_2``, ``_3``, … when it holds a result or
-    checkpoints.
-
-    :raises ValueError: when ``run.output`` holds a finished run, or one that can be resumed
-    """
+    checkpoints. ValueError when ``run.output`` holds a finished run, or one that can be resumed."""
     if run.output is not None:
         if (run.folder / RESULT).exists():
             raise ValueError(f"{run.output} already holds a finished run: choose another folder")
@@ -301,14 +283,12 @@ def close_model(model: Any) -> None:
 
 def _learn(model: BaseAlgorithm, n_timesteps: int, callbacks: list[BaseCallback], progress: bool, goes_on: bool) -> None:
     # what progress_bar=True does, but closed when training stops early
-    bar = [ProgressBarCallback()] if progress else []
-    left = n_timesteps - model.num_timesteps
+    everything = [*callbacks, *([ProgressBarCallback()] if progress else [])]
     try:
-        model.learn(max(left, 0), callback=[*callbacks, *bar], reset_num_timesteps=not goes_on)
+        model.learn(max(n_timesteps - model.num_timesteps, 0), callback=everything, reset_num_timesteps=not goes_on)
     finally:
-        for callback in callbacks:
+        for callback in everything:
             if isinstance(callback, CheckpointCallback):
                 callback.close()
-        for one in bar:
-            if hasattr(one, "pbar"):
-                one.pbar.close()
+            elif isinstance(callback, ProgressBarCallback) and hasattr(callback, "pbar"):
+                callback.pbar.close()

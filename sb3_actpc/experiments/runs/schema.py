@@ -5,8 +5,6 @@ among others, and the filled one is what ``config.json`` holds, what goes to a w
 A part of a run (an entry of a comparison's file, say) is a :class:`Run` too; :func:`merged` puts parts together.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Mapping
@@ -41,9 +39,7 @@ FILLED = ("is_resolved", "demonstrations_sha256", "demonstrators_return", "versi
 _MESSAGES = {
     "greater_than_equal": "must be at least {ge}",
     "less_than_equal": "must be at most {le}",
-    "int_type": "must be a whole number",
-    "int_parsing": "must be a whole number",
-    "int_from_float": "must be a whole number",
+    **dict.fromkeys(("int_type", "int_parsing", "int_from_float"), "must be a whole number"),
     "finite_number": "must be a finite number",
     "string_type": "must be a text",
     "dict_type": "must be a mapping",
@@ -69,7 +65,7 @@ def _algorithm(name: str) -> str:
 
 def _keywords(value: Any) -> Any:
     """As in rl-zoo3: true, false, or keywords."""
-    return {True: {}, False: None}[value] if isinstance(value, bool) else value
+    return ({} if value else None) if isinstance(value, bool) else value
 
 
 Count = Annotated[int, BeforeValidator(_number), Field(ge=1)]
@@ -99,82 +95,49 @@ class Schema(BaseModel):
 
 
 class Run(Schema):
-    """One training run, or a part of what is said about it.
+    """One training run, or a part of what is said about it; ValueError, in one line that names the value, when one is wrong.
+    What is None is by default the preset's, if it can say so, and is filled in by
+    :func:`~sb3_actpc.experiments.runs.presets.resolve`."""
 
-    :param env: Gymnasium id of the task
-    :param algo: key of ``ALGORITHMS``
-    :param preset: name of a file of ``hyperparams/``, or a path ending in ``.yml``; by default the name of the algorithm
-    :param n_timesteps: environment steps to train for, also called ``steps``; by default the preset's
-    :param seed: seed of the agent and of the training environment
-    :param demonstrations: ``"shipped"`` or ``"weak"`` (the files in the package for a sparse task), ``"none"``, a path,
-        or the id of a Minari dataset
-    :param settings: the algorithm's keywords that replace the preset's; ``"policy_kwargs.net_arch"`` replaces one value in a
-        mapping. Once filled in: all of them
-    :param env_kwargs: keywords of the environment, added to the preset's
-    :param policy: name of SB3's policy; by default the preset's
-    :param n_envs: parallel training environments; by default the preset's, or 1
-    :param noise_type: of the action noise, by default the preset's
-    :param noise_std: its standard deviation
-    :param normalize: keywords of SB3's ``VecNormalize`` around the training environment, or true;
-        by default the preset's
-    :param eval_freq: environment steps between two evaluations; by default a tenth of the training
-    :param eval_episodes: episodes in each evaluation
-    :param checkpoint_freq: environment steps between two checkpoints, 0 for none; by default as ``eval_freq``
-    :param keep: which agent is kept as ``model.zip``: that of the ``"last"`` evaluation, or of the ``"best"`` (dense return)
-    :param target_return: the training ends at the first evaluation whose mean dense return reaches it; None for never
-    :param output: run folder; by default ``runs/<env>/<algo>_<preset>_seed<seed>``
-    :param device: torch device
-    :param threads: threads that torch uses
-    :param progress: show a progress bar
-    :param continuable: keep the last checkpoint when the run is finished, so that it can be given more steps
-    :param gym_packages: modules to import before the environment is made, which register it; the working folder is looked in
-    :param task: of a comparison; ``env`` may be another version of it
-    :param name: of this way of running the algorithm in a comparison, a variant
-    :param about: what the variant is, for a report
-    :param task_prefix: what the variant's environment begins with, in the place of the task's ``Sparse``
-    :param is_resolved: whether everything is filled in
-    :param demonstrations_sha256: of the file's content; filled in, as those that follow
-    :param demonstrators_return: mean dense return of the demonstrations
-    :param versions: of the packages
-    :param git_commit: of the source checkout that ran
-    :param dirty: whether files differed from that commit
-    :raises ValueError: in one line that names the value, when one is wrong
-    """
-
-    env: str = ""
-    algo: Annotated[str, AfterValidator(_algorithm)] = "actpc"
-    preset: str | None = None
+    env: str = ""  # Gymnasium id of the task
+    algo: Annotated[str, AfterValidator(_algorithm)] = "actpc"  # key of ``ALGORITHMS``
+    preset: str | None = None  # a file's name in ``hyperparams/``, or a path ending in ``.yml``; by default ``algo``
+    # environment steps to train for
     n_timesteps: Count | None = Field(default=None, validation_alias=AliasChoices("n_timesteps", "steps"))
-    seed: Seed = 0
+    seed: Seed = 0  # of the agent and of the training environment
+    # ``"shipped"`` or ``"weak"`` (the package's files for a sparse task), ``"none"``, a path, or the id of a Minari dataset
     demonstrations: str = "shipped"
+    # the algorithm's keywords that replace the preset's; ``"policy_kwargs.net_arch"`` replaces one value in a mapping. Once
+    # filled in: all of them
     settings: Keywords = Field(default_factory=dict)
-    env_kwargs: Keywords = Field(default_factory=dict)
-    policy: str | None = None
-    n_envs: Annotated[Count, Field(le=1024)] | None = None
-    noise_type: Literal["normal", "ornstein-uhlenbeck"] | None = None
-    noise_std: Annotated[Real, Field(ge=0)] | None = None
-    normalize: Annotated[Keywords | None, BeforeValidator(_keywords)] = None
-    eval_freq: Count | None = None
-    eval_episodes: Count = 5
+    env_kwargs: Keywords = Field(default_factory=dict)  # of the environment, added to the preset's
+    policy: str | None = None  # name of SB3's policy
+    n_envs: Annotated[Count, Field(le=1024)] | None = None  # parallel training environments
+    noise_type: Literal["normal", "ornstein-uhlenbeck"] | None = None  # of the action noise
+    noise_std: Annotated[Real, Field(ge=0)] | None = None  # its standard deviation
+    normalize: Annotated[Keywords | None, BeforeValidator(_keywords)] = None  # keywords of SB3's ``VecNormalize``, or true
+    eval_freq: Count | None = None  # environment steps between two evaluations; by default a tenth of the training
+    eval_episodes: Count = 5  # in each evaluation
+    # environment steps between two checkpoints, 0 for none; by default as ``eval_freq``
     checkpoint_freq: Annotated[int, BeforeValidator(_number), Field(ge=0)] | None = None
-    keep: Literal["last", "best"] = "last"
-    target_return: Real | None = None
-    output: str | None = None
-    device: Annotated[str, AfterValidator(lambda name: check_device(name) or name)] = "cpu"
-    threads: Annotated[Count, Field(le=1024)] = 1
-    progress: bool = True
-    continuable: bool = True
-    gym_packages: tuple[str, ...] = ()
-    task: str | None = None
-    name: Name | None = None
-    about: str = ""
-    task_prefix: str | None = None
-    is_resolved: bool = False
-    demonstrations_sha256: str | None = None
-    demonstrators_return: float | None = None
-    versions: dict[str, str] = Field(default_factory=dict)
-    git_commit: str | None = None
-    dirty: bool | None = None
+    keep: Literal["last", "best"] = "last"  # the agent of which evaluation (best: dense return) is kept as ``model.zip``
+    target_return: Real | None = None  # the training ends at the first evaluation whose mean dense return reaches it
+    output: str | None = None  # run folder; by default ``runs/<env>/<algo>_<preset>_seed<seed>``
+    device: Annotated[str, AfterValidator(lambda name: check_device(name) or name)] = "cpu"  # torch's
+    threads: Annotated[Count, Field(le=1024)] = 1  # that torch uses
+    progress: bool = True  # show a progress bar
+    continuable: bool = True  # keep the last checkpoint of a finished run, so that it can be given more steps
+    gym_packages: tuple[str, ...] = ()  # modules that register the environment; the working folder is looked in
+    task: str | None = None  # of a comparison; ``env`` may be another version of it
+    name: Name | None = None  # of this way of running the algorithm in a comparison, a variant
+    about: str = ""  # what the variant is, for a report
+    task_prefix: str | None = None  # what the variant's environment begins with, in the place of the task's ``Sparse``
+    is_resolved: bool = False  # whether everything is filled in; the rest is filled in as well
+    demonstrations_sha256: str | None = None  # of the file's content
+    demonstrators_return: float | None = None  # mean dense return of the demonstrations
+    versions: dict[str, str] = Field(default_factory=dict)  # of the packages
+    git_commit: str | None = None  # of the source checkout that ran
+    dirty: bool | None = None  # whether files differed from that commit
 
     @property
     def id(self) -> str:

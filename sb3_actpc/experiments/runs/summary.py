@@ -1,7 +1,5 @@
 """What a run shows at its end: a table and a plot."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any

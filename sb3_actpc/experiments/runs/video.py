@@ -1,7 +1,5 @@
 """A video of one episode, or a strip of pictures, where the machine can render."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import subprocess
@@ -14,7 +12,6 @@ import numpy as np
 
 from sb3_actpc.demonstrations.dataset import Demonstrations
 from sb3_actpc.experiments.runs.evaluation import play_episodes
-from sb3_actpc.utils.files import atomic_write
 
 GL_BACKENDS = ("egl", "osmesa")
 VIDEO_SUFFIXES = (".mp4", ".gif", ".png")
@@ -60,15 +57,11 @@ def record_video(
     n_frames: int = MAX_FRAMES,
     demonstrations: Demonstrations | None = None,
 ) -> int:
-    """Write a video of the first steps of an episode with the deterministic policy.
-
-    :param env_kwargs: keywords of the environment; ``width`` and ``height`` in pixels where it takes them
-    :param path: file to write: ``.mp4``, ``.gif``, or ``.png`` for ``STRIP_LENGTH`` pictures side by side, at half the size
-    :param n_frames: most frames to render
-    :param demonstrations: draw their first episode on the right of the agent, or None
-    :return: number of frames, each (height, width, 3) uint8
-    :raises RenderingUnavailable: when rendering does not work here
-    :raises ValueError: when the path has another suffix, or the environment cannot draw demonstrations
+    """Write a video of the first steps, at most ``n_frames``, of an episode with the deterministic policy: the number of
+    frames, each (height, width, 3) uint8. The path ends in ``.mp4``, ``.gif``, or ``.png`` for ``STRIP_LENGTH`` pictures side
+    by side, at half the size; ``env_kwargs`` are the environment's, ``width`` and ``height`` in pixels where it takes them. On
+    the right of the agent the first episode of the demonstrations is drawn, where they are given. RenderingUnavailable when
+    rendering does not work here, ValueError when the path has another suffix, or the environment cannot draw demonstrations.
     """
     check_video_path(path)
     with _rendering(env_id, env_kwargs) as env:
@@ -80,12 +73,11 @@ def record_video(
     import imageio.v2 as imageio
 
     path.parent.mkdir(parents=True, exist_ok=True)
-    if path.suffix.lower() == ".png":
-        with atomic_write(path) as file:
-            file.write(imageio.imwrite("<bytes>", picture_strip(frames), format="png"))
-        return len(frames)
     temporary = path.with_name(f".{path.name}{path.suffix}")  # the suffix tells imageio the format
-    if path.suffix.lower() == ".gif":
+    if path.suffix.lower() == ".png":
+        chosen = np.linspace(0, len(frames) - 1, STRIP_LENGTH).round().astype(int)
+        imageio.imwrite(temporary, np.concatenate([frames[index][::2, ::2] for index in chosen], axis=1))
+    elif path.suffix.lower() == ".gif":
         # viewers slow down a GIF with delays below 20 ms
         stride = max(1, round(frames_per_second / 25))
         imageio.mimsave(temporary, frames[::stride], duration=1000 * stride / frames_per_second, loop=0)
@@ -93,13 +85,6 @@ def record_video(
         imageio.mimsave(temporary, frames, fps=frames_per_second, macro_block_size=2)
     temporary.replace(path)
     return len(frames)
-
-
-def picture_strip(frames: list[np.ndarray]) -> np.ndarray:
-    """``STRIP_LENGTH`` of frames (height, width, 3) from the first to the last, side by side, (height / 2, STRIP_LENGTH *
-    width / 2, 3)."""
-    chosen = np.linspace(0, len(frames) - 1, STRIP_LENGTH).round().astype(int)
-    return np.concatenate([frames[index][::2, ::2] for index in chosen], axis=1)
 
 
 @contextlib.contextmanager

@@ -15,8 +15,8 @@ from rich.console import Console
 
 from sb3_actpc.checkpoints import list_bundles
 from sb3_actpc.cli import main
+from sb3_actpc.experiments.comparison.cluster import _execute, pack_folder, unpack_folder
 from sb3_actpc.experiments.comparison.display import Display, describe_runs
-from sb3_actpc.experiments.comparison.engines.cluster import _execute, pack_folder, unpack_folder
 from sb3_actpc.experiments.comparison.execution import (
     FAILED,
     FINISHED,

@@ -10,10 +10,9 @@ import pytest
 from sb3_actpc.cli import main
 from sb3_actpc.experiments.comparison import ablation_variants
 from sb3_actpc.experiments.report.build import task_table, write_report
-from sb3_actpc.experiments.report.page import Section, write_pages
+from sb3_actpc.experiments.report.page import UNDEFINED, Section, write_pages
 from sb3_actpc.experiments.report.references import reference_score
 from sb3_actpc.experiments.report.results import load_results, read_rows
-from sb3_actpc.experiments.report.tables import UNDEFINED
 from tests.experiments.report.folders import HOPPER, REACHER, write_run
 
 

@@ -1,7 +1,5 @@
 """BCQ and CQL by d3rlpy, in d3rlpy's own virtual environment (see :mod:`sb3_actpc.baselines.offline.served`)."""
 
-from __future__ import annotations
-
 import io
 import random
 import sys
@@ -17,7 +15,7 @@ class Server:
     algorithm: Any
     transitions: Arrays
 
-    def build(self, values: Values, arrays: Arrays) -> tuple[Values, Arrays]:
+    def build(self, values: Values, arrays: Arrays) -> None:
         """``method_kwargs`` are those of d3rlpy's config, and ``net_arch``, the hidden sizes of all networks."""
         import d3rlpy
 
@@ -31,12 +29,10 @@ class Server:
         encoders = {f"{part}_encoder_factory": hidden for part in parts}
         self.algorithm = config(batch_size=values["batch_size"], **encoders, **kwargs).create(device=False)
         self.algorithm.create_impl((values["n_observations"],), values["n_actions"])
-        return {}, {}
 
-    def show(self, values: Values, arrays: Arrays) -> tuple[Values, Arrays]:
+    def show(self, values: Values, arrays: Arrays) -> None:
         """Transitions to learn from."""
         self.transitions = arrays
-        return {}, {}
 
     def train(self, values: Values, arrays: Arrays) -> tuple[Values, Arrays]:
         """One update."""
@@ -66,10 +62,9 @@ class Server:
         self.algorithm.impl.save_model(buffer)
         return {}, {"parameters": np.frombuffer(buffer.getvalue(), dtype=np.uint8)}
 
-    def load(self, values: Values, arrays: Arrays) -> tuple[Values, Arrays]:
+    def load(self, values: Values, arrays: Arrays) -> None:
         """What :meth:`save` returned."""
         self.algorithm.impl.load_model(io.BytesIO(arrays["parameters"].tobytes()))
-        return {}, {}
 
 
 if __name__ == "__main__":

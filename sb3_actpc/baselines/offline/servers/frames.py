@@ -3,8 +3,6 @@
 Nothing is unpickled. The standard library and numpy are enough to read it.
 """
 
-from __future__ import annotations
-
 import io
 import json
 import sys
@@ -20,7 +18,7 @@ VALUES = "values"  # the entry that holds them
 
 Values = dict[str, Any]
 Arrays = dict[str, np.ndarray]
-Handler = Callable[[Values, Arrays], tuple[Values, Arrays]]
+Handler = Callable[[Values, Arrays], tuple[Values, Arrays] | None]
 
 
 def pack(values: Values, arrays: Arrays) -> bytes:
@@ -45,14 +43,14 @@ def unpack(message: bytes) -> tuple[Values, Arrays]:
 
 def serve(handlers: dict[str, Handler]) -> int:
     """Answer the questions of the pipe whose number is the last argument of this program, until it is closed: the exit
-    code. A handler, by the ``ask`` of a question, is given its values and arrays and returns those of the answer. An
+    code. A handler, by the ``ask`` of a question, is given its values and arrays and returns those of the answer, if any. An
     exception is the answer ``{"error": ...}`` and ends the program."""
     channel = Connection(int(sys.argv[-1]))
     with suppress(EOFError, ConnectionError):  # the other side has ended
         while True:
             values, arrays = unpack(channel.recv_bytes())
             try:
-                answer = pack(*handlers[values.pop("ask")](values, arrays))
+                answer = pack(*(handlers[values.pop("ask")](values, arrays) or ({}, {})))
             except Exception as error:
                 traceback.print_exc()
                 channel.send_bytes(pack({"error": f"{type(error).__name__}: {error}"}, {}))

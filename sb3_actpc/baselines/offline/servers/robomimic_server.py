@@ -4,8 +4,6 @@ The observation is one low-dimensional key, ``flat``. Sequences are drawn as rob
 any transition on, the last one repeated beyond the end of the episode.
 """
 
-from __future__ import annotations
-
 import io
 import random
 import sys
@@ -24,7 +22,7 @@ class Server:
     algorithm: Any
     transitions: Arrays
 
-    def build(self, values: Values, arrays: Arrays) -> tuple[Values, Arrays]:
+    def build(self, values: Values, arrays: Arrays) -> None:
         """``method_kwargs`` are of the ``algo`` part of robomimic's config."""
         stand_in_for_torchvision()
         import torch
@@ -57,12 +55,10 @@ class Server:
         self.algorithm = algo_factory(
             values["method"], config, {KEY: [values["n_observations"]]}, values["n_actions"], torch.device("cpu")
         )
-        return {}, {}
 
-    def show(self, values: Values, arrays: Arrays) -> tuple[Values, Arrays]:
+    def show(self, values: Values, arrays: Arrays) -> None:
         """Transitions to learn from."""
         self.transitions = arrays
-        return {}, {}
 
     def train(self, values: Values, arrays: Arrays) -> tuple[Values, Arrays]:
         """One update of every part."""
@@ -138,12 +134,11 @@ class Server:
         torch.save(self.algorithm.serialize(), buffer)
         return {}, {"parameters": np.frombuffer(buffer.getvalue(), dtype=np.uint8)}
 
-    def load(self, values: Values, arrays: Arrays) -> tuple[Values, Arrays]:
+    def load(self, values: Values, arrays: Arrays) -> None:
         """What :meth:`save` returned."""
         import torch
 
         self.algorithm.deserialize(torch.load(io.BytesIO(arrays["parameters"].tobytes()), weights_only=True))
-        return {}, {}
 
 
 def parts_of(memory: Any) -> tuple[Any, ...]:
@@ -152,10 +147,8 @@ def parts_of(memory: Any) -> tuple[Any, ...]:
 
 
 def update(config: Any, values: dict[str, Any], where: str) -> None:
-    """Change values, mappings in mappings, in a part of robomimic's config, which the user calls ``where``.
-
-    :raises ValueError: for a key that it does not have
-    """
+    """Change values, mappings in mappings, in a part of robomimic's config, which the user calls ``where``; ValueError for a
+    key that it does not have."""
     for key, value in values.items():
         if key not in config:
             raise ValueError(f"{where} has no setting {key!r}: choose one of {', '.join(sorted(config))}")

@@ -1,6 +1,4 @@
-"""Runs in processes of this machine, each with its own interpreter."""
-
-from __future__ import annotations
+"""Where runs are executed: processes of this machine, each with its own interpreter, or a Ray cluster."""
 
 import json
 import os
@@ -8,37 +6,85 @@ import queue
 import subprocess
 import sys
 import threading
+from abc import ABC, abstractmethod
 from contextlib import suppress
+from dataclasses import dataclass
 
-from sb3_actpc.experiments.comparison.engines.base import Event
 from sb3_actpc.experiments.comparison.execution import LOG, LOST, STOPPED, Outcome
 from sb3_actpc.experiments.runs import Run
 
+ENGINES = ("local", "ray")
 SAVING_TIME = 60.0  # seconds that a worker gets to save its checkpoint
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMEXPR_NUM_THREADS")
 
 
-class LocalEngine:
-    """A process for each run. A process that dies, whatever the reason, takes no other with it; all save and end when this one
-    dies.
+@dataclass(frozen=True)
+class Event:
+    """News of a run: how many steps it has done, or, where there is an outcome, that it has ended."""
 
-    :param n_workers: runs at a time; by default the number of usable cores divided by ``threads``
-    :param threads: of each run
-    """
+    run_id: str
+    steps: int | None = None
+    outcome: Outcome | None = None
+
+
+class Engine(ABC):
+    """Executes runs, each in a process of its own with :func:`~sb3_actpc.experiments.comparison.execution.execute_run`."""
+
+    @abstractmethod
+    def capacity(self) -> int:
+        """How many runs can be executed at a time, now."""
+
+    @abstractmethod
+    def start(self, run: Run) -> None:
+        """Begin, or go on with, a run that is not under way."""
+
+    @abstractmethod
+    def poll(self, timeout: float) -> list[Event]:
+        """What has happened since the last call, waiting for it some seconds; each run that was started ends in exactly one
+        event with an outcome."""
+
+    @abstractmethod
+    def stop(self) -> None:
+        """Ask every run under way to save a checkpoint and end; their ends still come as events."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Leave nothing running."""
+
+
+def make_engine(name: str, n_workers: int | None, threads: int, address: str | None = None) -> Engine:
+    """One of ``ENGINES``, for ``n_workers`` runs at a time (by default one for each core, of the cluster, and ``threads``) of
+    so many threads; ``address`` is a Ray cluster's, by default one is started on this machine. ValueError for another name, a
+    number below 1, or an address that the engine has no use for, ImportError when Ray is not installed."""
+    if name not in ENGINES:
+        raise ValueError(f"engine={name!r} is unknown: choose one of {', '.join(ENGINES)}")
+    if n_workers is not None and n_workers < 1:
+        raise ValueError(f"workers={n_workers} must be at least 1: give the number of runs at a time")
+    if name == "ray":
+        from sb3_actpc.experiments.comparison.cluster import RayEngine
+
+        return RayEngine(n_workers, threads, address)
+    if address is not None:
+        raise ValueError(f"address={address!r} is of no use to the local engine: add --engine ray, or leave it out")
+    return LocalEngine(n_workers, threads)
+
+
+class LocalEngine(Engine):
+    """A process for each run, at most ``n_workers`` at a time, by default as many as there are usable cores for their
+    ``threads``. A process that dies, whatever the reason, takes no other with it; all save and end when this one dies."""
 
     def __init__(self, n_workers: int | None = None, threads: int = 1) -> None:
-        self.n_workers = max(1, usable_cores() // threads) if n_workers is None else n_workers
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        self.n_workers = max(1, cores // threads) if n_workers is None else n_workers
         self.threads = threads
         self.workers: dict[str, subprocess.Popen[str]] = {}
         self._events: queue.Queue[Event] = queue.Queue()
         self._is_stopping = False
 
     def capacity(self) -> int:
-        """See :class:`~sb3_actpc.experiments.comparison.engines.Engine`, as for the others."""
         return self.n_workers
 
     def start(self, run: Run) -> None:
-        """Begin, or go on with, a run."""
         run.folder.mkdir(parents=True, exist_ok=True)
         environment = {**os.environ, **dict.fromkeys(_THREAD_VARIABLES, str(self.threads))}
         with open(run.folder / LOG, "a", encoding="utf-8") as log:
@@ -58,7 +104,6 @@ class LocalEngine:
         threading.Thread(target=self._listen, args=(run.id, worker), daemon=True).start()
 
     def poll(self, timeout: float) -> list[Event]:
-        """News, after some seconds at most."""
         events = []
         try:
             events.append(self._events.get(timeout=timeout))
@@ -102,11 +147,6 @@ class LocalEngine:
         if outcome is None:
             outcome = Outcome(STOPPED) if self._is_stopping else Outcome(LOST, _describe_exit(code))
         self._events.put(Event(run_id, outcome=outcome))
-
-
-def usable_cores() -> int:
-    """How many cores this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _describe_exit(code: int) -> str:

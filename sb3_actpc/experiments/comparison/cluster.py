@@ -1,19 +1,16 @@
 """Runs as tasks of a Ray cluster (extra ``ray``); their folders end up on this machine, shared or not."""
 
-from __future__ import annotations
-
 import io
 import os
 import socket
 import tempfile
-import threading
+import time
 import uuid
 import zipfile
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from sb3_actpc.experiments.comparison.engines.base import Event
+from sb3_actpc.experiments.comparison.engines import Engine, Event
 from sb3_actpc.experiments.comparison.execution import LOCK, LOG, LOST, STOPPED, Outcome, execute_run
 from sb3_actpc.experiments.runs import Run
 from sb3_actpc.utils.extras import import_extra
@@ -22,19 +19,13 @@ CONNECTION_TIME = 10.0  # seconds
 _PROBE = ".shared-"  # a file by which a node sees whether it shares the folders
 
 
-class RayEngine:
-    """A Ray task for each run. A run whose node dies ends as lost, and is begun again, or gone on with, elsewhere.
-
-    A node that sees this machine's folders (a network file system, or the same machine) works in them, checkpoints and all.
-    To another the run's folder is sent, and what it made of it comes back when the run has ended.
-
-    :param n_workers: runs at a time; by default as many as the cluster has cores for
-    :param threads: of each run, the cores that it reserves
-    :param address: of a cluster, such as ``"auto"`` or ``"10.0.0.1:6379"``; by default one is started on this machine, or the
-        one that this process has joined already is used
-    :raises ImportError: when Ray is not installed
-    :raises ConnectionError: when there is no cluster at the address
-    """
+class RayEngine(Engine):
+    """A Ray task for each run, at most ``n_workers`` at a time, by default as many as the cluster has cores for their
+    ``threads``. A run whose node dies ends as lost, and is begun again, or gone on with, elsewhere. A node that sees this
+    machine's folders (a network file system, or the same machine) works in them, checkpoints and all. To another the run's
+    folder is sent, and what it made of it comes back when the run has ended. The cluster is that at the ``address``, such as
+    ``"auto"`` or ``"10.0.0.1:6379"``; by default one is started on this machine, or the one that this process has joined
+    already is used. ImportError when Ray is not installed, ConnectionError when there is no cluster at the address."""
 
     def __init__(self, n_workers: int | None = None, threads: int = 1, address: str | None = None) -> None:
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # nothing is reported to anybody unless the user asks for it
@@ -47,7 +38,10 @@ class RayEngine:
             options = {"address": "local", "include_dashboard": False} if address is None else {"address": address}
             self.ray.init(log_to_driver=False, **options)
         self._task = self.ray.remote(num_cpus=threads, max_retries=0)(_execute)
-        self._board = self._start_board()
+        # the actor to which runs tell their steps; on this node, so that no other's death takes it along
+        node = self.ray.get_runtime_context().get_node_id()
+        here = import_extra("ray.util.scheduling_strategies", "ray").NodeAffinitySchedulingStrategy(node, soft=True)
+        self._board = self.ray.remote(num_cpus=0, scheduling_strategy=here)(StepBoard).remote()
         self._tasks: dict[Any, Run] = {}  # by Ray's reference to the answer
         self._steps: dict[str, int] = {}
         self._is_stopping = False
@@ -58,7 +52,6 @@ class RayEngine:
         return max(1, fitting if self.n_workers is None else min(fitting, self.n_workers))
 
     def start(self, run: Run) -> None:
-        """Begin, or go on with, a run."""
         run.folder.mkdir(parents=True, exist_ok=True)
         folder = run.folder.absolute()
         run = run.model_copy(update={"output": str(folder)})
@@ -68,9 +61,8 @@ class RayEngine:
         self._tasks[self._task.remote(run.model_dump_json(), str(probe), packed, self._board)] = run
 
     def poll(self, timeout: float) -> list[Event]:
-        """News, after some seconds at most."""
         if not self._tasks:
-            threading.Event().wait(timeout)
+            time.sleep(timeout)
             return []
         ended, _ = self.ray.wait(list(self._tasks), num_returns=1, timeout=timeout)
         return [*self._progress(), *(self._end(reference) for reference in ended)]
@@ -87,13 +79,6 @@ class RayEngine:
             self.ray.cancel(reference, force=True)
         if self._is_mine:
             self.ray.shutdown()
-
-    def _start_board(self) -> Any:
-        """The actor to which runs tell their steps; on this node, so that no other's death takes it along."""
-        from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
-
-        here = NodeAffinitySchedulingStrategy(self.ray.get_runtime_context().get_node_id(), soft=True)
-        return self.ray.remote(num_cpus=0, scheduling_strategy=here)(StepBoard).remote()
 
     def _progress(self) -> list[Event]:
         try:
@@ -134,29 +119,20 @@ class StepBoard:
 
 
 def _execute(job: str, probe: str, packed: bytes, board: Any) -> tuple[str, str, bytes | None]:
-    """On a node: bring a run, given as JSON, to its end. Where it sees the probe file it works in the run's folder, else in
-    a copy of it, which is sent back with status and message of the outcome."""
-    run = Run.model_validate_json(job)
+    """On a node: bring a run to its end, in its folder where that is seen; else in a copy, which is sent back."""
+    run, is_shared = Run.model_validate_json(job), Path(probe).is_file()
 
     def on_steps(steps: int) -> None:
         if board is not None:
             board.write.remote(run.id, steps)
 
-    if Path(probe).is_file():
-        outcome = _execute_with_log(run, on_steps)
-        return outcome.status, outcome.message, None
     with tempfile.TemporaryDirectory() as temporary:
-        folder = Path(temporary)
-        unpack_folder(packed, folder)
-        local = run.model_copy(update={"output": str(folder)})
-        outcome = _execute_with_log(local, on_steps)
-        return outcome.status, outcome.message, pack_folder(folder)
-
-
-def _execute_with_log(run: Run, on_steps: Callable[[int], None]) -> Outcome:
-    """With what it reports in the run's folder, as the local engine has it."""
-    with open(run.folder / LOG, "a", encoding="utf-8") as log:
-        return execute_run(run, lambda line: print(line, file=log, flush=True), on_steps)
+        if not is_shared:
+            unpack_folder(packed, Path(temporary))
+            run = run.model_copy(update={"output": temporary})
+        with open(run.folder / LOG, "a", encoding="utf-8") as log:  # as the local engine has it
+            outcome = execute_run(run, lambda line: print(line, file=log, flush=True), on_steps)
+        return outcome.status, outcome.message, None if is_shared else pack_folder(run.folder)
 
 
 def pack_folder(folder: Path) -> bytes:
