@@ -615,6 +615,20 @@ MUTANTS = [
         "or episode_return > self.best_return",
         f"{STORES} -k enters",
     ),
+    Mutant(
+        "short quiet episodes are few",
+        TRIALS,
+        'self.roles[env] == "actor" or self.quiet_due[env] > 0',
+        'self.roles[env] == "actor"',
+        f"{HABIT} -k as_many_steps",
+    ),
+    Mutant(
+        "quiet steps are due for ever",
+        TRIALS,
+        "else self.quiet_due[env] - length",
+        "else self.quiet_due[env]",
+        f"{HABIT} -k as_many_steps",
+    ),
     Mutant("own episodes below the best stay out", IMITATION, "self.takes_all or ", "", f"{STORES} -k enters"),
     Mutant(
         "own episodes count for nothing",

@@ -123,7 +123,8 @@ class ActPC(OffPolicyAlgorithm):
     :param settling: "scheduled" (one ordered sweep of the errors, the zero-divergence schedule or Z-IL of the
         predictive-coding literature) or "iterative" (the paper: K steps of eq. 1)
     :param exploration_noise: standard deviation of the Gaussian noise on the actions in [-1, 1]; with demonstrations at most
-        their spread around the warm-started actor, dimension by dimension. With a habit every second episode goes without.
+        their spread around the warm-started actor, dimension by dimension. With a habit a noisy episode is followed by as many
+        steps without.
         0 for none (the paper)
     :param policy_delay: updates of the critic for each of the actor, as in TD3; the paper's is 1
     :param demonstrations: a path, a Minari id, or a :class:`~sb3_actpc.demonstrations.dataset.Demonstrations`. A path is saved

@@ -1,7 +1,7 @@
 """The habit: the best proven actor, which is what the agent is for everyone but itself.
 
 The circuit that learns is pressed by a critic that can be wrong, so it does not act for others at once. A *candidate*, the
-slow average of the learning actor, is frozen and plays every second episode without exploration noise. When it is paid more
+slow average of the learning actor, is frozen and plays the episodes without exploration noise. When it is paid more
 than the habit, by more than chance would have it, it becomes the habit. The warm-started clone is the first habit: what the
 agent does is imitation until something better is proven; other clones can be candidates too.
 """
@@ -29,10 +29,11 @@ class Trials:
     """
     Who plays which episode, and what follows from its return. Holds no circuits: the agent copies them as it is told.
 
-    Episodes alternate: with exploration noise by the learning actor, without by the habit or a candidate. A gain must pass a
-    share of the habit's absolute mean return and ``SURE`` of its own standard errors, from the variance that candidate and
-    habit have in common. While it only passes the first, the candidate plays on; when it has had its steps, ``LIKELY`` does.
-    After a candidate that did not prove itself the habit plays again: what made it the habit was partly luck.
+    Episodes alternate: one with exploration noise by the learning actor, then as many steps without (an episode at least) by
+    the habit or a candidate; episodes that soon end in a fall would else be few. A gain must pass a share of the habit's
+    absolute mean return and ``SURE`` of its own standard errors, from the variance that candidate and habit have in common.
+    While it only passes the first, the candidate plays on; when it has had its steps, ``LIKELY`` does. After a candidate that
+    did not prove itself the habit plays again: what made it the habit was partly luck.
 
     Clones of the same demonstrations can do very differently, by their first synapses alone. So while the habit is paid less
     than what it imitates, by more than ``SHORTFALL`` of it, further clones are candidates: before anything is learned, and
@@ -47,6 +48,7 @@ class Trials:
     generation: int = 0
     returns: list[float] = field(default_factory=list)  # so far, of the running episodes
     lengths: list[int] = field(default_factory=list)
+    quiet_due: list[int] = field(default_factory=list)  # steps without noise that are still due, for each environment
     habit_returns: list[float] = field(default_factory=list)
     candidate_returns: list[float] = field(default_factory=list)
     candidate_steps: int = 0
@@ -68,7 +70,7 @@ class Trials:
     def begin_all(self) -> None:
         """All environments were reset: episodes that were running do not count."""
         self.roles = ["actor"] * self.n_envs
-        self.generations, self.lengths = [0] * self.n_envs, [0] * self.n_envs
+        self.generations, self.lengths, self.quiet_due = ([0] * self.n_envs for _ in range(3))
         self.returns = [0.0] * self.n_envs
 
     @property
@@ -100,6 +102,7 @@ class Trials:
         self.has_learned = has_learned
         role, episode_return, length = self.roles[env], self.returns[env], self.lengths[env]
         self.returns[env], self.lengths[env] = 0.0, 0
+        self.quiet_due[env] = length if role == "actor" else self.quiet_due[env] - length
         if role == "habit":
             self.habit_returns = [*self.habit_returns, episode_return][-KEPT_RETURNS:]
             self.habit_proofs, self.habit_steps = self.habit_proofs + 1, self.habit_steps + length
@@ -113,14 +116,14 @@ class Trials:
 
     def begin(self, env: int) -> bool:
         """
-        A new episode of ``env`` begins: noisy and quiet ones take turns.
+        A new episode of ``env`` begins: a noisy one, then quiet ones of as many steps.
 
         :return: whether a new candidate plays it, which is to be made now: a clone where ``is_clone`` says so, else the
             learning actor's average
         """
         has_candidate = self.on_trial or (not self.tests_habit and (self.has_learned or self.needs_clone()))
         quiet: Role = "candidate" if has_candidate else "habit"
-        self.roles[env] = quiet if self.roles[env] == "actor" else "actor"
+        self.roles[env] = quiet if self.roles[env] == "actor" or self.quiet_due[env] > 0 else "actor"
         self.generations[env] = self.generation
         if self.roles[env] != "candidate" or self.on_trial:
             return False

@@ -52,7 +52,7 @@ def play(trials, episode_return, length=PROOF_STEPS, env=0, has_learned=True):
 
 def play_quiet(trials, episode_return, length=PROOF_STEPS, env=0):
     """A noisy episode, whose return must not matter, and the quiet one after it."""
-    assert play(trials, 1e6, 3, env) == ("actor", None)
+    assert play(trials, 1e6, 1, env) == ("actor", None)
     return play(trials, episode_return, length, env)
 
 
@@ -90,6 +90,21 @@ def test_after_every_candidate_that_did_not_prove_itself_the_habit_is_tested_as_
     for _ in range(2):
         assert [play_quiet(trials, 100.0, length)[0] for _ in range(n)] == ["habit"] * n
         assert [play_quiet(trials, 0.0, 1) for _ in range(2)] == [("candidate", None), ("candidate", "rejected")]
+
+
+@pytest.mark.parametrize(("noisy", "quiet", "n"), [(500, 500, 1), (500, 1000, 1), (1, 500, 1), (500, 499, 2), (500, 100, 5)])
+def test_as_many_steps_go_without_noise_as_the_noisy_episode_before_them_had(noisy, quiet, n):
+    """An episode at least, whatever was quiet before; each environment by itself."""
+    trials = Trials(2)
+    for _ in range(3):
+        assert play(trials, 1.0, noisy)[0] == "actor"
+        assert "actor" not in [play(trials, 1.0, quiet)[0] for _ in range(n)]
+    assert trials.roles == ["actor", "actor"]
+    play(trials, 1.0, 200)
+    play(trials, 1.0, 7, env=1)
+    roles = [(play(trials, 1.0, 50)[0], play(trials, 1.0, 50, env=1)[0]) for _ in range(4)]
+    assert [first == "actor" for first, _ in roles] == [False] * 4
+    assert [second == "actor" for _, second in roles] == [False, True, False, True]
 
 
 def test_before_anything_is_learned_the_quiet_episodes_are_the_habits():
@@ -676,7 +691,7 @@ def test_random_actions_prove_nothing():
     """What comes before ``learning_starts`` is nobody's: an episode that begins there counts for nothing either."""
     model, roles = imitating(learning_starts=20), Roles()
     model.learn(40, callback=roles)  # episodes of 5, 9, 3, 12, 5 and 9 steps: the fourth goes on until step 29
-    assert [row[0] for row in roles.rows] == ["actor"] * 29 + ["habit"] * 5 + ["actor"] * 6
+    assert [row[0] for row in roles.rows] == ["actor"] * 29 + ["habit"] * 11  # of the fourth nine steps count: two quiet ones
     assert model.trials.habit_returns == [0.0]
 
 
