@@ -102,6 +102,10 @@ def _collect(args: argparse.Namespace) -> int:
         raise ValueError("--proficiency and --obs are for scripted demonstrators of robosuite tasks: leave them out")
     if demonstrator == "scripted" and (args.stochastic or args.quality is not None or args.target_return is not None):
         raise ValueError("--stochastic, --quality and --target-return are for trained demonstrators: give --proficiency")
+    for option in ("episodes", "max_tries"):  # before anybody is trained for it
+        number = getattr(args, option)
+        if number is not None and number < 1:
+            raise ValueError(f"--{option.replace('_', '-')} {number} must be at least 1")
     demonstrations = _collect_scripted(args) if demonstrator == "scripted" else _collect_trained(args)
     return _save(demonstrations, args.output or _default_output(args.env))
 
@@ -124,7 +128,8 @@ def _collect_scripted(args: argparse.Namespace) -> "Demonstrations":
     if args.mixed and args.proficiency is not None:
         raise ValueError(f"--proficiency {args.proficiency} and --mixed, which has six of them: give one of the two")
     proficiency = 1.0 if args.proficiency is None else args.proficiency
-    n_episodes = args.episodes or 50 * (len(MIXED_DEMONSTRATORS) if args.mixed else 1)
+    default = 50 * (len(MIXED_DEMONSTRATORS) if args.mixed else 1)
+    n_episodes = default if args.episodes is None else args.episodes
     _report(f"scripted demonstrators{' of three levels' if args.mixed else f' of proficiency {proficiency}'} in {args.env}")
     options = ("env", "demonstrator", "proficiency", "mixed", "obs", "episodes", "max_tries", "seed")
     return collect_scripted(

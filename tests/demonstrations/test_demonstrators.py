@@ -228,6 +228,9 @@ class TestCommand:
             (["--demonstrator", "scripted", "--quality", "0.5"], "are for trained demonstrators: give --proficiency"),
             (["--demonstrator", "scripted", "--mixed", "--proficiency", "0.5"], "give one of the two"),
             (["--env", "SparseLift-v0", "--demonstrator", "trained"], "use its scripted demonstrators"),
+            (["--episodes", "0"], "--episodes 0 must be at least 1"),
+            (["--env", "SparseLift-v0", "--episodes", "0"], "--episodes 0 must be at least 1"),
+            (["--max-tries", "-1"], "--max-tries -1 must be at least 1"),
         ],
     )
     def test_options_that_do_not_go_together_are_named(self, words: list[str], message: str) -> None:
