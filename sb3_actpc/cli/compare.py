@@ -35,9 +35,8 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
 def run(args: argparse.Namespace) -> int:
     """Bring the runs to their end; 1 when runs have failed, 75 when a signal or a full disk stopped the command."""
     from sb3_actpc.checkpoints import EXIT_STOPPED
-    from sb3_actpc.experiments.comparison import plan_runs, read_comparison
+    from sb3_actpc.experiments.comparison import make_engine, plan_runs, read_comparison
     from sb3_actpc.experiments.comparison.display import Display, describe_runs
-    from sb3_actpc.experiments.comparison.engines import make_engine
     from sb3_actpc.experiments.comparison.plan import read_comparison_file
     from sb3_actpc.experiments.comparison.schedule import run_comparison
 

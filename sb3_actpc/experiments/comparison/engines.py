@@ -1,4 +1,4 @@
-"""Where runs are executed: processes of this machine, each with its own interpreter, or a Ray cluster."""
+"""Where runs are executed: what every engine does, and processes of this machine, each with its own interpreter."""
 
 import json
 import os
@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from sb3_actpc.experiments.comparison.execution import LOG, LOST, STOPPED, Outcome
 from sb3_actpc.experiments.runs import Run
 
-ENGINES = ("local", "ray")
 SAVING_TIME = 60.0  # seconds that a worker gets to save its checkpoint
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMEXPR_NUM_THREADS")
 
@@ -50,23 +49,6 @@ class Engine(ABC):
     @abstractmethod
     def close(self) -> None:
         """Leave nothing running."""
-
-
-def make_engine(name: str, n_workers: int | None, threads: int, address: str | None = None) -> Engine:
-    """One of ``ENGINES``, for ``n_workers`` runs at a time (by default one for each core, of the cluster, and ``threads``) of
-    so many threads; ``address`` is a Ray cluster's, by default one is started on this machine. ValueError for another name, a
-    number below 1, or an address that the engine has no use for, ImportError when Ray is not installed."""
-    if name not in ENGINES:
-        raise ValueError(f"engine={name!r} is unknown: choose one of {', '.join(ENGINES)}")
-    if n_workers is not None and n_workers < 1:
-        raise ValueError(f"workers={n_workers} must be at least 1: give the number of runs at a time")
-    if name == "ray":
-        from sb3_actpc.experiments.comparison.cluster import RayEngine
-
-        return RayEngine(n_workers, threads, address)
-    if address is not None:
-        raise ValueError(f"address={address!r} is of no use to the local engine: add --engine ray, or leave it out")
-    return LocalEngine(n_workers, threads)
 
 
 class LocalEngine(Engine):

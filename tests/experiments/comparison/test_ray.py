@@ -6,7 +6,8 @@ from pathlib import Path
 import pytest
 
 from sb3_actpc.cli import main
-from sb3_actpc.experiments.comparison.engines import Event, make_engine
+from sb3_actpc.experiments.comparison import make_engine
+from sb3_actpc.experiments.comparison.engines import Event
 from sb3_actpc.experiments.comparison.execution import run_status
 from sb3_actpc.experiments.comparison.schedule import run_comparison
 from tests.checkpoints.runs import log_rows
