@@ -1,4 +1,4 @@
-"""Whole episodes worth imitating: the demonstrations, and the agent's own best (self-imitation)."""
+"""Whole episodes worth imitating: the demonstrations, and the agent's own good ones (self-imitation)."""
 
 import warnings
 from collections.abc import Callable, Sequence
