@@ -354,10 +354,13 @@ MUTANTS = [
     Mutant("random actions prove something", AGENT, "or self.num_timesteps <= self.learning_starts", "", f"{HABIT} -k random"),
     Mutant("the habit is not copied", AGENT, "_copy(self.policy.candidate, self.actor.habit)", "pass", f"{HABIT} -k predict"),
     Mutant("the learning actor acts", POLICIES, "self.circuit if self.habit is None", "self.circuit if True", HABIT),
-    Mutant("one proof is enough", TRIALS, "elif n < N_PROOFS", "elif n < 1", HABIT),
-    Mutant("a tie is a proof", TRIALS, "gain >= max(SMALLEST_GAIN * unit, enough * error)", "gain >= enough * error", HABIT),
+    Mutant("one proof is enough", TRIALS, "elif n < N_PROOFS or", "elif n < 1 or", HABIT),
+    Mutant("a tie is a proof", TRIALS, "gain >= max(smallest, (SURE", "gain >= max(0.0, (SURE", HABIT),
+    Mutant("chance is a proof", TRIALS, "(SURE if has_time else LIKELY) * error", "0.0", HABIT),
+    Mutant("chance is a tie", TRIALS, "abs(gain) + SURE * error > smallest", "abs(gain) > smallest", f"{HABIT} -k chance"),
+    Mutant("a chance loss is held against a candidate", TRIALS, "has_time * LIKELY * error", "0.0", f"{HABIT} -k chance"),
     Mutant(
-        "chance is a proof", TRIALS, "gain >= max(SMALLEST_GAIN * unit, enough * error)", "gain >= SMALLEST_GAIN * unit", HABIT
+        "a sure loss waits for the end", TRIALS, "has_time * LIKELY * error", "has_time * SURE * error", f"{HABIT} -k chance"
     ),
     Mutant(
         "chance is held against a candidate",
@@ -369,8 +372,8 @@ MUTANTS = [
     Mutant(
         "a candidate plays on for ever",
         TRIALS,
-        "LIKELY if self.candidate_steps >= MOST_PROOF_STEPS else SURE",
-        "SURE",
+        "has_time = self.candidate_steps < MOST_PROOF_STEPS",
+        "has_time = True",
         f"{HABIT} -k plays_on",
     ),
     Mutant(
@@ -447,9 +450,53 @@ MUTANTS = [
     Mutant(
         "a costly habit needs clones",
         TRIALS,
-        "SHORTFALL * abs(self.imitated_return)",
-        "SHORTFALL * self.imitated_return",
-        f"{HABIT} -k tenth",
+        "shortfall * abs(self.imitated_return)",
+        "shortfall * self.imitated_return",
+        f"{HABIT} -k share_of_what",
+    ),
+    Mutant(
+        "the other noise is never tried",
+        TRIALS,
+        "self.noise if self.other_noise is None else",
+        "self.noise if True else",
+        HABIT,
+    ),
+    Mutant(
+        "the other noise is tried for ever", TRIALS, "            self.other_noise = None\n", "", f"{HABIT} -k other_noise"
+    ),
+    Mutant(
+        "a rejected clone's noise stays",
+        TRIALS,
+        'self.clone_noise if verdict == "accepted"',
+        "self.clone_noise if True",
+        HABIT,
+    ),
+    Mutant(
+        "a learner's verdict ends the search for noise", TRIALS, "        if self.is_clone:\n", "        if True:\n", HABIT
+    ),
+    Mutant(
+        "clones imitate with the learner's noise",
+        AGENT,
+        "noise = self.trials.clone_noise",
+        "noise = self.imitation_noise",
+        HABIT,
+    ),
+    Mutant(
+        "a given noise is not heeded", AGENT, "self.refresh.noise or 0.0 if", "0.0 if", "tests/actpc/test_agent.py -k ridge"
+    ),
+    Mutant(
+        "noise of one size",
+        AGENT,
+        "noise * distances * th.randn_like(distances)",
+        "noise * th.randn_like(distances)",
+        "tests/actpc/test_agent.py -k room_between",
+    ),
+    Mutant(
+        "distances within an episode",
+        IMITATION,
+        "lengths.masked_fill_(episodes[rows, None] == episodes[chosen], th.inf)",
+        "lengths.masked_fill_(rows[:, None] == chosen, th.inf)",
+        "tests/actpc/test_agent.py -k distances",
     ),
     Mutant(
         "pressure begins with all its strength",

@@ -50,6 +50,7 @@ from sb3_actpc.actpc.self_imitation import (
     Episodes,
     Observations,
     Refresh,
+    distances_to_nearest,
     imitated_return,
     is_by_return,
     map_observations,
@@ -310,6 +311,8 @@ class ActPC(OffPolicyAlgorithm):
         if self.policy.habit:
             self.trials = self.trials or Trials(self.n_envs)  # a loaded agent knows what its habit was paid
             self.trials.n_envs = self.n_envs
+            if self.refresh.noise is not None:
+                self.trials.noise, self.trials.other_noise = self.refresh.noise, None
             clones = self.refresh.n_clones - 1 if self.demonstrations is not None and self.actor_warm_start else 0
             self.trials.n_clones = min(self.trials.n_clones, clones)
         self._setup_demonstrations()
@@ -412,7 +415,8 @@ class ActPC(OffPolicyAlgorithm):
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         super().set_env(env, force_reset)
         if self.trials is not None:  # another environment may pay for other steps
-            self.trials = Trials(self.n_envs, n_clones=self.trials.n_clones, begun_at=self.trials.begun_at)
+            kept = ("n_clones", "begun_at", "noise", "other_noise")
+            self.trials = Trials(self.n_envs, **{name: getattr(self.trials, name) for name in kept})
         if self.demonstrations is not None:
             self._setup_demonstrations()
 
@@ -517,20 +521,25 @@ class ActPC(OffPolicyAlgorithm):
             if update < n_prior:
                 self._update_prior(self.policy.batch_size_of("prior", self.batch_size))
             else:
-                self._warm_up_actor(self.actor.circuit, (update - n_prior) / self.actor_warm_start)
+                self._warm_up_actor(self.actor.circuit, (update - n_prior) / self.actor_warm_start, self.imitation_noise)
             self.n_pretraining_updates += 1
         self._start_from(self.actor.circuit)
         if self.actor_warm_start and self.trials is not None:
             self.trials.n_clones = self.refresh.n_clones - 1
         self.pretrained = True
 
-    def _warm_up_actor(self, circuit: NGCCircuit, progress: float) -> None:
+    @property
+    def imitation_noise(self) -> float:
+        """The present noise on what is imitated: the one asked for, or the one that clones have proved better."""
+        return self.refresh.noise or 0.0 if self.trials is None else self.trials.noise
+
+    def _warm_up_actor(self, circuit: NGCCircuit, progress: float, noise: float) -> None:
         """One update on imitated actions; ``progress`` is the share of the warm start that is done."""
         first, last = WARM_START_RATES
         rate = first * (last / first) ** progress
         for group, own in zip(circuit.optimizer.param_groups, circuit.parameter_groups(rate), strict=True):
             group["lr"] = own["lr"]
-        circuit.apply_changes(self._refresh_changes(circuit, WARM_START_BATCH))
+        circuit.apply_changes(self._refresh_changes(circuit, WARM_START_BATCH, noise))
 
     def _start_from(self, clone: NGCCircuit) -> None:
         """Learning begins with this actor."""
@@ -646,12 +655,13 @@ class ActPC(OffPolicyAlgorithm):
         if not self.trials.is_clone:
             _copy(self.policy.actor_average, self.policy.candidate)
             return
+        noise = self.trials.clone_noise
         if self.verbose:
             paid, imitated = self.trials.habit_return, self.trials.imitated_return
-            print(f"another clone is tried: the habit is paid {paid:.4g}, what it imitates {imitated:.4g}")
+            print(f"a clone is tried, with noise {noise:g}: the habit is paid {paid:.4g}, what it imitates {imitated:.4g}")
         clone = self.policy.make_actor()
         for update in range(self.actor_warm_start):
-            self._warm_up_actor(clone, update / self.actor_warm_start)
+            self._warm_up_actor(clone, update / self.actor_warm_start, noise)
         _copy(clone, self.policy.candidate)
 
     def _check_observations(self, observations: Any) -> None:
@@ -766,7 +776,7 @@ class ActPC(OffPolicyAlgorithm):
         """Motor-action circuit: pressure of the critic (line 19) plus refresh (line 26), in one step of the optimiser."""
         changes = None
         if self.refresh_weight and self._imitated():
-            changes = self._refresh_changes(self.actor.circuit, len(batch.features))
+            changes = self._refresh_changes(self.actor.circuit, len(batch.features), self.imitation_noise)
         if changes is not None:
             self.diagnostics.change_norms("refresh", changes.scale_(self.refresh_weight))
         if self.actor_pressure and self._n_updates > self.critic_warmup:
@@ -854,20 +864,25 @@ class ActPC(OffPolicyAlgorithm):
         own = [] if memory is None or memory.episodes is None else [memory.episodes]
         return own if self.expert is None else [self.expert.episodes, *own]
 
-    def _refresh_changes(self, circuit: NGCCircuit, n: int) -> HebbianChanges:
+    def _refresh_changes(self, circuit: NGCCircuit, n: int, noise: float) -> HebbianChanges:
         """Settle the actor, or a clone of the same imitated actions, on ``n`` of them."""
-        state = circuit.settle(*self._sample_imitated(n))
+        state = circuit.settle(*self._sample_imitated(n, noise))
         if circuit is self.actor.circuit:
             self.diagnostics.settled("actor", state)
         return circuit.hebbian_update(state)
 
-    def _sample_imitated(self, n: int) -> tuple[th.Tensor, th.Tensor, th.Tensor | None]:
-        """Features, actions and working memory of ``n`` imitated steps."""
+    def _sample_imitated(self, n: int, noise: float) -> tuple[th.Tensor, th.Tensor, th.Tensor | None]:
+        """Features, actions and working memory of ``n`` imitated steps, the demonstrated ones with ``noise``."""
         inputs = self.inputs
+        if noise and self.expert is not None and self.expert.episodes.distances is None:
+            demonstrated = self.expert.episodes
+            all_features = inputs.features(inputs.observations(demonstrated.observations))
+            demonstrated.distances = distances_to_nearest(all_features, demonstrated.starts)
         samples = sample_union(self._imitated(), n, self.memory_history, self.refresh.weighting)
         features = inputs.features(inputs.observations(samples.observations))
-        if self.refresh.noise:
-            features = features + self.refresh.noise * th.randn_like(features)
+        if noise and samples.distances is not None:
+            distances = inputs.tensor(samples.distances)
+            features[: len(distances)] += noise * distances * th.randn_like(distances)
         return features, inputs.tensor(samples.actions), inputs.memory(*inputs.past(samples.history, samples.history_mask))
 
     # ------------------------------------------------------------------ logging, saving

@@ -13,13 +13,17 @@ from typing import Any, Literal
 Role = Literal["actor", "candidate", "habit"]
 Verdict = Literal["accepted", "tied", "rejected"]
 
-N_PROOFS = 2  # episodes of a candidate at least, before it is accepted
+N_PROOFS = 2  # episodes of a candidate at least, before it is judged by less than a great loss
 # environment steps, or episodes however short, of a candidate before it is judged, and of the habit between two candidates
 PROOF_STEPS, ENOUGH_PROOFS = 500, 10
 MOST_PROOF_STEPS = 2000  # that a candidate has for a proof
 KEPT_RETURNS = 20  # of the habit
-SHORTFALL = 0.1  # of what the imitated episodes were paid: a clone that is paid less by more is no good one
-SURE, LIKELY = 1.5, 0.5  # standard errors that a gain must pass: at any time, and after ``MOST_PROOF_STEPS``
+# of what the imitated episodes were paid: a clone that is paid less by more is no good one. The second is for the first clone
+# that is tried, which has another noise
+SHORTFALL, FIRST_SHORTFALL = 0.1, 0.05
+OTHER_NOISE = 1.0  # see Refresh
+# standard errors: that a gain must pass at any time, and after ``MOST_PROOF_STEPS``; the second is also a loss's before
+SURE, LIKELY = 1.5, 0.5
 # shares of the habit's mean return: what counts as a gain or a loss, and with what loss a candidate is rejected at once
 SMALLEST_GAIN, GREAT_LOSS = 0.01, 0.2
 
@@ -31,13 +35,16 @@ class Trials:
 
     Episodes alternate: one with exploration noise by the learning actor, then as many steps without (an episode at least) by
     the habit or a candidate; episodes that soon end in a fall would else be few. A gain must pass a share of the habit's
-    absolute mean return and ``SURE`` of its own standard errors, from the variance that candidate and habit have in common.
-    While it only passes the first, the candidate plays on; when it has had its steps, ``LIKELY`` does. After a candidate that
-    did not prove itself the habit plays again: what made it the habit was partly luck.
+    absolute mean return and ``SURE`` of its own standard errors, from the variance that candidate and habit have in common,
+    and a loss that share and ``LIKELY``. In between the candidate plays on, unless it surely is neither; when it has had its
+    steps, ``LIKELY`` is enough of a gain and the share of a loss. After a candidate that did not prove itself the habit plays
+    again: what made it the habit was partly luck.
 
     Clones of the same demonstrations can do very differently, by their first synapses alone. So while the habit is paid less
     than what it imitates, by more than ``SHORTFALL`` of it, further clones are candidates: before anything is learned, and
-    after a rejected learner. One that is accepted is where learning begins anew.
+    after a rejected learner. One that is accepted is where learning begins anew. The first that is tried has another noise on
+    what it imitates, and those after it the better one's: noise makes an arm's clone sure and a Hopper's fall, and what is
+    demonstrated does not say which.
 
     :param n_envs: environments, each with an episode of its own
     """
@@ -55,6 +62,8 @@ class Trials:
     habit_proofs: int = 0  # episodes since the last verdict, and their steps
     habit_steps: int = 0
     imitated_return: float = 0.0  # what the imitated episodes were paid
+    noise: float = 0.0  # on what is imitated, since learning began
+    other_noise: float | None = OTHER_NOISE  # of the next clone; None once it was tried
     n_clones: int = 0  # that may still be tried
     begun_at: int = 0  # update at which learning began with the present clone
     on_trial: bool = False  # there is a candidate that is not judged yet
@@ -78,10 +87,16 @@ class Trials:
         """Mean of the habit's last returns; 0 where there is none yet."""
         return fmean(self.habit_returns) if self.habit_returns else 0.0
 
+    @property
+    def clone_noise(self) -> float:
+        """Noise on what the next clone imitates, or the one on trial."""
+        return self.noise if self.other_noise is None else self.other_noise
+
     def needs_clone(self) -> bool:
         """Whether the next candidate is a clone."""
         is_due = self.learner_was_rejected or not self.has_learned
-        least = self.imitated_return - SHORTFALL * abs(self.imitated_return)
+        shortfall = SHORTFALL if self.other_noise is None else FIRST_SHORTFALL
+        least = self.imitated_return - shortfall * abs(self.imitated_return)
         return is_due and self.n_clones > 0 and self.habit_return < least
 
     def step(self, env: int, reward: float) -> None:
@@ -134,21 +149,26 @@ class Trials:
     def _judge(self) -> Verdict | None:
         own, n = self.candidate_returns, len(self.candidate_returns)
         gain, unit = fmean(own) - self.habit_return, abs(self.habit_return)
-        error = self._standard_error()
+        smallest, error = SMALLEST_GAIN * unit, self._standard_error()
         great_loss = gain + SURE * error < -GREAT_LOSS * unit
-        enough = LIKELY if self.candidate_steps >= MOST_PROOF_STEPS else SURE
         if not _is_tried(n, self.candidate_steps) and not (n >= N_PROOFS and great_loss):
             return None
+        has_time = self.candidate_steps < MOST_PROOF_STEPS
         verdict: Verdict = "tied"
-        if great_loss or (n >= N_PROOFS and gain < -SMALLEST_GAIN * unit):
+        if great_loss or (n >= N_PROOFS and gain < -max(smallest, has_time * LIKELY * error)):
             verdict = "rejected"
-        elif n < N_PROOFS or (enough == SURE and SURE * error > gain >= SMALLEST_GAIN * unit):
+        elif n < N_PROOFS:
             return None
-        elif gain > 0.0 and gain >= max(SMALLEST_GAIN * unit, enough * error):
+        elif gain > 0.0 and gain >= max(smallest, (SURE if has_time else LIKELY) * error):
             verdict, self.habit_returns = "accepted", own[-KEPT_RETURNS:]
             # what the old habit has begun elsewhere is no return of the new one
             self.roles = ["actor" if role == "habit" else role for role in self.roles]
+        elif has_time and abs(gain) + SURE * error > smallest:
+            return None
         self.learner_was_rejected = verdict == "rejected" and not self.is_clone
+        if self.is_clone:
+            self.noise = self.clone_noise if verdict == "accepted" else self.noise
+            self.other_noise = None
         self.tests_habit = verdict != "accepted"
         self.candidate_returns, self.candidate_steps, self.on_trial = [], 0, False
         self.habit_proofs, self.habit_steps = 0, 0

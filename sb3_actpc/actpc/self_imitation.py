@@ -10,7 +10,7 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 
-from sb3_actpc.actpc.arguments import Between, Weight, checked
+from sb3_actpc.actpc.arguments import Between, checked
 from sb3_actpc.demonstrations import Demonstrations, scaled_actions
 from sb3_actpc.demonstrations.rows import split_observations
 
@@ -18,6 +18,7 @@ Observations = np.ndarray | dict[str, np.ndarray]
 TensorObservations = th.Tensor | dict[str, th.Tensor]
 Weighting = Literal["returns", "uniform"]
 RETURN_EXPONENT = 4.0  # an episode that was paid half as much is imitated a sixteenth as often
+MOST_NEIGHBOURS = 20_000
 PATIENCE = 20  # episodes, all with a negative return, after which the memory warns
 
 
@@ -28,8 +29,10 @@ class Refresh:
         reward-weighted regression, Peters and Schaal 2007; uniformly where no demonstration's return is positive) or
         "uniform" (the paper). Returns are compared as they are: where episodes differ in difficulty, as with random goals, the
         easy ones are imitated most
-    :param noise: standard deviation of Gaussian noise on the features (normalised observations), not on the working memory's;
-        against overfitting to few demonstrations. 0 for none (the paper)
+    :param noise: standard deviation of Gaussian noise on the demonstrated features (normalised observations), not on the
+        working memory's; dimension by dimension, in units of the distance to the nearest step of another episode
+        (:func:`distances_to_nearest`), so that it fills the space between demonstrations. 0 for none (the paper); None for
+        none at first, and with a habit for what its clones prove better (:mod:`sb3_actpc.actpc.habit`)
     :param own_episodes: which of them are imitated too: "paid" (every one, as often as its return says; "best" where steps are
         not drawn by returns, or nothing is demonstrated) or "best" (those that are paid at least what the best one was: the
         paper)
@@ -43,7 +46,7 @@ class Refresh:
     def __init__(
         self,
         weighting: Weighting = "returns",
-        noise: Weight = 0.0,
+        noise: Annotated[float | None, Between(0)] = None,
         own_episodes: Literal["paid", "best"] = "paid",
         n_clones: Annotated[int, Between(1)] = 6,
     ) -> None:
@@ -57,12 +60,14 @@ class ImitationSamples(NamedTuple):
     :param actions: (B, A), scaled to [-1, 1]
     :param history: (B, H, *obs_shape), the observations before each row in its episode, oldest first; or None
     :param history_mask: (B, H), 1 where there was such an observation, or None
+    :param distances: (B', n_features) of the first B' rows, which are demonstrated, or None: see :class:`Episodes`
     """
 
     observations: Observations
     actions: np.ndarray
     history: Observations | None
     history_mask: np.ndarray | None
+    distances: np.ndarray | None = None
 
 
 def map_observations(function: Callable[[Any], Any], observations: Any) -> Any:
@@ -80,12 +85,14 @@ class Episodes:
     :param actions: (N, A), scaled to [-1, 1]
     :param starts: (N,) index of the first transition of each row's episode
     :param returns: (N,) what each row's episode was paid
+    :param distances: (N, n_features), of :func:`distances_to_nearest`, where they are known
     """
 
     observations: Observations
     actions: np.ndarray
     starts: np.ndarray
     returns: np.ndarray
+    distances: np.ndarray | None = None
 
     @cached_property
     def weights(self) -> np.ndarray:
@@ -122,9 +129,9 @@ class Episodes:
     def take(self, indices: np.ndarray, history: int = 0) -> ImitationSamples:
         """(B,) rows, each with ``history`` preceding observations of the same episode."""
         past, mask = self.past(indices, history)
-        return ImitationSamples(
-            map_observations(lambda array: array[indices], self.observations), self.actions[indices], past, mask
-        )
+        distances = None if self.distances is None else self.distances[indices]
+        observations = map_observations(lambda array: array[indices], self.observations)
+        return ImitationSamples(observations, self.actions[indices], past, mask, distances)
 
     def past(
         self, indices: np.ndarray, history: int, including: bool = False
@@ -245,8 +252,31 @@ def sample_union(parts: list[Episodes], n: int, history: int = 0, weighting: Wei
         start = end
     if len(taken) == 1:
         return taken[0]
-    columns: list[Any] = [None if column[0] is None else _concatenate(column) for column in zip(*taken, strict=True)]
+    columns: list[Any] = [
+        None if column[0] is None else _concatenate([part for part in column if part is not None])
+        for column in zip(*taken, strict=True)
+    ]
     return ImitationSamples(*columns)
+
+
+def distances_to_nearest(features: th.Tensor, starts: np.ndarray) -> np.ndarray:
+    """
+    How far each step is from the nearest one of another episode, in every dimension: the room that a clone fills by guessing.
+
+    :param features: (N, n_features) of episodes
+    :param starts: (N,) first row of each row's episode
+    :return: (N, n_features), zeros where there is one episode alone; of long sets, to the nearest of ``MOST_NEIGHBOURS`` rows
+    """
+    episodes = th.as_tensor(starts, device=features.device)
+    chosen = th.linspace(0, len(features) - 1, min(len(features), MOST_NEIGHBOURS), device=features.device).long()
+    distances = th.zeros_like(features)
+    for rows in th.arange(len(features), device=features.device).split(1024):
+        lengths = th.cdist(features[rows], features[chosen])
+        lengths.masked_fill_(episodes[rows, None] == episodes[chosen], th.inf)
+        shortest, nearest = lengths.min(dim=1)
+        there = shortest.isfinite()
+        distances[rows[there]] = (features[chosen[nearest[there]]] - features[rows[there]]).abs()
+    return distances.cpu().numpy()
 
 
 def _concatenate(arrays: Sequence[Any]) -> Any:

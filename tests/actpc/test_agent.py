@@ -18,7 +18,9 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_actpc import ActPC
+from sb3_actpc.actpc import self_imitation
 from sb3_actpc.actpc.diagnostics import Diagnostics
+from sb3_actpc.actpc.self_imitation import distances_to_nearest
 from sb3_actpc.ngc import NGCCircuit, settle_coupled
 from tests.actpc.agents import differ, make, plain, weights_of
 from tests.actpc.envs import CountingEnv, demonstrations
@@ -390,20 +392,52 @@ def test_actor_warm_start_imitates_before_any_step():
 
 
 def test_noise_on_refreshed_observations_is_ridge_regression():
-    """Of a linear actor on white observations the noise leaves the share 1 / (1 + σ^2) (Bishop, 1995)."""
+    """Of a linear actor on white observations noise leaves the share 1 / (1 + σ^2) (Bishop, 1995), σ in units of distances."""
     data = demonstrations(n_episodes=20, length=50)
     data = dataclasses.replace(data, actions=0.2 * data.observations[:, :2])
     slopes = []
-    for noise in (0.0, 1.0):
+    for noise in (0.0, 0.5):
         model = make(
             demonstrations=data,
             policy_kwargs={"actor_kwargs": {"net_arch": []}},
             actor_warm_start=2500,
             refresh_kwargs={"noise": noise},
         )
+        model.expert.episodes.distances = np.full_like(data.observations, 2.0)
         model.pretrain()
         slopes.append(model.actor.circuit.weights[0][:, :2].diagonal().mean().item())
     assert slopes == pytest.approx([0.1, 0.05], rel=0.1)
+
+
+def test_noise_fills_the_room_between_demonstrations_and_none_is_on_own_episodes():
+    """Its standard deviation is the distance to the nearest step of the other episode, in each dimension."""
+    data = demonstrations(n_episodes=2, length=50)
+    observations = np.zeros_like(data.observations)
+    observations[50:] = np.arange(observations.shape[1]) / 10
+    model = make(demonstrations=dataclasses.replace(data, observations=observations), refresh_kwargs={"noise": 0.5})
+    for noise, spread in ((0.0, 0.0), (0.5, 0.5)):
+        features = model._sample_imitated(20_000, noise)[0].numpy()
+        first = features[: len(features) // 2 - 200]  # rows come in order
+        assert first.std(0) == pytest.approx(spread * observations[-1], rel=0.05)
+        assert first.mean(0) == pytest.approx(np.zeros(observations.shape[1]), abs=0.01)
+    own = np.full((100, observations.shape[1]), 7.0, dtype=np.float32)
+    model.replay_buffer.self_imitation.store(own, data.actions, 1.0)
+    features = model._sample_imitated(1000, 0.5)[0].numpy()
+    assert 300 < (features == 7.0).all(1).sum() < 700 and not np.isnan(features).any()
+
+
+def test_distances_are_to_the_nearest_step_of_another_episode():
+    features = th.tensor([[0.0, 0.0], [0.1, 0.0], [1.0, -2.0], [5.0, 5.0]])
+    starts = np.array([0, 0, 2, 3])
+    expected = [[1.0, 2.0], [0.9, 2.0], [0.9, 2.0], [4.9, 5.0]]
+    assert distances_to_nearest(features, starts) == pytest.approx(np.array(expected))
+    assert not distances_to_nearest(features, np.zeros(4, dtype=int)).any()  # one episode
+
+
+def test_distances_of_long_sets_are_to_some_of_their_steps(monkeypatch):
+    monkeypatch.setattr(self_imitation, "MOST_NEIGHBOURS", 3)  # rows 0, 2 and 4
+    features, starts = th.tensor([[0.0], [1.0], [10.0], [11.0], [30.0]]), np.array([0, 1, 2, 3, 4])
+    assert distances_to_nearest(features, starts)[:, 0].tolist() == [10.0, 1.0, 10.0, 1.0, 20.0]
 
 
 @pytest.mark.parametrize(("weighting", "share"), [("returns", 0.0), ("uniform", 0.5)])
@@ -413,7 +447,7 @@ def test_the_actor_imitates_the_episodes_that_were_paid(weighting, share):
     unpaid = np.arange(len(data)) < 50
     data = dataclasses.replace(data, rewards=np.where(unpaid, 0.0, 1.0).astype(np.float32))
     model = make(demonstrations=data, refresh_kwargs={"weighting": weighting})
-    features = model._sample_imitated(2000)[0]
+    features = model._sample_imitated(2000, 0.0)[0]
     from_unpaid = (features[:, None] == th.as_tensor(data.observations[unpaid])[None]).all(-1).any(1)
     assert from_unpaid.float().mean().item() == pytest.approx(share, abs=0.05)
 

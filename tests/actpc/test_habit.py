@@ -179,6 +179,22 @@ def test_a_gain_must_pass_its_standard_error_and_the_candidate_plays_on_until_it
     assert tried(100.0, candidate) == verdicts
 
 
+@pytest.mark.parametrize(
+    ("candidate", "verdicts"),
+    [
+        ([90.0, 110.0], [None, None]),  # neither, and 1.5 errors of 10
+        ([99.9, 100.1], [None, "tied"]),  # of 0.1
+        ([90.0, 106.0], [None, None]),  # a loss of 2, and half an error of 8
+        ([90.0, 102.0], [None, "rejected"]),  # of 4, and half of 6
+        ([90.0, 106.0, 97.0, 99.0], [None, None, None, "rejected"]),  # it had its steps
+        ([90.0, 106.0, 120.0, 120.0], [None, None, None, "accepted"]),
+    ],
+)
+def test_a_loss_that_may_be_chance_is_not_held_against_a_candidate_while_it_has_time(candidate, verdicts):
+    """Two habit's returns without spread, as above."""
+    assert tried(100.0, candidate) == verdicts
+
+
 def test_of_short_episodes_a_candidate_may_play_as_many_as_it_takes():
     """Successes of 0 or 1, two fifths against one: 35 episodes tell the two apart by the errors asked for, ten do not."""
     length = MOST_PROOF_STEPS // 40
@@ -327,20 +343,40 @@ def test_while_nothing_is_learned_and_the_habit_is_paid_less_than_what_it_imitat
 
 
 @pytest.mark.parametrize(
-    ("imitated", "paid", "n_clones", "is_needed"),
+    ("imitated", "paid", "n_clones", "other_noise", "is_needed"),
     [
-        (100.0, 89.0, 1, True),
-        (100.0, 91.0, 1, False),
-        (100.0, 0.0, 1, True),
-        (100.0, 0.0, 0, False),
-        (0.0, 0.0, 1, False),
-        (-100.0, -111.0, 1, True),
-        (-100.0, -109.0, 1, False),
+        (100.0, 89.0, 1, None, True),
+        (100.0, 91.0, 1, None, False),
+        (100.0, 0.0, 1, None, True),
+        (100.0, 0.0, 0, None, False),
+        (0.0, 0.0, 1, None, False),
+        (-100.0, -111.0, 1, None, True),
+        (-100.0, -109.0, 1, None, False),
+        (100.0, 94.0, 1, 1.0, True),
+        (100.0, 94.0, 0, 1.0, False),
+        (100.0, 96.0, 1, 1.0, False),
     ],
 )
-def test_a_clone_is_needed_where_a_tenth_of_what_is_imitated_is_missing(imitated, paid, n_clones, is_needed):
-    trials = Trials(1, imitated_return=imitated, n_clones=n_clones, habit_returns=[paid, paid])
+def test_a_clone_is_needed_where_a_share_of_what_is_imitated_is_missing(imitated, paid, n_clones, other_noise, is_needed):
+    """A tenth, and half of it where the other noise was not tried yet."""
+    trials = Trials(1, imitated_return=imitated, n_clones=n_clones, habit_returns=[paid, paid], other_noise=other_noise)
     assert trials.needs_clone() == is_needed
+
+
+@pytest.mark.parametrize(("paid", "noise"), [((95.0, 95.0), 1.0), ((10.0,), 0.0)])
+def test_the_first_clone_that_is_tried_has_the_other_noise_and_those_after_it_the_better_ones(paid, noise):
+    trials = Trials(1, imitated_return=100.0, n_clones=3)
+    assert (trials.noise, trials.clone_noise) == (0.0, 1.0)
+    play_clones(trials, 50.0, 60.0)
+    played = play_clones(trials, *paid)
+    assert played[0][2] and played[-1][1] == ("accepted" if noise else "rejected")
+    assert (trials.noise, trials.clone_noise, trials.other_noise) == (noise, noise, None)
+
+
+def test_the_verdict_on_a_learner_says_nothing_about_the_noise():
+    trials = Trials(1, imitated_return=100.0)  # no clone may be tried
+    assert play_clones(trials, 50.0, 50.0, 95.0, 95.0, has_learned=True)[-1] == ("candidate", "accepted", False)
+    assert (trials.noise, trials.clone_noise) == (0.0, 1.0)
 
 
 def test_once_something_is_learned_a_clone_is_tried_after_a_rejected_learner_and_then_the_learner_again():
@@ -486,7 +522,9 @@ def test_a_clone_that_is_accepted_is_where_learning_begins(paid, verdict):
     model.policy.spread.fill_(7.0)
     updates, model._warm_up_actor = [], lambda *given, own=model._warm_up_actor: (updates.append(given), own(*given))
     prove(model, 0.0, 0.5, 0.0, 0.5, 0.0)  # noise, the habit, twice, and noise: now a clone is made
-    assert [progress for _, progress in updates] == [k / 5 for k in range(5)] and n_stored == model.replay_buffer.size() == 30
+    assert [given[1:] for given in updates] == [(k / 5, 1.0) for k in range(5)]
+    assert n_stored == model.replay_buffer.size() == 30
+    assert model.imitation_noise == 0.0
     clone = weights_of(model.policy.candidate)
     assert not differ(clone, weights_of(updates[-1][0])) and differ(clone, before[0])
     assert not differ(before[1], weights_of(model.actor.circuit)) and model.trials.is_clone and model.trials.n_clones == 2
@@ -496,6 +534,7 @@ def test_a_clone_that_is_accepted_is_where_learning_begins(paid, verdict):
     for circuit, weights in zip(circuits, expected, strict=False):
         assert not differ(weights, weights_of(circuit))
     assert bool(model.actor.circuit.optimizer.state) == (verdict == "rejected")
+    assert model.imitation_noise == (verdict == "accepted")
     assert float(region.radius) == radius
     if verdict == "accepted":
         assert th.allclose(model.policy.spread, spread_of(model._imitation_residuals()), rtol=0.2)  # of other rows
@@ -721,7 +760,7 @@ def test_noise_is_no_wider_than_the_demonstrations_around_the_warm_started_actor
     """Actions of one size around an actor that does nothing spread by that size; the least is a fiftieth of the box's half."""
     signs = np.random.default_rng(0).choice([-1.0, 1.0], size=(60, 2))
 
-    def do_nothing(model, circuit, progress):
+    def do_nothing(model, circuit, progress, noise):
         for parameter in model.actor.circuit.parameters():
             parameter.zero_()
 
@@ -743,10 +782,10 @@ def test_without_a_warm_start_the_noise_is_as_asked_for():
 def test_the_warm_starts_rates_fall_geometrically_and_leave_nothing_behind(monkeypatch):
     seen, original = [], ActPC._refresh_changes
 
-    def watched(self, circuit, n):
-        assert circuit is self.actor.circuit
+    def watched(self, circuit, n, noise):
+        assert circuit is self.actor.circuit and not noise
         seen.append((n, *(group["lr"] for group in circuit.optimizer.param_groups)))
-        return original(self, circuit, n)
+        return original(self, circuit, n, noise)
 
     monkeypatch.setattr(ActPC, "_refresh_changes", watched)
     model = imitating(policy_kwargs={"circuit_kwargs": {"feedback_rate": 0.9}}, actor_warm_start=10, learning_rate=8e-4)
