@@ -66,6 +66,11 @@ def plan_runs(comparison: Comparison, folder: Path | None = None) -> list[Run]:
     task is unknown."""
     folder = Path(comparison.output) if folder is None else folder
     filled = [_fill(comparison.shared, task, variant) for task in comparison.tasks for variant in comparison.variants]
+    names: dict[tuple[str | None, str], str | None] = {}
+    for run in filled:
+        other = names.setdefault((run.task, run.id), run.name)
+        if other != run.name:
+            raise ValueError(f"{run.task}: {other!r} and {run.name!r} have the same settings: leave one out")
     seeds = range(comparison.first_seed, comparison.first_seed + comparison.seeds)
     seeded = [run.model_copy(update={"seed": seed}) for seed in seeds for run in filled]
     own = [folder / str(run.task).replace(":", "_") / str(run.name) / f"seed{run.seed}_{run.id}" for run in seeded]

@@ -138,6 +138,7 @@ def test_a_variant_on_another_version_of_the_task_stands_beside_the_others() -> 
         (["list.yml"], "expected a mapping"),
         (["variant.yml"], "unknown key 'colour'"),
         (["name.yml"], "it becomes a folder's"),
+        (["twins.yml"], "SparseReacher-v5: 'one' and 'two' have the same settings"),
     ],
 )
 def test_mistakes_give_one_line_and_begin_nothing(
@@ -147,6 +148,8 @@ def test_mistakes_give_one_line_and_begin_nothing(
     Path("list.yml").write_text("[1]", encoding="utf-8")
     Path("variant.yml").write_text("{envs: [SparseReacher-v5], algos: [{algo: actpc, colour: red}]}", encoding="utf-8")
     Path("name.yml").write_text("{envs: [SparseReacher-v5], algos: [{algo: actpc, name: ../up}]}", encoding="utf-8")
+    twins = "[{algo: actpc, name: one}, {base: actpc, name: two}]"
+    Path("twins.yml").write_text(f"{{envs: [SparseReacher-v5], algos: {twins}}}", encoding="utf-8")
     assert main(["compare", *arguments]) == 2
     errors = capsys.readouterr().err.strip()
     assert message in errors and "\n" not in errors
