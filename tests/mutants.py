@@ -487,15 +487,15 @@ MUTANTS = [
     Mutant(
         "noise of one size",
         AGENT,
-        "noise * distances * th.randn_like(distances)",
-        "noise * th.randn_like(distances)",
+        "noise * inputs.tensor(samples.distances) * th.randn_like(features)",
+        "noise * th.randn_like(features)",
         "tests/actpc/test_agent.py -k room_between",
     ),
     Mutant(
         "distances within an episode",
         IMITATION,
-        "lengths.masked_fill_(episodes[rows, None] == episodes[chosen], th.inf)",
-        "lengths.masked_fill_(rows[:, None] == chosen, th.inf)",
+        "lengths.masked_fill_(of_features[rows, None] == of_demonstrated, th.inf)",
+        "lengths.masked_fill_(lengths == 0.0, th.inf)",
         "tests/actpc/test_agent.py -k distances",
     ),
     Mutant(

@@ -47,6 +47,7 @@ from sb3_actpc.actpc.habit import Trials
 from sb3_actpc.actpc.policies import POLICIES, ActPCActor, ActPCPolicy, Critics, check_policy, check_policy_kwargs
 from sb3_actpc.actpc.reward_signals import InternalSignals, summed_squared_errors
 from sb3_actpc.actpc.self_imitation import (
+    MOST_NEIGHBOURS,
     Episodes,
     Observations,
     Refresh,
@@ -872,18 +873,37 @@ class ActPC(OffPolicyAlgorithm):
         return circuit.hebbian_update(state)
 
     def _sample_imitated(self, n: int, noise: float) -> tuple[th.Tensor, th.Tensor, th.Tensor | None]:
-        """Features, actions and working memory of ``n`` imitated steps, the demonstrated ones with ``noise``."""
+        """Features, actions and working memory of ``n`` imitated steps, with noise where something is demonstrated."""
         inputs = self.inputs
-        if noise and self.expert is not None and self.expert.episodes.distances is None:
-            demonstrated = self.expert.episodes
-            all_features = inputs.features(inputs.observations(demonstrated.observations))
-            demonstrated.distances = distances_to_nearest(all_features, demonstrated.starts)
+        if noise and self.expert is not None:
+            self._measure_distances()
         samples = sample_union(self._imitated(), n, self.memory_history, self.refresh.weighting)
         features = inputs.features(inputs.observations(samples.observations))
         if noise and samples.distances is not None:
-            distances = inputs.tensor(samples.distances)
-            features[: len(distances)] += noise * distances * th.randn_like(distances)
+            features = features + noise * inputs.tensor(samples.distances) * th.randn_like(features)
         return features, inputs.tensor(samples.actions), inputs.memory(*inputs.past(samples.history, samples.history_mask))
+
+    def _measure_distances(self) -> None:
+        """Of imitated steps that came since: from the nearest demonstrated step of another episode."""
+        assert self.expert is not None
+        shown = self.expert.episodes
+        for part in self._imitated():
+            rows = np.arange(len(part)) if part.distances is None else np.flatnonzero(np.isnan(part.distances[:, 0]))
+            if not len(rows):
+                continue
+            near = np.arange(0, len(shown), -(-len(shown) // MOST_NEIGHBOURS))
+            numbers = shown.starts[rows] if part is shown else np.full(len(rows), -1)  # own episodes are none of these
+            others = self._features_of(shown, near), shown.starts[near]
+            distances = distances_to_nearest(self._features_of(part, rows), numbers, *others)
+            if part.distances is None:
+                part.distances = distances
+            else:
+                part.distances[rows] = distances
+
+    def _features_of(self, episodes: Episodes, rows: np.ndarray) -> th.Tensor:
+        """(B, n_features) of (B,) rows, some at a time: there can be many images."""
+        parts = [episodes.take(some).observations for some in np.array_split(rows, -(-len(rows) // 1024))]
+        return th.cat([self.inputs.features(self.inputs.observations(part)) for part in parts])
 
     # ------------------------------------------------------------------ logging, saving
 

@@ -18,7 +18,7 @@ Observations = np.ndarray | dict[str, np.ndarray]
 TensorObservations = th.Tensor | dict[str, th.Tensor]
 Weighting = Literal["returns", "uniform"]
 RETURN_EXPONENT = 4.0  # an episode that was paid half as much is imitated a sixteenth as often
-MOST_NEIGHBOURS = 20_000
+MOST_NEIGHBOURS = 20_000  # demonstrated steps among which the nearest is looked for
 PATIENCE = 20  # episodes, all with a negative return, after which the memory warns
 
 
@@ -29,9 +29,9 @@ class Refresh:
         reward-weighted regression, Peters and Schaal 2007; uniformly where no demonstration's return is positive) or
         "uniform" (the paper). Returns are compared as they are: where episodes differ in difficulty, as with random goals, the
         easy ones are imitated most
-    :param noise: standard deviation of Gaussian noise on the demonstrated features (normalised observations), not on the
-        working memory's; dimension by dimension, in units of the distance to the nearest step of another episode
-        (:func:`distances_to_nearest`), so that it fills the space between demonstrations. 0 for none (the paper); None for
+    :param noise: standard deviation of Gaussian noise on the imitated features (normalised observations), not on the working
+        memory's; dimension by dimension, in units of the distance to the nearest demonstrated step of another episode
+        (:func:`distances_to_nearest`), so that it fills the room between demonstrations. 0 for none (the paper); None for
         none at first, and with a habit for what its clones prove better (:mod:`sb3_actpc.actpc.habit`)
     :param own_episodes: which of them are imitated too: "paid" (every one, as often as its return says; "best" where steps are
         not drawn by returns, or nothing is demonstrated) or "best" (those that are paid at least what the best one was: the
@@ -60,7 +60,7 @@ class ImitationSamples(NamedTuple):
     :param actions: (B, A), scaled to [-1, 1]
     :param history: (B, H, *obs_shape), the observations before each row in its episode, oldest first; or None
     :param history_mask: (B, H), 1 where there was such an observation, or None
-    :param distances: (B', n_features) of the first B' rows, which are demonstrated, or None: see :class:`Episodes`
+    :param distances: (B, n_features), or None: see :class:`Episodes`
     """
 
     observations: Observations
@@ -85,7 +85,7 @@ class Episodes:
     :param actions: (N, A), scaled to [-1, 1]
     :param starts: (N,) index of the first transition of each row's episode
     :param returns: (N,) what each row's episode was paid
-    :param distances: (N, n_features), of :func:`distances_to_nearest`, where they are known
+    :param distances: (N, n_features), of :func:`distances_to_nearest`, NaN where they are not known yet; None where none is
     """
 
     observations: Observations
@@ -190,16 +190,19 @@ class SelfImitationMemory:
         """One whole episode: observations (T, *obs_shape) or a dict of such, actions (T, A), and its sparse return."""
         self.lengths.append(len(actions))
         self.returns.append(episode_return)
-        n_gone = 0
+        n_gone, distances = 0, None
         while len(self) > self.capacity:
             n_gone += self.lengths.pop(0)
             self.returns.pop(0)
         if self.episodes is not None:
             kept = map_observations(lambda array: array[n_gone:], self.episodes.observations)
             observations = _concatenate([kept, observations])
+            if self.episodes.distances is not None:
+                known = self.episodes.distances[n_gone:]
+                distances = np.concatenate([known, np.full((len(actions), known.shape[1]), np.nan, known.dtype)])
             actions = np.concatenate([self.episodes.actions[n_gone:], actions])
         starts = np.repeat(np.cumsum([0, *self.lengths[:-1]]), self.lengths)
-        self.episodes = Episodes(observations, actions, starts, np.repeat(self.returns, self.lengths))
+        self.episodes = Episodes(observations, actions, starts, np.repeat(self.returns, self.lengths), distances)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         if state["episodes"] is not None and "returns" not in vars(state["episodes"]):
@@ -253,29 +256,32 @@ def sample_union(parts: list[Episodes], n: int, history: int = 0, weighting: Wei
     if len(taken) == 1:
         return taken[0]
     columns: list[Any] = [
-        None if column[0] is None else _concatenate([part for part in column if part is not None])
-        for column in zip(*taken, strict=True)
+        None if any(part is None for part in column) else _concatenate(column) for column in zip(*taken, strict=True)
     ]
     return ImitationSamples(*columns)
 
 
-def distances_to_nearest(features: th.Tensor, starts: np.ndarray) -> np.ndarray:
+def distances_to_nearest(
+    features: th.Tensor, episodes: np.ndarray, demonstrated: th.Tensor, demonstrated_episodes: np.ndarray
+) -> np.ndarray:
     """
-    How far each step is from the nearest one of another episode, in every dimension: the room that a clone fills by guessing.
+    How far each step is from the nearest demonstrated one of another episode, in every dimension: the room that a clone fills
+    by guessing.
 
-    :param features: (N, n_features) of episodes
-    :param starts: (N,) first row of each row's episode
-    :return: (N, n_features), zeros where there is one episode alone; of long sets, to the nearest of ``MOST_NEIGHBOURS`` rows
+    :param features: (N, n_features) of the steps
+    :param episodes: (N,) numbers of their episodes
+    :param demonstrated: (M, n_features) of demonstrations
+    :param demonstrated_episodes: (M,) numbers of their episodes
+    :return: (N, n_features), zeros where there is no other episode
     """
-    episodes = th.as_tensor(starts, device=features.device)
-    chosen = th.linspace(0, len(features) - 1, min(len(features), MOST_NEIGHBOURS), device=features.device).long()
+    of_features, of_demonstrated = (th.as_tensor(one, device=features.device) for one in (episodes, demonstrated_episodes))
     distances = th.zeros_like(features)
     for rows in th.arange(len(features), device=features.device).split(1024):
-        lengths = th.cdist(features[rows], features[chosen])
-        lengths.masked_fill_(episodes[rows, None] == episodes[chosen], th.inf)
+        lengths = th.cdist(features[rows], demonstrated)
+        lengths.masked_fill_(of_features[rows, None] == of_demonstrated, th.inf)
         shortest, nearest = lengths.min(dim=1)
         there = shortest.isfinite()
-        distances[rows[there]] = (features[chosen[nearest[there]]] - features[rows[there]]).abs()
+        distances[rows[there]] = (demonstrated[nearest[there]] - features[rows[there]]).abs()
     return distances.cpu().numpy()
 
 

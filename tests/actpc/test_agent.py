@@ -18,7 +18,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_actpc import ActPC
-from sb3_actpc.actpc import self_imitation
+from sb3_actpc.actpc import actpc as actpc_module
 from sb3_actpc.actpc.diagnostics import Diagnostics
 from sb3_actpc.actpc.self_imitation import distances_to_nearest
 from sb3_actpc.ngc import NGCCircuit, settle_coupled
@@ -409,8 +409,8 @@ def test_noise_on_refreshed_observations_is_ridge_regression():
     assert slopes == pytest.approx([0.1, 0.05], rel=0.1)
 
 
-def test_noise_fills_the_room_between_demonstrations_and_none_is_on_own_episodes():
-    """Its standard deviation is the distance to the nearest step of the other episode, in each dimension."""
+def test_noise_fills_the_room_between_demonstrations():
+    """Its standard deviation is the distance to the nearest demonstrated step of another episode, in each dimension."""
     data = demonstrations(n_episodes=2, length=50)
     observations = np.zeros_like(data.observations)
     observations[50:] = np.arange(observations.shape[1]) / 10
@@ -420,24 +420,31 @@ def test_noise_fills_the_room_between_demonstrations_and_none_is_on_own_episodes
         first = features[: len(features) // 2 - 200]  # rows come in order
         assert first.std(0) == pytest.approx(spread * observations[-1], rel=0.05)
         assert first.mean(0) == pytest.approx(np.zeros(observations.shape[1]), abs=0.01)
-    own = np.full((100, observations.shape[1]), 7.0, dtype=np.float32)
-    model.replay_buffer.self_imitation.store(own, data.actions, 1.0)
-    features = model._sample_imitated(1000, 0.5)[0].numpy()
-    assert 300 < (features == 7.0).all(1).sum() < 700 and not np.isnan(features).any()
+    for place in (7.0, -9.0):  # own episodes, far from both and from each other
+        model._sample_imitated(10, 0.0)
+        model.replay_buffer.self_imitation.store(np.full_like(observations, place), data.actions, 1.0)
+        features = model._sample_imitated(10_000, 0.5)[0].numpy()
+        nearest = observations[-1] if place > 0 else np.zeros(observations.shape[1])
+        own = features[len(features) * 2 // 3 + 200 :] if place < 0 else features[len(features) // 2 + 200 :]
+        assert own.mean(0) == pytest.approx(np.full(observations.shape[1], place), rel=0.1)
+        assert own.std(0) == pytest.approx(0.5 * abs(place - nearest), rel=0.1)
 
 
 def test_distances_are_to_the_nearest_step_of_another_episode():
     features = th.tensor([[0.0, 0.0], [0.1, 0.0], [1.0, -2.0], [5.0, 5.0]])
-    starts = np.array([0, 0, 2, 3])
+    numbers = np.array([0, 0, 2, 3])
     expected = [[1.0, 2.0], [0.9, 2.0], [0.9, 2.0], [4.9, 5.0]]
-    assert distances_to_nearest(features, starts) == pytest.approx(np.array(expected))
-    assert not distances_to_nearest(features, np.zeros(4, dtype=int)).any()  # one episode
+    assert distances_to_nearest(features, numbers, features, numbers) == pytest.approx(np.array(expected))
+    assert not distances_to_nearest(features, np.zeros(4), features, np.zeros(4)).any()  # one episode
 
 
 def test_distances_of_long_sets_are_to_some_of_their_steps(monkeypatch):
-    monkeypatch.setattr(self_imitation, "MOST_NEIGHBOURS", 3)  # rows 0, 2 and 4
-    features, starts = th.tensor([[0.0], [1.0], [10.0], [11.0], [30.0]]), np.array([0, 1, 2, 3, 4])
-    assert distances_to_nearest(features, starts)[:, 0].tolist() == [10.0, 1.0, 10.0, 1.0, 20.0]
+    monkeypatch.setattr(actpc_module, "MOST_NEIGHBOURS", 3)  # rows 0, 2 and 4
+    data = demonstrations(n_episodes=5, length=1)
+    observations = np.repeat(np.float32([[0.0], [1.0], [10.0], [11.0], [30.0]]), data.observations.shape[1], axis=1)
+    model = make(demonstrations=dataclasses.replace(data, observations=observations))
+    model._sample_imitated(1, 1.0)
+    assert model.expert.episodes.distances[:, 0].tolist() == [10.0, 1.0, 10.0, 1.0, 20.0]
 
 
 @pytest.mark.parametrize(("weighting", "share"), [("returns", 0.0), ("uniform", 0.5)])
