@@ -354,7 +354,7 @@ MUTANTS = [
     Mutant("random actions prove something", AGENT, "or self.num_timesteps <= self.learning_starts", "", f"{HABIT} -k random"),
     Mutant("the habit is not copied", AGENT, "_copy(self.policy.candidate, self.actor.habit)", "pass", f"{HABIT} -k predict"),
     Mutant("the learning actor acts", POLICIES, "self.circuit if self.habit is None", "self.circuit if True", HABIT),
-    Mutant("one proof is enough", TRIALS, "elif n < N_PROOFS or", "elif n < 1 or", HABIT),
+    Mutant("one proof is enough", TRIALS, "elif n < N_PROOFS:", "elif n < 1:", HABIT),
     Mutant("a tie is a proof", TRIALS, "gain >= max(smallest, (SURE", "gain >= max(0.0, (SURE", HABIT),
     Mutant("chance is a proof", TRIALS, "(SURE if has_time else LIKELY) * error", "0.0", HABIT),
     Mutant("chance is a tie", TRIALS, "abs(gain) + SURE * error > smallest", "abs(gain) > smallest", f"{HABIT} -k chance"),
@@ -455,6 +455,17 @@ MUTANTS = [
         f"{HABIT} -k share_of_what",
     ),
     Mutant(
+        "a tie ends the search for noise", TRIALS, 'self.is_clone and verdict != "tied"', "self.is_clone", f"{HABIT} -k tie"
+    ),
+    Mutant(
+        "a checkpoint's noise is heeded",
+        AGENT,
+        '**state["trials"])\n        self._heed_given_noise()',
+        '**state["trials"])',
+        HABIT,
+    ),
+    Mutant("own episodes keep old distances", AGENT, "memory.episodes.distances = None", "pass", f"{HABIT} -k anew"),
+    Mutant(
         "the other noise is never tried",
         TRIALS,
         "self.noise if self.other_noise is None else",
@@ -472,7 +483,11 @@ MUTANTS = [
         HABIT,
     ),
     Mutant(
-        "a learner's verdict ends the search for noise", TRIALS, "        if self.is_clone:\n", "        if True:\n", HABIT
+        "a learner's verdict ends the search for noise",
+        TRIALS,
+        "if self.is_clone and verdict",
+        "if verdict",
+        f"{HABIT} -k noise",
     ),
     Mutant(
         "clones imitate with the learner's noise",
@@ -509,8 +524,8 @@ MUTANTS = [
     Mutant(
         "the spread of the habit does not count",
         TRIALS,
-        "samples = self.candidate_returns, self.habit_returns",
-        "samples = [self.candidate_returns]",
+        "in (self.candidate_returns, self.habit_returns) if sample",
+        "in (self.candidate_returns,) if sample",
         f"{HABIT} -k spread",
     ),
     Mutant("all dimensions spread alike", REGION, "residuals.square().mean(0)", "residuals.square().mean()", REGIONS),

@@ -312,8 +312,7 @@ class ActPC(OffPolicyAlgorithm):
         if self.policy.habit:
             self.trials = self.trials or Trials(self.n_envs)  # a loaded agent knows what its habit was paid
             self.trials.n_envs = self.n_envs
-            if self.refresh.noise is not None:
-                self.trials.noise, self.trials.other_noise = self.refresh.noise, None
+            self._heed_given_noise()
             clones = self.refresh.n_clones - 1 if self.demonstrations is not None and self.actor_warm_start else 0
             self.trials.n_clones = min(self.trials.n_clones, clones)
         self._setup_demonstrations()
@@ -455,6 +454,8 @@ class ActPC(OffPolicyAlgorithm):
         if memory is not None:
             is_weighted = self.expert is not None and is_by_return([self.expert.episodes], self.refresh.weighting)
             memory.takes_all = is_weighted and self.refresh.own_episodes == "paid"
+            if memory.episodes is not None:
+                memory.episodes.distances = None  # the demonstrations may be others by now
         if self.verbose:
             print(self.describe())
         self.pretrain(between_updates(result[1]), progress_bar)
@@ -528,6 +529,10 @@ class ActPC(OffPolicyAlgorithm):
         if self.actor_warm_start and self.trials is not None:
             self.trials.n_clones = self.refresh.n_clones - 1
         self.pretrained = True
+
+    def _heed_given_noise(self) -> None:
+        if self.trials is not None and self.refresh.noise is not None:
+            self.trials.noise, self.trials.other_noise = self.refresh.noise, None
 
     @property
     def imitation_noise(self) -> float:
@@ -888,7 +893,10 @@ class ActPC(OffPolicyAlgorithm):
         assert self.expert is not None
         shown = self.expert.episodes
         for part in self._imitated():
-            rows = np.arange(len(part)) if part.distances is None else np.flatnonzero(np.isnan(part.distances[:, 0]))
+            if part.distances is None:
+                rows = np.arange(len(part))
+            else:
+                rows = np.flatnonzero(np.isnan(part.distances[:, 0])) if part is not shown else np.arange(0)
             if not len(rows):
                 continue
             near = np.arange(0, len(shown), -(-len(shown) // MOST_NEIGHBOURS))
@@ -990,6 +998,7 @@ class ActPC(OffPolicyAlgorithm):
         self.signals.restore_checkpoint_state(state["signals"])
         self.diagnostics.values = dict(state["diagnostics"])
         self.trials = None if state["trials"] is None else Trials(**state["trials"])
+        self._heed_given_noise()
 
     @classmethod
     def load_checkpoint(cls: type[SelfActPC], path: str | PathLike[str], env: GymEnv | str, **keywords: Any) -> Restored:

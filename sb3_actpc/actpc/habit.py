@@ -42,9 +42,9 @@ class Trials:
 
     Clones of the same demonstrations can do very differently, by their first synapses alone. So while the habit is paid less
     than what it imitates, by more than ``SHORTFALL`` of it, further clones are candidates: before anything is learned, and
-    after a rejected learner. One that is accepted is where learning begins anew. The first that is tried has another noise on
-    what it imitates, and those after it the better one's: noise makes an arm's clone sure and a Hopper's fall, and what is
-    demonstrated does not say which.
+    after a rejected learner. One that is accepted is where learning begins anew. The first that is tried (for which half that
+    shortfall is enough) has another noise on what it imitates, and those after it the better one's: noise makes an arm's clone
+    sure and a Hopper's fall, and what is demonstrated does not say which.
 
     :param n_envs: environments, each with an episode of its own
     """
@@ -63,7 +63,7 @@ class Trials:
     habit_steps: int = 0
     imitated_return: float = 0.0  # what the imitated episodes were paid
     noise: float = 0.0  # on what is imitated, since learning began
-    other_noise: float | None = OTHER_NOISE  # of the next clone; None once it was tried
+    other_noise: float | None = OTHER_NOISE  # of the next clone; None once it was tried, or where the noise is given
     n_clones: int = 0  # that may still be tried
     begun_at: int = 0  # update at which learning began with the present clone
     on_trial: bool = False  # there is a candidate that is not judged yet
@@ -166,7 +166,7 @@ class Trials:
         elif has_time and abs(gain) + SURE * error > smallest:
             return None
         self.learner_was_rejected = verdict == "rejected" and not self.is_clone
-        if self.is_clone:
+        if self.is_clone and verdict != "tied":  # which says nothing
             self.noise = self.clone_noise if verdict == "accepted" else self.noise
             self.other_noise = None
         self.tests_habit = verdict != "accepted"
@@ -177,10 +177,10 @@ class Trials:
 
     def _standard_error(self) -> float:
         """Of the difference of the two means, from the variance within both."""
-        samples = self.candidate_returns, self.habit_returns
-        squares = sum((one - fmean(sample)) ** 2 for sample in samples for one in sample)
+        samples = [sample for sample in (self.candidate_returns, self.habit_returns) if sample]
+        squares = sum((one - mean) ** 2 for sample, mean in zip(samples, map(fmean, samples), strict=True) for one in sample)
         degrees = max(sum(map(len, samples)) - 2, 1)
-        return (squares / degrees * sum(1 / len(sample) for sample in samples if sample)) ** 0.5
+        return (squares / degrees * sum(1 / len(sample) for sample in samples)) ** 0.5
 
     def checkpoint_state(self) -> dict[str, Any]:
         """Everything, as plain values."""

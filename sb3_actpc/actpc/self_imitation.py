@@ -36,7 +36,7 @@ class Refresh:
     :param own_episodes: which of them are imitated too: "paid" (every one, as often as its return says; "best" where steps are
         not drawn by returns, or nothing is demonstrated) or "best" (those that are paid at least what the best one was: the
         paper)
-    :param n_clones: clones that are tried at most, the first included, while the habit is paid less than nine tenths of what
+    :param n_clones: clones that are tried at most, the first included, while the habit is paid clearly less than what
         it imitates (:mod:`sb3_actpc.actpc.habit`): returns of environment and demonstrations must be of one scale. 1 for the
         warm-started actor alone (the paper); without a habit or a warm start there are no others
     :raises ValueError: for another value
@@ -213,7 +213,8 @@ class SelfImitationMemory:
         """The stored episodes and their returns, for a checkpoint."""
         episodes = None
         if self.episodes is not None:
-            episodes = {field.name: getattr(self.episodes, field.name) for field in fields(self.episodes)}
+            names = [field.name for field in fields(self.episodes) if field.name != "distances"]  # they are measured anew
+            episodes = {name: getattr(self.episodes, name) for name in names}
         return {"returns": list(self.returns), "lengths": list(self.lengths), "episodes": episodes}
 
     def restore_checkpoint_state(self, state: dict[str, Any]) -> None:
@@ -275,9 +276,9 @@ def distances_to_nearest(
     :return: (N, n_features), zeros where there is no other episode
     """
     of_features, of_demonstrated = (th.as_tensor(one, device=features.device) for one in (episodes, demonstrated_episodes))
-    distances = th.zeros_like(features)
+    distances, mean = th.zeros_like(features), demonstrated.mean(0)  # far from 0 the lengths would lose their digits
     for rows in th.arange(len(features), device=features.device).split(1024):
-        lengths = th.cdist(features[rows], demonstrated)
+        lengths = th.cdist(features[rows] - mean, demonstrated - mean)
         lengths.masked_fill_(of_features[rows, None] == of_demonstrated, th.inf)
         shortest, nearest = lengths.min(dim=1)
         there = shortest.isfinite()

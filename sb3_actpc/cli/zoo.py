@@ -153,7 +153,7 @@ def sample_actpc_params(trial: Any, n_actions: int, n_envs: int, additional_args
     trial.suggest_categorical("alpha_ep", [0.0, 0.1, 1.0])
     trial.suggest_categorical("alpha_in", [0.0, 0.1, 1.0])
     trial.suggest_categorical("weight_decay", [0.0, 0.1, 0.3, 1.0])
-    trial.suggest_categorical("refresh_noise", [0.0, 0.05, 0.1, 0.2])
+    trial.suggest_categorical("refresh_noise", [None, 0.0, 0.5, 1.0])
     trial.suggest_categorical("refresh_weighting", ["returns", "uniform"])
     params = convert_actpc_params(trial.params)
     trial.set_user_attr("gamma", params["gamma"])

@@ -434,7 +434,9 @@ def test_distances_are_to_the_nearest_step_of_another_episode():
     features = th.tensor([[0.0, 0.0], [0.1, 0.0], [1.0, -2.0], [5.0, 5.0]])
     numbers = np.array([0, 0, 2, 3])
     expected = [[1.0, 2.0], [0.9, 2.0], [0.9, 2.0], [4.9, 5.0]]
-    assert distances_to_nearest(features, numbers, features, numbers) == pytest.approx(np.array(expected))
+    for far in (0.0, 4096.0):
+        there = features + far
+        assert distances_to_nearest(there, numbers, there, numbers) == pytest.approx(np.array(expected), abs=1e-3)
     assert not distances_to_nearest(features, np.zeros(4), features, np.zeros(4)).any()  # one episode
 
 

@@ -373,6 +373,35 @@ def test_the_first_clone_that_is_tried_has_the_other_noise_and_those_after_it_th
     assert (trials.noise, trials.clone_noise, trials.other_noise) == (noise, noise, None)
 
 
+def test_a_tie_says_nothing_about_the_noise():
+    trials = Trials(1, imitated_return=100.0, n_clones=3)
+    assert play_clones(trials, 0.0, 0.0, 0.0, 0.0)[-1] == ("candidate", "tied", False)
+    assert (trials.noise, trials.clone_noise) == (0.0, 1.0)
+
+
+def test_the_noise_that_is_given_holds_whatever_a_checkpoint_says():
+    stored, given = imitating(), imitating(refresh_kwargs={"noise": 0.5})
+    for model in (stored, given):
+        model.learn(10)
+    stored.trials.noise, stored.trials.other_noise = 1.0, None
+    given.restore_checkpoint_state(stored.checkpoint_state())
+    assert (given.imitation_noise, given.trials.clone_noise) == (0.5, 0.5)
+    given.set_env(given.get_env())
+    assert (given.imitation_noise, given.trials.clone_noise) == (0.5, 0.5)
+
+
+def test_own_episodes_are_measured_anew_from_other_demonstrations():
+    model = imitating(refresh_kwargs={"noise": 0.5}, env=lambda: CountingEnv(returns=(1.0,)))
+    model.learn(60)
+    own, shown = model.replay_buffer.self_imitation, model.expert.episodes
+    before = own.episodes.distances[:5].copy()
+    data = demonstrations()
+    model.demonstrations = dataclasses.replace(data, observations=data.observations + 3.0)
+    model.learn(60, reset_num_timesteps=False)
+    assert model.expert.episodes is not shown and not np.isnan(own.episodes.distances[:5]).any()
+    assert (own.episodes.distances[:5] != before).any()
+
+
 def test_the_verdict_on_a_learner_says_nothing_about_the_noise():
     trials = Trials(1, imitated_return=100.0)  # no clone may be tried
     assert play_clones(trials, 50.0, 50.0, 95.0, 95.0, has_learned=True)[-1] == ("candidate", "accepted", False)
