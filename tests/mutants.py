@@ -450,55 +450,14 @@ MUTANTS = [
     Mutant(
         "a costly habit needs clones",
         TRIALS,
-        "shortfall * abs(self.imitated_return)",
-        "shortfall * self.imitated_return",
-        f"{HABIT} -k share_of_what",
-    ),
-    Mutant(
-        "a tie ends the search for noise", TRIALS, 'self.is_clone and verdict != "tied"', "self.is_clone", f"{HABIT} -k tie"
-    ),
-    Mutant(
-        "a checkpoint's noise is heeded",
-        AGENT,
-        '**state["trials"])\n        self._heed_given_noise()',
-        '**state["trials"])',
-        HABIT,
+        "SHORTFALL * abs(self.imitated_return)",
+        "SHORTFALL * self.imitated_return",
+        f"{HABIT} -k tenth",
     ),
     Mutant("own episodes keep old distances", AGENT, "memory.episodes.distances = None", "pass", f"{HABIT} -k anew"),
-    Mutant(
-        "the other noise is never tried",
-        TRIALS,
-        "self.noise if self.other_noise is None else",
-        "self.noise if True else",
-        HABIT,
-    ),
-    Mutant(
-        "the other noise is tried for ever", TRIALS, "            self.other_noise = None\n", "", f"{HABIT} -k other_noise"
-    ),
-    Mutant(
-        "a rejected clone's noise stays",
-        TRIALS,
-        'self.clone_noise if verdict == "accepted"',
-        "self.clone_noise if True",
-        HABIT,
-    ),
-    Mutant(
-        "a learner's verdict ends the search for noise",
-        TRIALS,
-        "if self.is_clone and verdict",
-        "if verdict",
-        f"{HABIT} -k noise",
-    ),
-    Mutant(
-        "clones imitate with the learner's noise",
-        AGENT,
-        "noise = self.trials.clone_noise",
-        "noise = self.imitation_noise",
-        HABIT,
-    ),
-    Mutant(
-        "a given noise is not heeded", AGENT, "self.refresh.noise or 0.0 if", "0.0 if", "tests/actpc/test_agent.py -k ridge"
-    ),
+    Mutant("a given noise is not heeded", AGENT, "return self.refresh.noise\n", "return 1.0\n", f"{LEARNS} -k ridge"),
+    Mutant("noise where there is no room", AGENT, "float(self.expert.leaves_room)", "1.0", f"{LEARNS} -k room"),
+    Mutant("room in any unit", IMITATION, "> np.median(lengths)", "> 0.5", f"{LEARNS} -k room"),
     Mutant(
         "noise of one size",
         AGENT,

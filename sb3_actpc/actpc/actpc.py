@@ -47,6 +47,7 @@ from sb3_actpc.actpc.habit import Trials
 from sb3_actpc.actpc.policies import POLICIES, ActPCActor, ActPCPolicy, Critics, check_policy, check_policy_kwargs
 from sb3_actpc.actpc.reward_signals import InternalSignals, summed_squared_errors
 from sb3_actpc.actpc.self_imitation import (
+    MOST_MEASURED,
     MOST_NEIGHBOURS,
     Episodes,
     Observations,
@@ -54,6 +55,7 @@ from sb3_actpc.actpc.self_imitation import (
     distances_to_nearest,
     imitated_return,
     is_by_return,
+    leave_room,
     map_observations,
     sample_union,
 )
@@ -312,7 +314,6 @@ class ActPC(OffPolicyAlgorithm):
         if self.policy.habit:
             self.trials = self.trials or Trials(self.n_envs)  # a loaded agent knows what its habit was paid
             self.trials.n_envs = self.n_envs
-            self._heed_given_noise()
             clones = self.refresh.n_clones - 1 if self.demonstrations is not None and self.actor_warm_start else 0
             self.trials.n_clones = min(self.trials.n_clones, clones)
         self._setup_demonstrations()
@@ -415,8 +416,7 @@ class ActPC(OffPolicyAlgorithm):
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         super().set_env(env, force_reset)
         if self.trials is not None:  # another environment may pay for other steps
-            kept = ("n_clones", "begun_at", "noise", "other_noise")
-            self.trials = Trials(self.n_envs, **{name: getattr(self.trials, name) for name in kept})
+            self.trials = Trials(self.n_envs, n_clones=self.trials.n_clones, begun_at=self.trials.begun_at)
         if self.demonstrations is not None:
             self._setup_demonstrations()
 
@@ -481,6 +481,7 @@ class ActPC(OffPolicyAlgorithm):
             f"reward: {ext:g} x task (alpha_ext) + {ep:g} x epistemic (alpha_ep) + {inst:g} x instrumental signal (alpha_in)\n"
             f"demonstrations: {'none' if self.expert is None else self.expert.demonstrations!r}\n"
             f"imitated: {self._describe_imitated()}\n"
+            f"noise on what is imitated: {self.imitation_noise:g} of the distance to another demonstration\n"
             f"off: {', '.join(name for name, value in parts.items() if not value) or 'nothing'}"
         )
 
@@ -523,29 +524,20 @@ class ActPC(OffPolicyAlgorithm):
             if update < n_prior:
                 self._update_prior(self.policy.batch_size_of("prior", self.batch_size))
             else:
-                self._warm_up_actor(self.actor.circuit, (update - n_prior) / self.actor_warm_start, self.imitation_noise)
+                self._warm_up_actor(self.actor.circuit, (update - n_prior) / self.actor_warm_start)
             self.n_pretraining_updates += 1
         self._start_from(self.actor.circuit)
         if self.actor_warm_start and self.trials is not None:
             self.trials.n_clones = self.refresh.n_clones - 1
         self.pretrained = True
 
-    def _heed_given_noise(self) -> None:
-        if self.trials is not None and self.refresh.noise is not None:
-            self.trials.noise, self.trials.other_noise = self.refresh.noise, None
-
-    @property
-    def imitation_noise(self) -> float:
-        """The present noise on what is imitated: the one asked for, or the one that clones have proved better."""
-        return self.refresh.noise or 0.0 if self.trials is None else self.trials.noise
-
-    def _warm_up_actor(self, circuit: NGCCircuit, progress: float, noise: float) -> None:
+    def _warm_up_actor(self, circuit: NGCCircuit, progress: float) -> None:
         """One update on imitated actions; ``progress`` is the share of the warm start that is done."""
         first, last = WARM_START_RATES
         rate = first * (last / first) ** progress
         for group, own in zip(circuit.optimizer.param_groups, circuit.parameter_groups(rate), strict=True):
             group["lr"] = own["lr"]
-        circuit.apply_changes(self._refresh_changes(circuit, WARM_START_BATCH, noise))
+        circuit.apply_changes(self._refresh_changes(circuit, WARM_START_BATCH))
 
     def _start_from(self, clone: NGCCircuit) -> None:
         """Learning begins with this actor."""
@@ -661,13 +653,12 @@ class ActPC(OffPolicyAlgorithm):
         if not self.trials.is_clone:
             _copy(self.policy.actor_average, self.policy.candidate)
             return
-        noise = self.trials.clone_noise
         if self.verbose:
             paid, imitated = self.trials.habit_return, self.trials.imitated_return
-            print(f"a clone is tried, with noise {noise:g}: the habit is paid {paid:.4g}, what it imitates {imitated:.4g}")
+            print(f"another clone is tried: the habit is paid {paid:.4g}, what it imitates {imitated:.4g}")
         clone = self.policy.make_actor()
         for update in range(self.actor_warm_start):
-            self._warm_up_actor(clone, update / self.actor_warm_start, noise)
+            self._warm_up_actor(clone, update / self.actor_warm_start)
         _copy(clone, self.policy.candidate)
 
     def _check_observations(self, observations: Any) -> None:
@@ -782,7 +773,7 @@ class ActPC(OffPolicyAlgorithm):
         """Motor-action circuit: pressure of the critic (line 19) plus refresh (line 26), in one step of the optimiser."""
         changes = None
         if self.refresh_weight and self._imitated():
-            changes = self._refresh_changes(self.actor.circuit, len(batch.features), self.imitation_noise)
+            changes = self._refresh_changes(self.actor.circuit, len(batch.features))
         if changes is not None:
             self.diagnostics.change_norms("refresh", changes.scale_(self.refresh_weight))
         if self.actor_pressure and self._n_updates > self.critic_warmup:
@@ -870,23 +861,38 @@ class ActPC(OffPolicyAlgorithm):
         own = [] if memory is None or memory.episodes is None else [memory.episodes]
         return own if self.expert is None else [self.expert.episodes, *own]
 
-    def _refresh_changes(self, circuit: NGCCircuit, n: int, noise: float) -> HebbianChanges:
+    def _refresh_changes(self, circuit: NGCCircuit, n: int) -> HebbianChanges:
         """Settle the actor, or a clone of the same imitated actions, on ``n`` of them."""
-        state = circuit.settle(*self._sample_imitated(n, noise))
+        state = circuit.settle(*self._sample_imitated(n))
         if circuit is self.actor.circuit:
             self.diagnostics.settled("actor", state)
         return circuit.hebbian_update(state)
 
-    def _sample_imitated(self, n: int, noise: float) -> tuple[th.Tensor, th.Tensor, th.Tensor | None]:
+    def _sample_imitated(self, n: int) -> tuple[th.Tensor, th.Tensor, th.Tensor | None]:
         """Features, actions and working memory of ``n`` imitated steps, with noise where something is demonstrated."""
-        inputs = self.inputs
-        if noise and self.expert is not None:
+        inputs, noise = self.inputs, self.imitation_noise
+        if noise:
             self._measure_distances()
         samples = sample_union(self._imitated(), n, self.memory_history, self.refresh.weighting)
         features = inputs.features(inputs.observations(samples.observations))
         if noise and samples.distances is not None:
             features = features + noise * inputs.tensor(samples.distances) * th.randn_like(features)
         return features, inputs.tensor(samples.actions), inputs.memory(*inputs.past(samples.history, samples.history_mask))
+
+    @property
+    def imitation_noise(self) -> float:
+        """The noise on what is imitated: as asked for, or by default 1 where the demonstrations leave room and 0 where not."""
+        if self.expert is None:
+            return 0.0
+        if self.refresh.noise is not None:
+            return self.refresh.noise
+        if self.expert.leaves_room is None:
+            shown = self.expert.episodes
+            rows, near = (np.arange(0, len(shown), -(-len(shown) // most)) for most in (MOST_MEASURED, MOST_NEIGHBOURS))
+            rows = rows[(rows + 1 < len(shown)) & (shown.starts[rows] == shown.starts[np.minimum(rows + 1, len(shown) - 1)])]
+            here, next_, others = (self._features_of(shown, some) for some in (rows, rows + 1, near))
+            self.expert.leaves_room = leave_room(here, next_, shown.starts[rows], others, shown.starts[near])
+        return float(self.expert.leaves_room)
 
     def _measure_distances(self) -> None:
         """Of imitated steps that came since: from the nearest demonstrated step of another episode."""
@@ -910,7 +916,7 @@ class ActPC(OffPolicyAlgorithm):
 
     def _features_of(self, episodes: Episodes, rows: np.ndarray) -> th.Tensor:
         """(B, n_features) of (B,) rows, some at a time: there can be many images."""
-        parts = [episodes.take(some).observations for some in np.array_split(rows, -(-len(rows) // 1024))]
+        parts = [episodes.take(some).observations for some in np.array_split(rows, 1 + len(rows) // 1024)]
         return th.cat([self.inputs.features(self.inputs.observations(part)) for part in parts])
 
     # ------------------------------------------------------------------ logging, saving
@@ -998,7 +1004,6 @@ class ActPC(OffPolicyAlgorithm):
         self.signals.restore_checkpoint_state(state["signals"])
         self.diagnostics.values = dict(state["diagnostics"])
         self.trials = None if state["trials"] is None else Trials(**state["trials"])
-        self._heed_given_noise()
 
     @classmethod
     def load_checkpoint(cls: type[SelfActPC], path: str | PathLike[str], env: GymEnv | str, **keywords: Any) -> Restored:

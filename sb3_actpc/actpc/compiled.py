@@ -51,7 +51,7 @@ class CompiledUpdate:
         """
         agent = self.agent
         # drawn in the order of the eager update
-        imitated = None if actor is None else agent._sample_imitated(len(actor.features), agent.imitation_noise)
+        imitated = None if actor is None else agent._sample_imitated(len(actor.features))
         given = _Given(actor, critic, generator, imitated, agent._target_noise(critic))
         circuits = [*agent.critic, *([agent.generator] if agent.alpha_ep else [])]
         if actor is not None:

@@ -42,6 +42,7 @@ class DemonstrationReplay:
         )
         self.epistemic, self.instrumental = np.zeros((2, len(demonstrations)), dtype=np.float32)
         self.has_signals = False
+        self.leaves_room: bool | None = None  # whether noise fills what lies between the episodes; None before that is asked
 
     def __len__(self) -> int:
         return len(self.demonstrations)

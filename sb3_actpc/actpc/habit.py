@@ -18,10 +18,7 @@ N_PROOFS = 2  # episodes of a candidate at least, before it is judged by less th
 PROOF_STEPS, ENOUGH_PROOFS = 500, 10
 MOST_PROOF_STEPS = 2000  # that a candidate has for a proof
 KEPT_RETURNS = 20  # of the habit
-# of what the imitated episodes were paid: a clone that is paid less by more is no good one. The second is for the first clone
-# that is tried, which has another noise
-SHORTFALL, FIRST_SHORTFALL = 0.1, 0.05
-OTHER_NOISE = 1.0  # see Refresh
+SHORTFALL = 0.1  # of what the imitated episodes were paid: a clone that is paid less by more is no good one
 # standard errors: that a gain must pass at any time, and after ``MOST_PROOF_STEPS``; the second is also a loss's before
 SURE, LIKELY = 1.5, 0.5
 # shares of the habit's mean return: what counts as a gain or a loss, and with what loss a candidate is rejected at once
@@ -42,9 +39,7 @@ class Trials:
 
     Clones of the same demonstrations can do very differently, by their first synapses alone. So while the habit is paid less
     than what it imitates, by more than ``SHORTFALL`` of it, further clones are candidates: before anything is learned, and
-    after a rejected learner. One that is accepted is where learning begins anew. The first that is tried (for which half that
-    shortfall is enough) has another noise on what it imitates, and those after it the better one's: noise makes an arm's clone
-    sure and a Hopper's fall, and what is demonstrated does not say which.
+    after a rejected learner. One that is accepted is where learning begins anew.
 
     :param n_envs: environments, each with an episode of its own
     """
@@ -62,8 +57,6 @@ class Trials:
     habit_proofs: int = 0  # episodes since the last verdict, and their steps
     habit_steps: int = 0
     imitated_return: float = 0.0  # what the imitated episodes were paid
-    noise: float = 0.0  # on what is imitated, since learning began
-    other_noise: float | None = OTHER_NOISE  # of the next clone; None once it was tried, or where the noise is given
     n_clones: int = 0  # that may still be tried
     begun_at: int = 0  # update at which learning began with the present clone
     on_trial: bool = False  # there is a candidate that is not judged yet
@@ -87,16 +80,10 @@ class Trials:
         """Mean of the habit's last returns; 0 where there is none yet."""
         return fmean(self.habit_returns) if self.habit_returns else 0.0
 
-    @property
-    def clone_noise(self) -> float:
-        """Noise on what the next clone imitates, or the one on trial."""
-        return self.noise if self.other_noise is None else self.other_noise
-
     def needs_clone(self) -> bool:
         """Whether the next candidate is a clone."""
         is_due = self.learner_was_rejected or not self.has_learned
-        shortfall = SHORTFALL if self.other_noise is None else FIRST_SHORTFALL
-        least = self.imitated_return - shortfall * abs(self.imitated_return)
+        least = self.imitated_return - SHORTFALL * abs(self.imitated_return)
         return is_due and self.n_clones > 0 and self.habit_return < least
 
     def step(self, env: int, reward: float) -> None:
@@ -166,9 +153,6 @@ class Trials:
         elif has_time and abs(gain) + SURE * error > smallest:
             return None
         self.learner_was_rejected = verdict == "rejected" and not self.is_clone
-        if self.is_clone and verdict != "tied":  # which says nothing
-            self.noise = self.clone_noise if verdict == "accepted" else self.noise
-            self.other_noise = None
         self.tests_habit = verdict != "accepted"
         self.candidate_returns, self.candidate_steps, self.on_trial = [], 0, False
         self.habit_proofs, self.habit_steps = 0, 0

@@ -19,6 +19,7 @@ TensorObservations = th.Tensor | dict[str, th.Tensor]
 Weighting = Literal["returns", "uniform"]
 RETURN_EXPONENT = 4.0  # an episode that was paid half as much is imitated a sixteenth as often
 MOST_NEIGHBOURS = 20_000  # demonstrated steps among which the nearest is looked for
+MOST_MEASURED = 1000  # steps by which it is judged whether there is room
 PATIENCE = 20  # episodes, all with a negative return, after which the memory warns
 
 
@@ -31,12 +32,12 @@ class Refresh:
         easy ones are imitated most
     :param noise: standard deviation of Gaussian noise on the imitated features (normalised observations), not on the working
         memory's; dimension by dimension, in units of the distance to the nearest demonstrated step of another episode
-        (:func:`distances_to_nearest`), so that it fills the room between demonstrations. 0 for none (the paper); None for
-        none at first, and with a habit for what its clones prove better (:mod:`sb3_actpc.actpc.habit`)
+        (:func:`distances_to_nearest`), so that it fills the room between demonstrations. 0 for none (the paper); None for 1
+        where the demonstrations leave room (:func:`leave_room`), else 0
     :param own_episodes: which of them are imitated too: "paid" (every one, as often as its return says; "best" where steps are
         not drawn by returns, or nothing is demonstrated) or "best" (those that are paid at least what the best one was: the
         paper)
-    :param n_clones: clones that are tried at most, the first included, while the habit is paid clearly less than what
+    :param n_clones: clones that are tried at most, the first included, while the habit is paid less than nine tenths of what
         it imitates (:mod:`sb3_actpc.actpc.habit`): returns of environment and demonstrations must be of one scale. 1 for the
         warm-started actor alone (the paper); without a habit or a warm start there are no others
     :raises ValueError: for another value
@@ -284,6 +285,31 @@ def distances_to_nearest(
         there = shortest.isfinite()
         distances[rows[there]] = (demonstrated[nearest[there]] - features[rows[there]]).abs()
     return distances.cpu().numpy()
+
+
+def leave_room(
+    features: th.Tensor,
+    next_features: th.Tensor,
+    episodes: np.ndarray,
+    demonstrated: th.Tensor,
+    demonstrated_episodes: np.ndarray,
+) -> bool:
+    """
+    Whether demonstrations leave room between their episodes: the nearest step of another one is farther than a step leads.
+
+    A scale-free measure of how sparsely a task is shown. Arms and goals have distances of 2 to 7 steps (each episode begins
+    and ends elsewhere), gaits of 0.03 to 0.7, where noise only blurs what to do.
+
+    :param features: (N, n_features) of some steps
+    :param next_features: (N, n_features) one step later
+    :param episodes: (N,) numbers of their episodes
+    :param demonstrated: as for :func:`distances_to_nearest`
+    :param demonstrated_episodes: likewise
+    :return: whether it is so, by the medians
+    """
+    distances = distances_to_nearest(features, episodes, demonstrated, demonstrated_episodes)
+    lengths = (next_features - features).norm(dim=1).cpu().numpy()
+    return bool(len(lengths)) and bool(np.median(np.linalg.norm(distances, axis=1)) > np.median(lengths))
 
 
 def _concatenate(arrays: Sequence[Any]) -> Any:

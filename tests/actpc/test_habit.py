@@ -343,51 +343,20 @@ def test_while_nothing_is_learned_and_the_habit_is_paid_less_than_what_it_imitat
 
 
 @pytest.mark.parametrize(
-    ("imitated", "paid", "n_clones", "other_noise", "is_needed"),
+    ("imitated", "paid", "n_clones", "is_needed"),
     [
-        (100.0, 89.0, 1, None, True),
-        (100.0, 91.0, 1, None, False),
-        (100.0, 0.0, 1, None, True),
-        (100.0, 0.0, 0, None, False),
-        (0.0, 0.0, 1, None, False),
-        (-100.0, -111.0, 1, None, True),
-        (-100.0, -109.0, 1, None, False),
-        (100.0, 94.0, 1, 1.0, True),
-        (100.0, 94.0, 0, 1.0, False),
-        (100.0, 96.0, 1, 1.0, False),
+        (100.0, 89.0, 1, True),
+        (100.0, 91.0, 1, False),
+        (100.0, 0.0, 1, True),
+        (100.0, 0.0, 0, False),
+        (0.0, 0.0, 1, False),
+        (-100.0, -111.0, 1, True),
+        (-100.0, -109.0, 1, False),
     ],
 )
-def test_a_clone_is_needed_where_a_share_of_what_is_imitated_is_missing(imitated, paid, n_clones, other_noise, is_needed):
-    """A tenth, and half of it where the other noise was not tried yet."""
-    trials = Trials(1, imitated_return=imitated, n_clones=n_clones, habit_returns=[paid, paid], other_noise=other_noise)
+def test_a_clone_is_needed_where_a_tenth_of_what_is_imitated_is_missing(imitated, paid, n_clones, is_needed):
+    trials = Trials(1, imitated_return=imitated, n_clones=n_clones, habit_returns=[paid, paid])
     assert trials.needs_clone() == is_needed
-
-
-@pytest.mark.parametrize(("paid", "noise"), [((95.0, 95.0), 1.0), ((10.0,), 0.0)])
-def test_the_first_clone_that_is_tried_has_the_other_noise_and_those_after_it_the_better_ones(paid, noise):
-    trials = Trials(1, imitated_return=100.0, n_clones=3)
-    assert (trials.noise, trials.clone_noise) == (0.0, 1.0)
-    play_clones(trials, 50.0, 60.0)
-    played = play_clones(trials, *paid)
-    assert played[0][2] and played[-1][1] == ("accepted" if noise else "rejected")
-    assert (trials.noise, trials.clone_noise, trials.other_noise) == (noise, noise, None)
-
-
-def test_a_tie_says_nothing_about_the_noise():
-    trials = Trials(1, imitated_return=100.0, n_clones=3)
-    assert play_clones(trials, 0.0, 0.0, 0.0, 0.0)[-1] == ("candidate", "tied", False)
-    assert (trials.noise, trials.clone_noise) == (0.0, 1.0)
-
-
-def test_the_noise_that_is_given_holds_whatever_a_checkpoint_says():
-    stored, given = imitating(), imitating(refresh_kwargs={"noise": 0.5})
-    for model in (stored, given):
-        model.learn(10)
-    stored.trials.noise, stored.trials.other_noise = 1.0, None
-    given.restore_checkpoint_state(stored.checkpoint_state())
-    assert (given.imitation_noise, given.trials.clone_noise) == (0.5, 0.5)
-    given.set_env(given.get_env())
-    assert (given.imitation_noise, given.trials.clone_noise) == (0.5, 0.5)
 
 
 def test_own_episodes_are_measured_anew_from_other_demonstrations():
@@ -400,12 +369,6 @@ def test_own_episodes_are_measured_anew_from_other_demonstrations():
     model.learn(60, reset_num_timesteps=False)
     assert model.expert.episodes is not shown and not np.isnan(own.episodes.distances[:5]).any()
     assert (own.episodes.distances[:5] != before).any()
-
-
-def test_the_verdict_on_a_learner_says_nothing_about_the_noise():
-    trials = Trials(1, imitated_return=100.0)  # no clone may be tried
-    assert play_clones(trials, 50.0, 50.0, 95.0, 95.0, has_learned=True)[-1] == ("candidate", "accepted", False)
-    assert (trials.noise, trials.clone_noise) == (0.0, 1.0)
 
 
 def test_once_something_is_learned_a_clone_is_tried_after_a_rejected_learner_and_then_the_learner_again():
@@ -551,9 +514,8 @@ def test_a_clone_that_is_accepted_is_where_learning_begins(paid, verdict):
     model.policy.spread.fill_(7.0)
     updates, model._warm_up_actor = [], lambda *given, own=model._warm_up_actor: (updates.append(given), own(*given))
     prove(model, 0.0, 0.5, 0.0, 0.5, 0.0)  # noise, the habit, twice, and noise: now a clone is made
-    assert [given[1:] for given in updates] == [(k / 5, 1.0) for k in range(5)]
+    assert [progress for _, progress in updates] == [k / 5 for k in range(5)]
     assert n_stored == model.replay_buffer.size() == 30
-    assert model.imitation_noise == 0.0
     clone = weights_of(model.policy.candidate)
     assert not differ(clone, weights_of(updates[-1][0])) and differ(clone, before[0])
     assert not differ(before[1], weights_of(model.actor.circuit)) and model.trials.is_clone and model.trials.n_clones == 2
@@ -563,7 +525,6 @@ def test_a_clone_that_is_accepted_is_where_learning_begins(paid, verdict):
     for circuit, weights in zip(circuits, expected, strict=False):
         assert not differ(weights, weights_of(circuit))
     assert bool(model.actor.circuit.optimizer.state) == (verdict == "rejected")
-    assert model.imitation_noise == (verdict == "accepted")
     assert float(region.radius) == radius
     if verdict == "accepted":
         assert th.allclose(model.policy.spread, spread_of(model._imitation_residuals()), rtol=0.2)  # of other rows
@@ -789,7 +750,7 @@ def test_noise_is_no_wider_than_the_demonstrations_around_the_warm_started_actor
     """Actions of one size around an actor that does nothing spread by that size; the least is a fiftieth of the box's half."""
     signs = np.random.default_rng(0).choice([-1.0, 1.0], size=(60, 2))
 
-    def do_nothing(model, circuit, progress, noise):
+    def do_nothing(model, circuit, progress):
         for parameter in model.actor.circuit.parameters():
             parameter.zero_()
 
@@ -811,10 +772,10 @@ def test_without_a_warm_start_the_noise_is_as_asked_for():
 def test_the_warm_starts_rates_fall_geometrically_and_leave_nothing_behind(monkeypatch):
     seen, original = [], ActPC._refresh_changes
 
-    def watched(self, circuit, n, noise):
-        assert circuit is self.actor.circuit and not noise
+    def watched(self, circuit, n):
+        assert circuit is self.actor.circuit
         seen.append((n, *(group["lr"] for group in circuit.optimizer.param_groups)))
-        return original(self, circuit, n, noise)
+        return original(self, circuit, n)
 
     monkeypatch.setattr(ActPC, "_refresh_changes", watched)
     model = imitating(policy_kwargs={"circuit_kwargs": {"feedback_rate": 0.9}}, actor_warm_start=10, learning_rate=8e-4)
