@@ -456,6 +456,12 @@ MUTANTS = [
     ),
     Mutant("own episodes keep old distances", AGENT, "memory.episodes.distances = None", "pass", f"{HABIT} -k anew"),
     Mutant("a given noise is not heeded", AGENT, "return self.refresh.noise\n", "return 1.0\n", f"{LEARNS} -k ridge"),
+    Mutant(
+        "clones imitate without noise", AGENT, "WARM_START_BATCH, self.clone_noise", "WARM_START_BATCH", f"{HABIT} -k noise"
+    ),
+    Mutant(
+        "the learning actor is blurred", AGENT, "n: int, noise: float = 0.0) -> H", "n: int, noise: float = 0.5) -> H", HABIT
+    ),
     Mutant("noise where there is no room", AGENT, "float(self.expert.leaves_room)", "1.0", f"{LEARNS} -k room"),
     Mutant("room in any unit", IMITATION, "> np.median(lengths)", "> 0.5", f"{LEARNS} -k room"),
     Mutant(

@@ -481,7 +481,7 @@ class ActPC(OffPolicyAlgorithm):
             f"reward: {ext:g} x task (alpha_ext) + {ep:g} x epistemic (alpha_ep) + {inst:g} x instrumental signal (alpha_in)\n"
             f"demonstrations: {'none' if self.expert is None else self.expert.demonstrations!r}\n"
             f"imitated: {self._describe_imitated()}\n"
-            f"noise on what is imitated: {self.imitation_noise:g} of the distance to another demonstration\n"
+            f"noise on what clones imitate: {self.clone_noise:g} of the distance to another demonstration\n"
             f"off: {', '.join(name for name, value in parts.items() if not value) or 'nothing'}"
         )
 
@@ -537,7 +537,7 @@ class ActPC(OffPolicyAlgorithm):
         rate = first * (last / first) ** progress
         for group, own in zip(circuit.optimizer.param_groups, circuit.parameter_groups(rate), strict=True):
             group["lr"] = own["lr"]
-        circuit.apply_changes(self._refresh_changes(circuit, WARM_START_BATCH))
+        circuit.apply_changes(self._refresh_changes(circuit, WARM_START_BATCH, self.clone_noise))
 
     def _start_from(self, clone: NGCCircuit) -> None:
         """Learning begins with this actor."""
@@ -861,17 +861,17 @@ class ActPC(OffPolicyAlgorithm):
         own = [] if memory is None or memory.episodes is None else [memory.episodes]
         return own if self.expert is None else [self.expert.episodes, *own]
 
-    def _refresh_changes(self, circuit: NGCCircuit, n: int) -> HebbianChanges:
+    def _refresh_changes(self, circuit: NGCCircuit, n: int, noise: float = 0.0) -> HebbianChanges:
         """Settle the actor, or a clone of the same imitated actions, on ``n`` of them."""
-        state = circuit.settle(*self._sample_imitated(n))
+        state = circuit.settle(*self._sample_imitated(n, noise))
         if circuit is self.actor.circuit:
             self.diagnostics.settled("actor", state)
         return circuit.hebbian_update(state)
 
-    def _sample_imitated(self, n: int) -> tuple[th.Tensor, th.Tensor, th.Tensor | None]:
+    def _sample_imitated(self, n: int, noise: float = 0.0) -> tuple[th.Tensor, th.Tensor, th.Tensor | None]:
         """Features, actions and working memory of ``n`` imitated steps, with noise where something is demonstrated."""
-        inputs, noise = self.inputs, self.imitation_noise
-        if noise:
+        inputs = self.inputs
+        if noise and self.expert is not None:
             self._measure_distances()
         samples = sample_union(self._imitated(), n, self.memory_history, self.refresh.weighting)
         features = inputs.features(inputs.observations(samples.observations))
@@ -880,8 +880,8 @@ class ActPC(OffPolicyAlgorithm):
         return features, inputs.tensor(samples.actions), inputs.memory(*inputs.past(samples.history, samples.history_mask))
 
     @property
-    def imitation_noise(self) -> float:
-        """The noise on what is imitated: as asked for, or by default 1 where the demonstrations leave room and 0 where not."""
+    def clone_noise(self) -> float:
+        """Noise on what clones imitate: as asked for, or by default 1 where the demonstrations leave room and 0 where not."""
         if self.expert is None:
             return 0.0
         if self.refresh.noise is not None:

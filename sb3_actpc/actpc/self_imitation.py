@@ -30,8 +30,9 @@ class Refresh:
         reward-weighted regression, Peters and Schaal 2007; uniformly where no demonstration's return is positive) or
         "uniform" (the paper). Returns are compared as they are: where episodes differ in difficulty, as with random goals, the
         easy ones are imitated most
-    :param noise: standard deviation of Gaussian noise on the imitated features (normalised observations), not on the working
-        memory's; dimension by dimension, in units of the distance to the nearest demonstrated step of another episode
+    :param noise: standard deviation of Gaussian noise on the features (normalised observations) that clones imitate, not on
+        the working memory's nor on what the learning actor is refreshed with, which has to become precise; dimension by
+        dimension, in units of the distance to the nearest demonstrated step of another episode
         (:func:`distances_to_nearest`), so that it fills the room between demonstrations. 0 for none (the paper); None for 1
         where the demonstrations leave room (:func:`leave_room`), else 0
     :param own_episodes: which of them are imitated too: "paid" (every one, as often as its return says; "best" where steps are

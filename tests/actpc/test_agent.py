@@ -417,14 +417,14 @@ def test_noise_fills_the_room_between_demonstrations():
     data = dataclasses.replace(data, observations=observations)
     for noise in (0.0, None, 0.5):  # None: 1, as nothing moves in either episode
         model = make(demonstrations=data, refresh_kwargs={"noise": noise})
-        features = model._sample_imitated(20_000)[0].numpy()
+        features = model._sample_imitated(20_000, model.clone_noise)[0].numpy()
         first = features[: len(features) // 2 - 200]  # rows come in order
         assert first.std(0) == pytest.approx((1.0 if noise is None else noise) * observations[-1], rel=0.05)
         assert first.mean(0) == pytest.approx(np.zeros(observations.shape[1]), abs=0.01)
     for place in (7.0, -9.0):  # own episodes, far from both and from each other
-        model._sample_imitated(10)
+        model._sample_imitated(10, 0.5)
         model.replay_buffer.self_imitation.store(np.full_like(observations, place), data.actions, 1.0)
-        features = model._sample_imitated(10_000)[0].numpy()
+        features = model._sample_imitated(10_000, 0.5)[0].numpy()
         nearest = observations[-1] if place > 0 else np.zeros(observations.shape[1])
         own = features[len(features) * 2 // 3 + 200 :] if place < 0 else features[len(features) // 2 + 200 :]
         assert own.mean(0) == pytest.approx(np.full(observations.shape[1], place), rel=0.1)
@@ -450,16 +450,16 @@ def test_without_a_word_on_it_there_is_noise_where_the_next_episode_is_farther_t
     observations[:, 0] = np.tile(np.arange(30), 2) / 10
     observations[30:, 1] = apart
     model = make(demonstrations=dataclasses.replace(data, observations=scale * observations))
-    assert model.imitation_noise == noise
-    assert f"noise on what is imitated: {noise:g} of" in model.describe()
+    assert model.clone_noise == noise
+    assert f"noise on what clones imitate: {noise:g} of" in model.describe()
 
 
 @pytest.mark.parametrize("lengths", [(40,), (1, 1, 1)])
 def test_one_episode_or_episodes_of_one_step_leave_no_room(lengths):
     data = demonstrations(n_episodes=len(lengths), length=lengths[0])
     model = make(demonstrations=data)
-    assert model.imitation_noise == 0.0
-    assert not make().imitation_noise
+    assert model.clone_noise == 0.0
+    assert not make().clone_noise
 
 
 def test_distances_of_long_sets_are_to_some_of_their_steps(monkeypatch):
@@ -467,7 +467,7 @@ def test_distances_of_long_sets_are_to_some_of_their_steps(monkeypatch):
     data = demonstrations(n_episodes=5, length=1)
     observations = np.repeat(np.float32([[0.0], [1.0], [10.0], [11.0], [30.0]]), data.observations.shape[1], axis=1)
     model = make(demonstrations=dataclasses.replace(data, observations=observations), refresh_kwargs={"noise": 1.0})
-    model._sample_imitated(1)
+    model._sample_imitated(1, 1.0)
     assert model.expert.episodes.distances[:, 0].tolist() == [10.0, 1.0, 10.0, 1.0, 20.0]
 
 

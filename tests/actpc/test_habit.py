@@ -359,14 +359,31 @@ def test_a_clone_is_needed_where_a_tenth_of_what_is_imitated_is_missing(imitated
     assert trials.needs_clone() == is_needed
 
 
+def test_clones_imitate_with_noise_and_the_learning_actor_without(monkeypatch):
+    seen, original = [], ActPC._sample_imitated
+    monkeypatch.setattr(
+        ActPC, "_sample_imitated", lambda self, n, noise=0.0: (seen.append(noise), original(self, n, noise))[1]
+    )
+    model = imitating(refresh_kwargs={"noise": 0.5}, policy_delay=1)
+    model.learn(20)
+    n = model.actor_warm_start
+    assert seen[:n] == [0.5] * n and seen[n:] and not any(seen[n:])
+    model.trials.on_trial = model.trials.is_clone = True
+    seen.clear()
+    model._make_candidate()
+    assert seen == [0.5] * n
+
+
 def test_own_episodes_are_measured_anew_from_other_demonstrations():
     model = imitating(refresh_kwargs={"noise": 0.5}, env=lambda: CountingEnv(returns=(1.0,)))
     model.learn(60)
+    model._sample_imitated(9, 0.5)
     own, shown = model.replay_buffer.self_imitation, model.expert.episodes
     before = own.episodes.distances[:5].copy()
     data = demonstrations()
     model.demonstrations = dataclasses.replace(data, observations=data.observations + 3.0)
     model.learn(60, reset_num_timesteps=False)
+    model._sample_imitated(9, 0.5)
     assert model.expert.episodes is not shown and not np.isnan(own.episodes.distances[:5]).any()
     assert (own.episodes.distances[:5] != before).any()
 
@@ -772,10 +789,10 @@ def test_without_a_warm_start_the_noise_is_as_asked_for():
 def test_the_warm_starts_rates_fall_geometrically_and_leave_nothing_behind(monkeypatch):
     seen, original = [], ActPC._refresh_changes
 
-    def watched(self, circuit, n):
+    def watched(self, circuit, n, noise=0.0):
         assert circuit is self.actor.circuit
         seen.append((n, *(group["lr"] for group in circuit.optimizer.param_groups)))
-        return original(self, circuit, n)
+        return original(self, circuit, n, noise)
 
     monkeypatch.setattr(ActPC, "_refresh_changes", watched)
     model = imitating(policy_kwargs={"circuit_kwargs": {"feedback_rate": 0.9}}, actor_warm_start=10, learning_rate=8e-4)
