@@ -895,24 +895,15 @@ class ActPC(OffPolicyAlgorithm):
         return float(self.expert.leaves_room)
 
     def _measure_distances(self) -> None:
-        """Of imitated steps that came since: from the nearest demonstrated step of another episode."""
+        """Of all imitated steps, where they are not known: own episodes are others after each that is stored."""
         assert self.expert is not None
         shown = self.expert.episodes
         for part in self._imitated():
             if part.distances is None:
-                rows = np.arange(len(part))
-            else:
-                rows = np.flatnonzero(np.isnan(part.distances[:, 0])) if part is not shown else np.arange(0)
-            if not len(rows):
-                continue
-            near = np.arange(0, len(shown), -(-len(shown) // MOST_NEIGHBOURS))
-            numbers = shown.starts[rows] if part is shown else np.full(len(rows), -1)  # own episodes are none of these
-            others = self._features_of(shown, near), shown.starts[near]
-            distances = distances_to_nearest(self._features_of(part, rows), numbers, *others)
-            if part.distances is None:
-                part.distances = distances
-            else:
-                part.distances[rows] = distances
+                near = np.arange(0, len(shown), -(-len(shown) // MOST_NEIGHBOURS))
+                features, others = self._features_of(part, np.arange(len(part))), self._features_of(shown, near)
+                numbers = shown.starts if part is shown else np.full(len(part), -1)  # own episodes are none of these
+                part.distances = distances_to_nearest(features, numbers, others, shown.starts[near])
 
     def _features_of(self, episodes: Episodes, rows: np.ndarray) -> th.Tensor:
         """(B, n_features) of (B,) rows, some at a time: there can be many images."""

@@ -87,7 +87,7 @@ class Episodes:
     :param actions: (N, A), scaled to [-1, 1]
     :param starts: (N,) index of the first transition of each row's episode
     :param returns: (N,) what each row's episode was paid
-    :param distances: (N, n_features), of :func:`distances_to_nearest`, NaN where they are not known yet; None where none is
+    :param distances: (N, n_features), of :func:`distances_to_nearest`; None before they are measured
     """
 
     observations: Observations
@@ -192,19 +192,16 @@ class SelfImitationMemory:
         """One whole episode: observations (T, *obs_shape) or a dict of such, actions (T, A), and its sparse return."""
         self.lengths.append(len(actions))
         self.returns.append(episode_return)
-        n_gone, distances = 0, None
+        n_gone = 0
         while len(self) > self.capacity:
             n_gone += self.lengths.pop(0)
             self.returns.pop(0)
         if self.episodes is not None:
             kept = map_observations(lambda array: array[n_gone:], self.episodes.observations)
             observations = _concatenate([kept, observations])
-            if self.episodes.distances is not None:
-                known = self.episodes.distances[n_gone:]
-                distances = np.concatenate([known, np.full((len(actions), known.shape[1]), np.nan, known.dtype)])
             actions = np.concatenate([self.episodes.actions[n_gone:], actions])
         starts = np.repeat(np.cumsum([0, *self.lengths[:-1]]), self.lengths)
-        self.episodes = Episodes(observations, actions, starts, np.repeat(self.returns, self.lengths), distances)
+        self.episodes = Episodes(observations, actions, starts, np.repeat(self.returns, self.lengths))
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         if state["episodes"] is not None and "returns" not in vars(state["episodes"]):
