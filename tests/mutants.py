@@ -54,6 +54,7 @@ CIRCUIT, DYNAMICS, PLASTICITY = "ngc/circuit.py", "ngc/dynamics.py", "ngc/plasti
 AGENT, POLICIES, FEATURES = (f"actpc/{name}.py" for name in ("actpc", "policies", "features"))
 SIGNALS, SHOWN = "actpc/reward_signals.py", "actpc/demonstration_replay.py"
 BUFFERS, IMITATION = "actpc/buffers.py", "actpc/self_imitation.py"
+CLONING, CLONES = "actpc/cloning.py", "tests/actpc/test_cloning.py"
 LEARNS, STORES = "tests/actpc/test_agent.py", "tests/actpc/test_buffers.py"
 COUPLED, SPARSE = "ngc/coupled.py", "envs/sparse_mujoco.py"
 STATISTICS, R_STABILITY = "experiments/report/statistics.py", "experiments/report/r_stability.py"
@@ -390,6 +391,14 @@ MUTANTS = [
         "",
         f"{HABIT} -k clone",
     ),
+    Mutant(
+        "clones before a learner that is ahead",
+        TRIALS,
+        "self.has_learned or is_ahead)",
+        "self.has_learned)",
+        f"{HABIT} -k better",
+    ),
+    Mutant("a clone's noise is the last one's", TRIALS, "[] if self.is_clone else", "", f"{HABIT} -k not_count"),
     Mutant("clones for ever", TRIALS, "self.n_clones > 0 and ", "", f"{HABIT} -k clone"),
     Mutant(
         "clones after every learner",
@@ -422,8 +431,8 @@ MUTANTS = [
     Mutant(
         "a clone is the old actor",
         AGENT,
-        "clone = self.policy.make_actor()",
-        "clone = self.actor.circuit",
+        "self._clone_into(self.policy.make_actor())",
+        "self._clone_into(self.actor.circuit)",
         f"{HABIT} -k begins",
     ),
     Mutant(
@@ -456,11 +465,25 @@ MUTANTS = [
     ),
     Mutant("own episodes keep old distances", AGENT, "memory.episodes.distances = None", "pass", f"{HABIT} -k anew"),
     Mutant("a given noise is not heeded", AGENT, "return self.refresh.noise\n", "return 1.0\n", f"{LEARNS} -k ridge"),
+    Mutant("clones imitate without noise", AGENT, "noise=self.clone_noise)", "noise=0.0)", f"{HABIT} -k noise"),
     Mutant(
-        "clones imitate without noise", AGENT, "WARM_START_BATCH, self.clone_noise", "WARM_START_BATCH", f"{HABIT} -k noise"
+        "the learning actor is blurred", AGENT, "n: int, noise: float = 0.0) -> t", "n: int, noise: float = 0.5) -> t", HABIT
     ),
     Mutant(
-        "the learning actor is blurred", AGENT, "n: int, noise: float = 0.0) -> H", "n: int, noise: float = 0.5) -> H", HABIT
+        "one teacher for all", CLONING, "self.teachers.append(self.make_circuit())", "self.teachers.append(self.clone)", CLONES
+    ),
+    Mutant("teachers that are not asked", CLONING, "elif self.ensemble_size > 1:", "elif False:", CLONES),
+    Mutant("teachers are asked where it was shown", CLONING, "+= TEACHING_NOISE * th", "+= 0.0 * th", CLONES),
+    Mutant("the first teacher alone", CLONING, "for teacher in teachers]).mean(0)", "for teacher in teachers])[0]", CLONES),
+    Mutant("teachers everywhere", CLONING, "actions[::2] = th", "actions[:] = th", CLONES),
+    Mutant("one fall of the rates for all", CLONING, "(done / self.n_updates)", "(index / len(self))", CLONES),
+    Mutant("further clones are taught too", AGENT, "self.policy.make_actor())\n", "self.policy.make_actor(), 4)\n", CLONES),
+    Mutant(
+        "a stop forgets the teachers",
+        AGENT,
+        'self.cloning.restore_checkpoint_state(state["cloning"])',
+        "pass",
+        "tests/checkpoints/test_exact_resume.py -k pretraining",
     ),
     Mutant("noise where there is no room", AGENT, "float(self.expert.leaves_room)", "1.0", f"{LEARNS} -k room"),
     Mutant("room in any unit", IMITATION, "> np.median(lengths)", "> 0.5", f"{LEARNS} -k room"),

@@ -39,6 +39,7 @@ from sb3_actpc.actpc.arguments import (
     checked,
 )
 from sb3_actpc.actpc.buffers import CombinedHerReplayBuffer, SignalReplay, combined_buffer_class, relabels
+from sb3_actpc.actpc.cloning import Cloning
 from sb3_actpc.actpc.compiled import CompiledUpdate, compiled_update
 from sb3_actpc.actpc.demonstration_replay import DemonstrationReplay
 from sb3_actpc.actpc.diagnostics import Diagnostics
@@ -74,7 +75,6 @@ SMALLEST_VALUE_SCALE = 1.0
 NEED_DEMONSTRATIONS = ("demonstration_fraction", "actor_warm_start", "n_demonstrations", "n_demonstration_transitions")
 EXPERT_SIGNALS_INTERVAL = 1000  # updates between two evaluations of the demonstrations' signals
 PRETRAINING_INTERVAL = 1000  # updates between two lines about pre-training
-WARM_START_RATES, WARM_START_BATCH = (1e-3, 5e-5), 256  # a precise clone: what follows can only be as good as its habit
 ACTOR_SLOWNESS = 4.0  # how much slower than the others the actor learns, after a warm start
 TARGET_NOISE_CLIP = 2.5  # standard deviations, as TD3's 0.5 for 0.2
 AVERAGING_RATE = 0.001  # per update, of the average of the actor that becomes the habit
@@ -136,11 +136,11 @@ class ActPC(OffPolicyAlgorithm):
     :param n_demonstrations: use only the first so many episodes of them
     :param n_demonstration_transitions: use only the first so many transitions (the paper's "300 samples")
     :param prior_updates: updates of the prior on the demonstrations before learning starts; then it is frozen
-    :param actor_warm_start: updates of the actor on the demonstrations before learning starts, with learning rates that fall
-        from ``WARM_START_RATES[0]`` to ``[1]``
+    :param actor_warm_start: updates on the demonstrations before learning starts, of the actor and of each member of the
+        ensemble that teaches it (:mod:`sb3_actpc.actpc.cloning`); the learning rate falls meanwhile
     :param refresh_weight: weight of the actor's refresh from the demonstrations and its own good episodes
     :param refresh_kwargs: keywords of :class:`~sb3_actpc.actpc.self_imitation.Refresh`, for refresh and warm start:
-        ``weighting`` (by "returns"; the paper's is "uniform"), ``own_episodes``, ``noise`` and ``n_clones``
+        ``weighting`` (by "returns"; the paper's is "uniform"), ``own_episodes``, ``noise``, ``ensemble_size`` and ``n_clones``
     :param demonstration_fraction: share of the critic's batch that comes from the demonstrations
     :param alpha_ep: weight of the epistemic signal
     :param alpha_in: weight of the instrumental signal
@@ -291,6 +291,7 @@ class ActPC(OffPolicyAlgorithm):
         with named_in_errors(f"signal_kwargs={signal_kwargs!r}"):
             self.signals = InternalSignals(**(signal_kwargs or {}))
         self.pretrained, self.n_pretraining_updates = False, 0
+        self.cloning: Cloning | None = None  # while the actor becomes a clone
         self.trials: Trials | None = None
         if _init_setup_model:
             self._setup_model()
@@ -514,30 +515,30 @@ class ActPC(OffPolicyAlgorithm):
                 stacklevel=2,
             )
         n_prior = self.prior_updates if self.alpha_in else 0  # without a weight the prior has no role
-        updates: Iterable[int] = range(self.n_pretraining_updates, n_prior + self.actor_warm_start)
+        self.cloning = self.cloning or self._clone_into(self.actor.circuit, self.refresh.ensemble_size)
+        n_updates = n_prior + len(self.cloning)
+        updates: Iterable[int] = range(self.n_pretraining_updates, n_updates)
         if progress_bar:
-            updates = tqdm(updates, "pre-training", n_prior + self.actor_warm_start, initial=self.n_pretraining_updates)
+            updates = tqdm(updates, "pre-training", n_updates, initial=self.n_pretraining_updates)
         for update in updates:
             if self.verbose and update % PRETRAINING_INTERVAL == 0:
-                print(f"pre-training: update {update} of {n_prior + self.actor_warm_start}")
+                print(f"pre-training: update {update} of {n_updates}")
             before_update()
             if update < n_prior:
                 self._update_prior(self.policy.batch_size_of("prior", self.batch_size))
             else:
-                self._warm_up_actor(self.actor.circuit, (update - n_prior) / self.actor_warm_start)
+                self.cloning.update(update - n_prior)
             self.n_pretraining_updates += 1
+        self.cloning = None
         self._start_from(self.actor.circuit)
         if self.actor_warm_start and self.trials is not None:
             self.trials.n_clones = self.refresh.n_clones - 1
         self.pretrained = True
 
-    def _warm_up_actor(self, circuit: NGCCircuit, progress: float) -> None:
-        """One update on imitated actions; ``progress`` is the share of the warm start that is done."""
-        first, last = WARM_START_RATES
-        rate = first * (last / first) ** progress
-        for group, own in zip(circuit.optimizer.param_groups, circuit.parameter_groups(rate), strict=True):
-            group["lr"] = own["lr"]
-        circuit.apply_changes(self._refresh_changes(circuit, WARM_START_BATCH, self.clone_noise))
+    def _clone_into(self, circuit: NGCCircuit, ensemble_size: int = 1) -> Cloning:
+        """What makes an actor's circuit a clone of whatever is imitated by now."""
+        sample = partial(self._sample_imitated, noise=self.clone_noise)
+        return Cloning(circuit, self.policy.make_actor, sample, self.actor_warm_start, ensemble_size)
 
     def _start_from(self, clone: NGCCircuit) -> None:
         """Learning begins with this actor."""
@@ -656,10 +657,10 @@ class ActPC(OffPolicyAlgorithm):
         if self.verbose:
             paid, imitated = self.trials.habit_return, self.trials.imitated_return
             print(f"another clone is tried: the habit is paid {paid:.4g}, what it imitates {imitated:.4g}")
-        clone = self.policy.make_actor()
-        for update in range(self.actor_warm_start):
-            self._warm_up_actor(clone, update / self.actor_warm_start)
-        _copy(clone, self.policy.candidate)
+        cloning = self._clone_into(self.policy.make_actor())
+        for update in range(len(cloning)):
+            cloning.update(update)
+        _copy(cloning.clone, self.policy.candidate)
 
     def _check_observations(self, observations: Any) -> None:
         map_observations(lambda array: check_finite("environment", "observations", array, self.num_timesteps), observations)
@@ -773,7 +774,7 @@ class ActPC(OffPolicyAlgorithm):
         """Motor-action circuit: pressure of the critic (line 19) plus refresh (line 26), in one step of the optimiser."""
         changes = None
         if self.refresh_weight and self._imitated():
-            changes = self._refresh_changes(self.actor.circuit, len(batch.features))
+            changes = self._refresh_changes(len(batch.features))
         if changes is not None:
             self.diagnostics.change_norms("refresh", changes.scale_(self.refresh_weight))
         if self.actor_pressure and self._n_updates > self.critic_warmup:
@@ -861,12 +862,11 @@ class ActPC(OffPolicyAlgorithm):
         own = [] if memory is None or memory.episodes is None else [memory.episodes]
         return own if self.expert is None else [self.expert.episodes, *own]
 
-    def _refresh_changes(self, circuit: NGCCircuit, n: int, noise: float = 0.0) -> HebbianChanges:
-        """Settle the actor, or a clone of the same imitated actions, on ``n`` of them."""
-        state = circuit.settle(*self._sample_imitated(n, noise))
-        if circuit is self.actor.circuit:
-            self.diagnostics.settled("actor", state)
-        return circuit.hebbian_update(state)
+    def _refresh_changes(self, n: int) -> HebbianChanges:
+        """Settle the actor on ``n`` imitated actions."""
+        state = self.actor.circuit.settle(*self._sample_imitated(n))
+        self.diagnostics.settled("actor", state)
+        return self.actor.circuit.hebbian_update(state)
 
     def _sample_imitated(self, n: int, noise: float = 0.0) -> tuple[th.Tensor, th.Tensor, th.Tensor | None]:
         """Features, actions and working memory of ``n`` imitated steps, with noise where something is demonstrated."""
@@ -968,6 +968,7 @@ class ActPC(OffPolicyAlgorithm):
         return {
             "pretrained": self.pretrained,
             "n_pretraining_updates": self.n_pretraining_updates,
+            "cloning": None if self.cloning is None else self.cloning.checkpoint_state(),
             "rollout_state": self._rollout_state,
             "rollout_starts": self._rollout_starts,
             "signals": self.signals.checkpoint_state(),
@@ -991,6 +992,9 @@ class ActPC(OffPolicyAlgorithm):
         if self.expert is not None:
             self.expert.epistemic, self.expert.instrumental, self.expert.has_signals = signals
         self.pretrained, self.n_pretraining_updates = state["pretrained"], state["n_pretraining_updates"]
+        if state["cloning"] is not None:
+            self.cloning = self._clone_into(self.actor.circuit, self.refresh.ensemble_size)
+            self.cloning.restore_checkpoint_state(state["cloning"])
         self._rollout_state, self._rollout_starts = state["rollout_state"], state["rollout_starts"]
         self.signals.restore_checkpoint_state(state["signals"])
         self.diagnostics.values = dict(state["diagnostics"])
@@ -1033,7 +1037,7 @@ class ActPC(OffPolicyAlgorithm):
 
     def _excluded_save_params(self) -> list[str]:
         aliases = ["actor", "critic", "generator", "prior", "actor_target", "critic_target"]
-        derived = ["expert", "_followed", "diagnostics", "_compiled", "refresh"]
+        derived = ["expert", "_followed", "diagnostics", "_compiled", "refresh", "cloning"]
         return [*super()._excluded_save_params(), *aliases, *derived]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:

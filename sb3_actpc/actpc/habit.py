@@ -17,7 +17,7 @@ N_PROOFS = 2  # episodes of a candidate at least, before it is judged by less th
 # environment steps, or episodes however short, of a candidate before it is judged, and of the habit between two candidates
 PROOF_STEPS, ENOUGH_PROOFS = 500, 10
 MOST_PROOF_STEPS = 2000  # that a candidate has for a proof
-KEPT_RETURNS = 20  # of the habit
+KEPT_RETURNS, KEPT_NOISY_RETURNS = 20, 4  # of the habit, and of the learning actor
 SHORTFALL = 0.1  # of what the imitated episodes were paid: a clone that is paid less by more is no good one
 # standard errors: that a gain must pass at any time, and after ``MOST_PROOF_STEPS``; the second is also a loss's before
 SURE, LIKELY = 1.5, 0.5
@@ -38,8 +38,9 @@ class Trials:
     again: what made it the habit was partly luck.
 
     Clones of the same demonstrations can do very differently, by their first synapses alone. So while the habit is paid less
-    than what it imitates, by more than ``SHORTFALL`` of it, further clones are candidates: before anything is learned, and
-    after a rejected learner. One that is accepted is where learning begins anew.
+    than what it imitates, by more than ``SHORTFALL`` of it, further clones are candidates: before anything is learned, but not
+    while the learning actor, even with noise, is paid more than the habit; and after a rejected learner. One that is accepted
+    is where learning begins anew.
 
     :param n_envs: environments, each with an episode of its own
     """
@@ -52,6 +53,7 @@ class Trials:
     lengths: list[int] = field(default_factory=list)
     quiet_due: list[int] = field(default_factory=list)  # steps without noise that are still due, for each environment
     habit_returns: list[float] = field(default_factory=list)
+    noisy_returns: list[float] = field(default_factory=list)  # the learning actor's last ones
     candidate_returns: list[float] = field(default_factory=list)
     candidate_steps: int = 0
     habit_proofs: int = 0  # episodes since the last verdict, and their steps
@@ -82,7 +84,9 @@ class Trials:
 
     def needs_clone(self) -> bool:
         """Whether the next candidate is a clone."""
-        is_due = self.learner_was_rejected or not self.has_learned
+        noisy = self.noisy_returns
+        is_ahead = len(noisy) >= N_PROOFS and fmean(noisy) > self.habit_return
+        is_due = self.learner_was_rejected or not (self.has_learned or is_ahead)
         least = self.imitated_return - SHORTFALL * abs(self.imitated_return)
         return is_due and self.n_clones > 0 and self.habit_return < least
 
@@ -105,6 +109,8 @@ class Trials:
         role, episode_return, length = self.roles[env], self.returns[env], self.lengths[env]
         self.returns[env], self.lengths[env] = 0.0, 0
         self.quiet_due[env] = length if role == "actor" else self.quiet_due[env] - length
+        if role == "actor":
+            self.noisy_returns = [*self.noisy_returns, episode_return][-KEPT_NOISY_RETURNS:]
         if role == "habit":
             self.habit_returns = [*self.habit_returns, episode_return][-KEPT_RETURNS:]
             self.habit_proofs, self.habit_steps = self.habit_proofs + 1, self.habit_steps + length
@@ -148,6 +154,7 @@ class Trials:
             return None
         elif gain > 0.0 and gain >= max(smallest, (SURE if has_time else LIKELY) * error):
             verdict, self.habit_returns = "accepted", own[-KEPT_RETURNS:]
+            self.noisy_returns = [] if self.is_clone else self.noisy_returns  # learning begins anew
             # what the old habit has begun elsewhere is no return of the new one
             self.roles = ["actor" if role == "habit" else role for role in self.roles]
         elif has_time and abs(gain) + SURE * error > smallest:

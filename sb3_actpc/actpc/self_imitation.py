@@ -38,6 +38,8 @@ class Refresh:
     :param own_episodes: which of them are imitated too: "paid" (every one, as often as its return says; "best" where steps are
         not drawn by returns, or nothing is demonstrated) or "best" (those that are paid at least what the best one was: the
         paper)
+    :param ensemble_size: clones that teach the first one what to do around the imitated steps
+        (:mod:`sb3_actpc.actpc.cloning`); 1 for none (the paper)
     :param n_clones: clones that are tried at most, the first included, while the habit is paid less than nine tenths of what
         it imitates (:mod:`sb3_actpc.actpc.habit`): returns of environment and demonstrations must be of one scale. 1 for the
         warm-started actor alone (the paper); without a habit or a warm start there are no others
@@ -50,9 +52,11 @@ class Refresh:
         weighting: Weighting = "returns",
         noise: Annotated[float | None, Between(0)] = None,
         own_episodes: Literal["paid", "best"] = "paid",
+        ensemble_size: Annotated[int, Between(1)] = 3,
         n_clones: Annotated[int, Between(1)] = 6,
     ) -> None:
-        self.weighting, self.noise, self.own_episodes, self.n_clones = weighting, noise, own_episodes, n_clones
+        self.weighting, self.noise, self.own_episodes = weighting, noise, own_episodes
+        self.ensemble_size, self.n_clones = ensemble_size, n_clones
 
 
 class ImitationSamples(NamedTuple):

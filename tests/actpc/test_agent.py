@@ -906,7 +906,7 @@ def test_learning_says_what_the_reward_is_made_of_and_how_far_pre_training_is(ca
     assert "reward: 0 x task (alpha_ext) + 0.5 x epistemic (alpha_ep) + 1 x instrumental signal (alpha_in)" in printed
     assert "3 episodes, 60 transitions" in printed and "mean return 1.0" in printed
     assert "off: the task's reward, demonstrations in the critic's batch, working memory" in printed
-    assert "update 1000 of 1205" in printed
+    assert "update 1000 of 4805" in printed  # of three teachers and the actor
     assert model.start_time > began and model.start_time - began > 0.5 * (time.time_ns() - began)  # time/fps leaves it out
 
 

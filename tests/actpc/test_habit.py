@@ -15,6 +15,7 @@ from sb3_actpc import ActPC
 from sb3_actpc.actpc import actpc as actpc_module
 from sb3_actpc.actpc import habit as habit_module
 from sb3_actpc.actpc.actpc import AVERAGING_RATE
+from sb3_actpc.actpc.cloning import Cloning
 from sb3_actpc.actpc.habit import (
     ENOUGH_PROOFS,
     KEPT_RETURNS,
@@ -366,12 +367,12 @@ def test_clones_imitate_with_noise_and_the_learning_actor_without(monkeypatch):
     )
     model = imitating(refresh_kwargs={"noise": 0.5}, policy_delay=1)
     model.learn(20)
-    n = model.actor_warm_start
+    n = 4 * model.actor_warm_start  # of three members and the clone
     assert seen[:n] == [0.5] * n and seen[n:] and not any(seen[n:])
     model.trials.on_trial = model.trials.is_clone = True
     seen.clear()
     model._make_candidate()
-    assert seen == [0.5] * n
+    assert seen == [0.5] * model.actor_warm_start
 
 
 def test_own_episodes_are_measured_anew_from_other_demonstrations():
@@ -402,6 +403,34 @@ def test_once_something_is_learned_a_clone_is_tried_after_a_rejected_learner_and
         assert play_clones(trials, 50.0, has_learned=True) == [("habit", None, False)]
     # a rejected learner, a rejected clone, a learner's tie, another rejected learner, and the last clone
     assert kinds == [False, True, False, False, True] and trials.n_clones == 0
+
+
+@pytest.mark.parametrize(
+    ("noisy", "learner_was_rejected", "is_needed"),
+    [
+        ([60.0], False, True),  # one episode is chance
+        ([60.0, 41.0], False, False),
+        ([60.0, 39.0], False, True),
+        ([60.0, 60.0], True, True),  # noise can keep an actor up that falls without
+        ([90.0, 10.0, 60.0, 60.0, 60.0], False, True),  # the last four
+        ([10.0, 50.0, 50.0, 50.0, 60.0], False, False),
+    ],
+)
+def test_no_clone_is_needed_while_the_learning_actor_does_better_even_with_noise(noisy, learner_was_rejected, is_needed):
+    trials = Trials(1, imitated_return=100.0, n_clones=1, learner_was_rejected=learner_was_rejected)
+    for one in noisy:
+        trials.roles[0] = "actor"
+        play(trials, one, 3, has_learned=learner_was_rejected)
+    trials.habit_returns = [50.0, 50.0]
+    assert trials.needs_clone() == is_needed
+
+
+def test_what_was_paid_with_noise_before_a_clone_was_accepted_does_not_count():
+    trials = Trials(1, imitated_return=100.0, n_clones=2)
+    play_clones(trials, 10.0, 10.0)
+    trials.noisy_returns = [1.0, 2.0]
+    assert play_clones(trials, 60.0, 60.0)[-1][1] == "accepted"
+    assert 1.0 not in trials.noisy_returns and 2.0 not in trials.noisy_returns
 
 
 def test_a_clone_that_is_accepted_late_is_no_candidate_before_it_has_learned_again():
@@ -517,7 +546,7 @@ def test_a_candidate_is_taken_once_the_critic_has_pressed_long_enough(begun_at, 
 
 
 @pytest.mark.parametrize(("paid", "verdict"), [(1.0, "accepted"), (0.0, "rejected")])
-def test_a_clone_that_is_accepted_is_where_learning_begins(paid, verdict):
+def test_a_clone_that_is_accepted_is_where_learning_begins(paid, verdict, monkeypatch):
     """Of other first synapses, trained as the warm start was; about the pressure its verdict says nothing."""
     model = imitating()
     model.learn(30)
@@ -529,9 +558,10 @@ def test_a_clone_that_is_accepted_is_where_learning_begins(paid, verdict):
     region.multiplier.fill_(0.7)
     region.deviation.fill_(0.3)
     model.policy.spread.fill_(7.0)
-    updates, model._warm_up_actor = [], lambda *given, own=model._warm_up_actor: (updates.append(given), own(*given))
+    updates, update = [], Cloning.update
+    monkeypatch.setattr(Cloning, "update", lambda self, index: (updates.append((self.clone, index)), update(self, index)))
     prove(model, 0.0, 0.5, 0.0, 0.5, 0.0)  # noise, the habit, twice, and noise: now a clone is made
-    assert [progress for _, progress in updates] == [k / 5 for k in range(5)]
+    assert [index for _, index in updates] == list(range(5))
     assert n_stored == model.replay_buffer.size() == 30
     clone = weights_of(model.policy.candidate)
     assert not differ(clone, weights_of(updates[-1][0])) and differ(clone, before[0])
@@ -767,11 +797,11 @@ def test_noise_is_no_wider_than_the_demonstrations_around_the_warm_started_actor
     """Actions of one size around an actor that does nothing spread by that size; the least is a fiftieth of the box's half."""
     signs = np.random.default_rng(0).choice([-1.0, 1.0], size=(60, 2))
 
-    def do_nothing(model, circuit, progress):
-        for parameter in model.actor.circuit.parameters():
+    def do_nothing(cloning, index):
+        for parameter in cloning.clone.parameters():
             parameter.zero_()
 
-    monkeypatch.setattr(ActPC, "_warm_up_actor", do_nothing)
+    monkeypatch.setattr(Cloning, "update", do_nothing)
     for sizes, expected in (((0.05, 0.5), (0.05, 0.1)), ((0.001, 0.08), (0.02, 0.08))):
         data = dataclasses.replace(demonstrations(), actions=2.0 * signs * sizes)  # of a box from -2 to 2
         model = ActPC("MlpPolicy", CountingEnv(), demonstrations=data, **QUICK, exploration_noise=0.1)
@@ -784,27 +814,6 @@ def test_without_a_warm_start_the_noise_is_as_asked_for():
     for keywords in ({}, {"demonstrations": demonstrations()}):
         model = make(exploration_noise=0.3, **keywords)
         assert model._exploration((20_000, 2)).std(0) == pytest.approx([0.3, 0.3], rel=0.05)
-
-
-def test_the_warm_starts_rates_fall_geometrically_and_leave_nothing_behind(monkeypatch):
-    seen, original = [], ActPC._refresh_changes
-
-    def watched(self, circuit, n, noise=0.0):
-        assert circuit is self.actor.circuit
-        seen.append((n, *(group["lr"] for group in circuit.optimizer.param_groups)))
-        return original(self, circuit, n, noise)
-
-    monkeypatch.setattr(ActPC, "_refresh_changes", watched)
-    model = imitating(policy_kwargs={"circuit_kwargs": {"feedback_rate": 0.9}}, actor_warm_start=10, learning_rate=8e-4)
-    model.pretrain()
-    rates = [1e-3 * (5e-5 / 1e-3) ** (update / 10) for update in range(10)]
-    assert len(seen) == 10
-    for (n, *of_groups), rate in zip(seen, rates, strict=True):
-        assert n == 256 and of_groups == pytest.approx([rate, 0.9 * rate])
-    assert not model.actor.circuit.optimizer.state
-    model.learn(2)
-    assert [group["lr"] for group in model.actor.circuit.optimizer.param_groups] == pytest.approx([2e-4, 0.9 * 2e-4])
-    assert [group["lr"] for group in model.critic.first().optimizer.param_groups] == pytest.approx([8e-4, 0.9 * 8e-4])
 
 
 @pytest.mark.parametrize(("delay", "expected"), [(1, 7), (2, 3), (3, 2)])

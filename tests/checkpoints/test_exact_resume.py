@@ -20,6 +20,7 @@ from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 import sb3_actpc.envs  # noqa: F401, registers the sparse tasks
 from sb3_actpc import ActPC
+from sb3_actpc.actpc.cloning import Cloning
 from sb3_actpc.checkpoints import list_bundles, restore
 from sb3_actpc.checkpoints.simulators import _physics_arrays
 from tests.actpc.envs import CountingEnv, demonstrations
@@ -184,25 +185,25 @@ def test_sb3s_evaluation_callback_remembers_its_best_and_its_rows(tmp_path: Path
     assert len(results[0]["timesteps"]) == 3
 
 
-@pytest.mark.parametrize("stop_after", [1, 3, 5, 8])
+@pytest.mark.parametrize("stop_after", [1, 3, 5, 8, 10, 13, 18, 22])
 def test_a_stop_in_the_pretraining_loses_no_update(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stop_after: int) -> None:
-    """Five updates of the prior, then five of the actor."""
+    """Five updates of the prior, then five of each of three members and of the actor."""
 
     def make() -> ActPC:
         noise = NormalActionNoise(np.zeros(2), np.ones(2))
         return make_actpc(CountingEnv, 2, demonstrations=demonstrations(), actor_warm_start=5, action_noise=noise)
 
     straight = learn_straight(make, tmp_path / "straight", 60)
-    name, number = ("_update_prior", stop_after) if stop_after <= 5 else ("_refresh_changes", stop_after - 5)
-    original, calls = getattr(ActPC, name), []
+    owner, name, number = (ActPC, "_update_prior", stop_after) if stop_after <= 5 else (Cloning, "update", stop_after - 5)
+    original, calls = getattr(owner, name), []
 
-    def send_signal(self: ActPC, *arguments: Any) -> Any:
+    def send_signal(self: Any, *arguments: Any) -> Any:
         calls.append(name)
         if len(calls) == number:
             os.kill(os.getpid(), signal.SIGTERM)
         return original(self, *arguments)
 
-    monkeypatch.setattr(ActPC, name, send_signal)
+    monkeypatch.setattr(owner, name, send_signal)
     resumed = learn_in_two(make, tmp_path / "resumed", 60, stop_at=0)
     stopped = make()
     restore(stopped, list_bundles(tmp_path / "resumed" / "checkpoints")[0])

@@ -1,0 +1,179 @@
+"""The warm start: members that imitate, and the clone that they teach."""
+
+import numpy as np
+import pytest
+import torch as th
+
+from sb3_actpc import ActPC
+from sb3_actpc.actpc import cloning as cloning_module
+from sb3_actpc.actpc.cloning import BATCH_SIZE, TEACHING_NOISE, Cloning, taught
+from sb3_actpc.ngc import NGCCircuit
+from tests.actpc.agents import differ, weights_of
+from tests.actpc.test_habit import imitating
+
+
+def make_circuit() -> NGCCircuit:
+    circuit = NGCCircuit(2, 1, [8])
+    circuit.optimizer = th.optim.Adam(circuit.parameter_groups(1e-3))  # of rates that the warm start sets
+    return circuit
+
+
+def sample(n: int) -> tuple[th.Tensor, th.Tensor, None]:
+    """The first coordinate is what is imitated."""
+    features = th.rand(n, 2) - 0.5
+    return features, features[:, :1], None
+
+
+class Sum(NGCCircuit):
+    """A teacher whose action is a multiple of what it sees and remembers."""
+
+    def __init__(self, factor: float) -> None:
+        super().__init__(2, 1, [8])
+        self.factor = factor
+
+    def project(self, inputs: th.Tensor, memory: th.Tensor | None = None) -> th.Tensor:
+        return self.factor * (inputs.sum(1, keepdim=True) + (0.0 if memory is None else memory))
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch):
+    """Small circuits learn with large rates."""
+    monkeypatch.setattr(cloning_module, "RATES", (3e-2, 1e-3))
+    th.manual_seed(0)
+
+
+def test_alone_a_clone_imitates_what_is_shown():
+    cloning = Cloning(make_circuit(), make_circuit, sample, 600)
+    for update in range(len(cloning)):
+        cloning.update(update)
+    features, actions, _ = sample(500)
+    assert len(cloning) == 600 and not cloning.teachers
+    assert (cloning.clone.project(features, None) - actions).square().mean() < 0.01 * actions.var()
+
+
+def test_the_teachers_imitate_one_after_another_and_then_the_clone_does():
+    """Each has its own first synapses, all learn from what is shown; the clone does not before they have."""
+    cloning = Cloning(make_circuit(), make_circuit, sample, 400, 2)
+    before, (features, actions, _) = weights_of(cloning.clone), sample(500)
+    assert len(cloning) == 1200
+    for update in range(800):
+        assert len(cloning.teachers) == min(1 + (update - 1) // 400, 2) if update else not cloning.teachers
+        cloning.update(update)
+    assert not differ(before, weights_of(cloning.clone))
+    teachers = [weights_of(teacher) for teacher in cloning.teachers]
+    assert differ(*teachers)
+    for update in range(800, 1200):
+        cloning.update(update)
+    for weights, teacher in zip(teachers, cloning.teachers, strict=True):
+        assert not differ(weights, weights_of(teacher))
+    for circuit in (*cloning.teachers, cloning.clone):
+        assert (circuit.project(features, None) - actions).square().mean() < 0.01 * actions.var()
+
+
+def test_beside_what_is_shown_the_clone_does_what_its_teachers_do_on_average(monkeypatch):
+    """Shown along a line, where the action is 0; beside it the teachers' mean grows with the distance."""
+
+    def on_a_line(n):
+        return th.cat([th.rand(n, 1) - 0.5, th.zeros(n, 1)], dim=1), th.zeros(n, 1), None
+
+    class Distance(Sum):
+        def project(self, inputs, memory=None):
+            return self.factor * inputs[:, 1:].abs()
+
+    monkeypatch.setattr(cloning_module, "TEACHING_NOISE", 0.5)
+    cloning = Cloning(make_circuit(), make_circuit, on_a_line, 600, 3)
+    cloning.teachers = [Distance(-0.5), Distance(1.0), Distance(1.0)]
+    for update in range(1800, 2400):
+        cloning.update(update)
+    for distance in (-0.6, -0.3, 0.3, 0.6):
+        there = th.tensor([[0.2, distance]])
+        assert cloning.clone.project(there, None).item() == pytest.approx(0.5 * abs(distance), abs=0.06)
+
+
+def test_teachers_are_asked_around_every_other_step():
+    """Their answer is to where they were asked, with the memory of that step; the other rows are as shown."""
+    features, actions, memory = th.rand(20_000, 2), th.full((20_000, 1), 7.0), th.arange(20_000.0)[:, None]
+    asked, answers = taught([Sum(1.0), Sum(2.0)], features, actions, memory)
+    assert th.equal(asked[1::2], features[1::2]) and th.equal(answers[1::2], actions[1::2])
+    assert bool((actions == 7.0).all())  # what was given is not changed
+    moved = (asked - features)[::2]
+    assert moved.std(0).tolist() == pytest.approx([TEACHING_NOISE] * 2, rel=0.05)
+    assert moved.mean(0).tolist() == pytest.approx([0.0] * 2, abs=0.01)
+    expected = 1.5 * (asked.sum(1, keepdim=True) + memory)
+    assert th.allclose(answers[::2], expected[::2], rtol=1e-5)
+
+
+def test_students_differ_less_beside_what_is_shown_than_clones_do(monkeypatch):
+    """The mean of k independent members has a k-th of their variance, and its student is near it."""
+    monkeypatch.setattr(cloning_module, "TEACHING_NOISE", 1.0)
+    beside = 2.0 * th.randn(300, 2)
+
+    def spread(ensemble_size: int) -> float:
+        answers = []
+        for _ in range(6):
+            cloning = Cloning(make_circuit(), make_circuit, sample, 100, ensemble_size)
+            for update in range(len(cloning)):
+                cloning.update(update)
+            answers.append(cloning.clone.project(beside, None))
+        return float(th.stack(answers).var(0).mean())
+
+    assert spread(6) < 0.5 * spread(1)
+
+
+@pytest.mark.parametrize("ensemble_size", [1, 2])
+def test_rates_fall_geometrically_for_every_circuit_and_leave_nothing_behind(ensemble_size, monkeypatch):
+    seen, original = [], NGCCircuit.apply_changes
+
+    def watched(circuit, changes):
+        seen.append((circuit, [group["lr"] for group in circuit.optimizer.param_groups]))
+        original(circuit, changes)
+
+    monkeypatch.setattr(NGCCircuit, "apply_changes", watched)
+    model = imitating(
+        policy_kwargs={"circuit_kwargs": {"feedback_rate": 0.9}},
+        actor_warm_start=10,
+        learning_rate=8e-4,
+        refresh_kwargs={"ensemble_size": ensemble_size},
+    )
+    monkeypatch.setattr(cloning_module, "RATES", (1e-3, 5e-5))
+    model.pretrain()
+    rates = [1e-3 * (5e-5 / 1e-3) ** (update / 10) for update in range(10)]
+    stages = 1 if ensemble_size == 1 else ensemble_size + 1
+    assert len(seen) == 10 * stages and len({id(circuit) for circuit, _ in seen}) == stages
+    for index, (circuit, of_groups) in enumerate(seen):
+        assert (circuit is model.actor.circuit) == (index // 10 == stages - 1)
+        assert of_groups == pytest.approx([rates[index % 10], 0.9 * rates[index % 10]])
+    assert not model.actor.circuit.optimizer.state and model.cloning is None
+    model.learn(2)
+    assert [group["lr"] for group in model.actor.circuit.optimizer.param_groups] == pytest.approx([2e-4, 0.9 * 2e-4])
+    assert [group["lr"] for group in model.critic.first().optimizer.param_groups] == pytest.approx([8e-4, 0.9 * 8e-4])
+
+
+def test_the_first_clone_has_an_ensemble_and_further_ones_have_none(monkeypatch):
+    made, original = [], Cloning.__init__
+
+    def watched(self, *given):
+        original(self, *given)
+        made.append(self)
+
+    monkeypatch.setattr(Cloning, "__init__", watched)
+    model = imitating(refresh_kwargs={"ensemble_size": 4})
+    model.pretrain()
+    model.trials.on_trial = model.trials.is_clone = True
+    model._make_candidate()
+    assert [(cloning.ensemble_size, len(cloning)) for cloning in made] == [(4, 25), (1, 5)]
+    assert made[0].clone is model.actor.circuit is not made[1].clone
+    assert not differ(weights_of(made[1].clone), weights_of(model.policy.candidate))
+
+
+def test_batches_are_of_one_size(monkeypatch):
+    seen, original = [], ActPC._sample_imitated
+    monkeypatch.setattr(ActPC, "_sample_imitated", lambda self, n, noise=0.0: (seen.append(n), original(self, n, noise))[1])
+    imitating().pretrain()
+    assert seen == [BATCH_SIZE] * 20 and BATCH_SIZE == 256
+
+
+def test_settings_are_checked():
+    for size in (0, -1, 1.5, np.nan):
+        with pytest.raises(ValueError, match="ensemble_size"):
+            imitating(refresh_kwargs={"ensemble_size": size})
