@@ -380,7 +380,7 @@ MUTANTS = [
     Mutant(
         "candidates before anything is learned",
         TRIALS,
-        "(not self.tests_habit and (self.has_learned or self.needs_clone()))",
+        "(not self.tests_habit and self.has_learned)",
         "not self.tests_habit",
         f"{HABIT} -k late",
     ),
@@ -391,13 +391,7 @@ MUTANTS = [
         "",
         f"{HABIT} -k clone",
     ),
-    Mutant(
-        "clones before a learner that is ahead",
-        TRIALS,
-        "self.has_learned or is_ahead)",
-        "self.has_learned)",
-        f"{HABIT} -k better",
-    ),
+    Mutant("clones for a learner that is ahead", TRIALS, " and not self.is_ahead()", "", f"{HABIT} -k better"),
     Mutant("a clone's noise is the last one's", TRIALS, "[] if self.is_clone else", "", f"{HABIT} -k not_count"),
     Mutant("clones for ever", TRIALS, "self.n_clones > 0 and ", "", f"{HABIT} -k clone"),
     Mutant(

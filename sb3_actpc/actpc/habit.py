@@ -38,9 +38,8 @@ class Trials:
     again: what made it the habit was partly luck.
 
     Clones of the same demonstrations can do very differently, by their first synapses alone. So while the habit is paid less
-    than what it imitates, by more than ``SHORTFALL`` of it, further clones are candidates: before anything is learned, but not
-    while the learning actor, even with noise, is paid more than the habit; and after a rejected learner. One that is accepted
-    is where learning begins anew.
+    than what it imitates, by more than ``SHORTFALL`` of it, further clones are candidates: after a rejected learner, unless it
+    is paid more than the habit even with noise and was rejected by chance. Learning begins anew with one that is accepted.
 
     :param n_envs: environments, each with an episode of its own
     """
@@ -82,11 +81,13 @@ class Trials:
         """Mean of the habit's last returns; 0 where there is none yet."""
         return fmean(self.habit_returns) if self.habit_returns else 0.0
 
+    def is_ahead(self) -> bool:
+        """Whether the learning actor is paid more than the habit, even with noise."""
+        return len(self.noisy_returns) >= N_PROOFS and fmean(self.noisy_returns) > self.habit_return
+
     def needs_clone(self) -> bool:
         """Whether the next candidate is a clone."""
-        noisy = self.noisy_returns
-        is_ahead = len(noisy) >= N_PROOFS and fmean(noisy) > self.habit_return
-        is_due = self.learner_was_rejected or not (self.has_learned or is_ahead)
+        is_due = self.learner_was_rejected and not self.is_ahead()
         least = self.imitated_return - SHORTFALL * abs(self.imitated_return)
         return is_due and self.n_clones > 0 and self.habit_return < least
 
@@ -100,7 +101,7 @@ class Trials:
         """
         The episode of ``env`` has ended.
 
-        :param has_learned: whether the learning actor differs from the habit by more than imitation; before, clones alone are
+        :param has_learned: whether the learning actor differs from the habit by more than imitation; before, there are no
             candidates
         :return: "accepted": the candidate becomes the habit; "tied": it is dropped, being neither proven better nor worse;
             "rejected": it is dropped, being worse; None: nothing follows yet
@@ -115,7 +116,7 @@ class Trials:
             self.habit_returns = [*self.habit_returns, episode_return][-KEPT_RETURNS:]
             self.habit_proofs, self.habit_steps = self.habit_proofs + 1, self.habit_steps + length
             is_known = len(self.habit_returns) >= N_PROOFS and _is_tried(self.habit_proofs, self.habit_steps)
-            self.tests_habit = not (is_known and (has_learned or self.needs_clone()))
+            self.tests_habit = not (is_known and has_learned)
         if role != "candidate" or self.generations[env] != self.generation:
             return None
         self.candidate_returns.append(episode_return)
@@ -129,7 +130,7 @@ class Trials:
         :return: whether a new candidate plays it, which is to be made now: a clone where ``is_clone`` says so, else the
             learning actor's average
         """
-        has_candidate = self.on_trial or (not self.tests_habit and (self.has_learned or self.needs_clone()))
+        has_candidate = self.on_trial or (not self.tests_habit and self.has_learned)
         quiet: Role = "candidate" if has_candidate else "habit"
         self.roles[env] = quiet if self.roles[env] == "actor" or self.quiet_due[env] > 0 else "actor"
         self.generations[env] = self.generation
@@ -154,7 +155,7 @@ class Trials:
             return None
         elif gain > 0.0 and gain >= max(smallest, (SURE if has_time else LIKELY) * error):
             verdict, self.habit_returns = "accepted", own[-KEPT_RETURNS:]
-            self.noisy_returns = [] if self.is_clone else self.noisy_returns  # learning begins anew
+            self.noisy_returns = [] if self.is_clone else self.noisy_returns
             # what the old habit has begun elsewhere is no return of the new one
             self.roles = ["actor" if role == "habit" else role for role in self.roles]
         elif has_time and abs(gain) + SURE * error > smallest:

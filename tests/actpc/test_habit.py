@@ -333,14 +333,9 @@ def play_clones(trials, *paid, has_learned=False):
     return played
 
 
-def test_while_nothing_is_learned_and_the_habit_is_paid_less_than_what_it_imitates_clones_are_tried():
-    """The habit is known before a clone is tried, and better after one that is no better; none where it is nearly as good."""
+def test_while_nothing_is_learned_no_clone_is_tried():
     trials = Trials(1, imitated_return=100.0, n_clones=2)
-    assert play_clones(trials, 50.0, 60.0) == [("habit", None, False)] * 2
-    assert play_clones(trials, 10.0) == [("candidate", "rejected", True)]
-    assert play_clones(trials, 55.0) == [("habit", None, False)]
-    assert play_clones(trials, 95.0, 95.0) == [("candidate", None, True), ("candidate", "accepted", False)]
-    assert play_clones(trials, 70.0, 60.0) == [("habit", None, False)] * 2 and trials.n_clones == 0
+    assert play_clones(trials, 50.0, 60.0, 10.0, 40.0) == [("habit", None, False)] * 4 and trials.n_clones == 2
 
 
 @pytest.mark.parametrize(
@@ -356,7 +351,7 @@ def test_while_nothing_is_learned_and_the_habit_is_paid_less_than_what_it_imitat
     ],
 )
 def test_a_clone_is_needed_where_a_tenth_of_what_is_imitated_is_missing(imitated, paid, n_clones, is_needed):
-    trials = Trials(1, imitated_return=imitated, n_clones=n_clones, habit_returns=[paid, paid])
+    trials = Trials(1, imitated_return=imitated, n_clones=n_clones, habit_returns=[paid, paid], learner_was_rejected=True)
     assert trials.needs_clone() == is_needed
 
 
@@ -406,31 +401,33 @@ def test_once_something_is_learned_a_clone_is_tried_after_a_rejected_learner_and
 
 
 @pytest.mark.parametrize(
-    ("noisy", "learner_was_rejected", "is_needed"),
+    ("noisy", "is_needed"),
     [
-        ([60.0], False, True),  # one episode is chance
-        ([60.0, 41.0], False, False),
-        ([60.0, 39.0], False, True),
-        ([60.0, 60.0], True, True),  # noise can keep an actor up that falls without
-        ([90.0, 10.0, 60.0, 60.0, 60.0], False, True),  # the last four
-        ([10.0, 50.0, 50.0, 50.0, 60.0], False, False),
+        ([60.0], True),  # one episode is chance
+        ([60.0, 41.0], False),
+        ([60.0, 39.0], True),
+        ([90.0, 10.0, 60.0, 60.0, 60.0], True),  # the last four
+        ([10.0, 50.0, 50.0, 50.0, 60.0], False),
     ],
 )
-def test_no_clone_is_needed_while_the_learning_actor_does_better_even_with_noise(noisy, learner_was_rejected, is_needed):
-    trials = Trials(1, imitated_return=100.0, n_clones=1, learner_was_rejected=learner_was_rejected)
+def test_no_clone_is_needed_while_the_rejected_learner_does_better_even_with_noise(noisy, is_needed):
+    trials = Trials(1, imitated_return=100.0, n_clones=1, learner_was_rejected=True)
     for one in noisy:
         trials.roles[0] = "actor"
-        play(trials, one, 3, has_learned=learner_was_rejected)
+        play(trials, one, 3)
     trials.habit_returns = [50.0, 50.0]
     assert trials.needs_clone() == is_needed
+    trials.learner_was_rejected = False
+    assert not trials.needs_clone()
 
 
-def test_what_was_paid_with_noise_before_a_clone_was_accepted_does_not_count():
+@pytest.mark.parametrize("is_clone", [True, False])
+def test_what_was_paid_with_noise_before_a_clone_was_accepted_does_not_count(is_clone):
     trials = Trials(1, imitated_return=100.0, n_clones=2)
-    play_clones(trials, 10.0, 10.0)
-    trials.noisy_returns = [1.0, 2.0]
-    assert play_clones(trials, 60.0, 60.0)[-1][1] == "accepted"
-    assert 1.0 not in trials.noisy_returns and 2.0 not in trials.noisy_returns
+    play_clones(trials, 10.0, 10.0, 60.0, has_learned=True)
+    trials.is_clone, trials.noisy_returns, trials.roles = is_clone, [7.0, 8.0], ["candidate"]
+    assert play(trials, 60.0)[1] == "accepted"
+    assert trials.noisy_returns == ([] if is_clone else [7.0, 8.0])
 
 
 def test_a_clone_that_is_accepted_late_is_no_candidate_before_it_has_learned_again():
@@ -442,17 +439,17 @@ def test_a_clone_that_is_accepted_late_is_no_candidate_before_it_has_learned_aga
 
 
 def test_what_the_habit_is_paid_elsewhere_meanwhile_does_not_stop_the_trial_of_a_clone():
-    trials = Trials(2, imitated_return=100.0, n_clones=1)
+    trials = Trials(2, imitated_return=100.0, n_clones=1, learner_was_rejected=True)
     for _ in range(2):
-        assert play(trials, 0.0, 3, 0, False)[0] == "actor"
-        assert play(trials, 50.0, env=0, has_learned=False) == ("habit", None)
-    play(trials, 0.0, 3, 1, False)  # its quiet episode is the clone's
+        assert play(trials, 0.0, 3)[0] == "actor"
+        assert play(trials, 50.0) == ("habit", None)
+    play(trials, 0.0, 3, 1)  # its quiet episode is the clone's
     assert trials.roles == ["actor", "candidate"] and trials.is_clone
     trials.roles[0] = "habit"  # as if it had begun before
-    assert play(trials, 50.0, env=0, has_learned=False) == ("habit", None)
-    assert play(trials, 90.0, env=1, has_learned=False) == ("candidate", None)
-    play(trials, 0.0, 3, 1, False)
-    assert play(trials, 90.0, env=1, has_learned=False) == ("candidate", "accepted")
+    assert play(trials, 50.0) == ("habit", None)
+    assert play(trials, 90.0, env=1) == ("candidate", None)
+    play(trials, 0.0, 3, 1)
+    assert play(trials, 90.0, env=1) == ("candidate", "accepted")
 
 
 # ---------------------------------------------------------------------- the agent
@@ -550,8 +547,7 @@ def test_a_clone_that_is_accepted_is_where_learning_begins(paid, verdict, monkey
     """Of other first synapses, trained as the warm start was; about the pressure its verdict says nothing."""
     model = imitating()
     model.learn(30)
-    model.trials = Trials(1, imitated_return=1.0, n_clones=3)
-    model._n_updates = 3
+    model.trials = Trials(1, imitated_return=1.0, n_clones=3, learner_was_rejected=True)
     before = [weights_of(model.actor.habit), weights_of(model.actor.circuit)]
     region, n_stored = model.policy.trust_region, model.replay_buffer.size()
     radius = float(region.radius)
