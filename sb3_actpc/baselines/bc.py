@@ -33,18 +33,8 @@ class BC(OfflineAlgorithm):
         self.weight_decay, self.input_noise = weight_decay, input_noise
         super().__init__(*args, **options)
 
-    def _setup_model(self) -> None:
-        self._setup_lr_schedule()
-        self.set_random_seed(self.seed)
-        kwargs = {"optimizer_kwargs": {"weight_decay": self.weight_decay}, **self._network_kwargs(), **self.policy_kwargs}
-        self.policy = self.policy_class(self.observation_space, self.action_space, self.lr_schedule, **kwargs).to(self.device)  # type: ignore[assignment]
-        self._observations: th.Tensor | None = None
-        if self.env is not None:
-            self._load_demonstrations()
-
     def _network_kwargs(self) -> dict[str, Any]:
-        """Keywords of the policy that follow from the algorithm's."""
-        return {}
+        return {"optimizer_kwargs": {"weight_decay": self.weight_decay}}
 
     def _take(self, shown: Demonstrations) -> None:
         assert isinstance(self.action_space, spaces.Box)
@@ -55,18 +45,14 @@ class BC(OfflineAlgorithm):
         bounds = shown.episode_bounds
         self._episode_ends = th.as_tensor(np.repeat(bounds[:, 1], bounds[:, 1] - bounds[:, 0]), device=self.device)
 
-    def train(self) -> None:
-        """One gradient step."""
+    def _gradient_step(self) -> dict[str, th.Tensor]:
         self.policy.set_training_mode(True)
         self._update_learning_rate(self.policy.optimizer)
         loss = self._loss(th.randint(len(self._actions), (self.batch_size,), device=self.device))
         self.policy.optimizer.zero_grad()
         loss.backward()
         self.policy.optimizer.step()
-        self._n_updates += 1
-        if self._n_updates % 100 == 0:
-            self.logger.record("train/loss", loss.item())
-            self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        return {"loss": loss.detach()}
 
     def _loss(self, rows: th.Tensor) -> th.Tensor:
         """Mean squared error of the actions of (B,) demonstrated rows."""
@@ -74,7 +60,6 @@ class BC(OfflineAlgorithm):
 
     def _inputs(self, rows: th.Tensor) -> th.Tensor:
         """Normalised observations with noise, (*shape, obs_dim), of rows of any shape."""
-        assert self._observations is not None
         inputs = self._observations[rows]
         return inputs + self.input_noise * th.randn_like(inputs) if self.input_noise else inputs
 
@@ -111,7 +96,7 @@ class BCRNN(BC):
         super().__init__(*args, **options)
 
     def _network_kwargs(self) -> dict[str, Any]:
-        return {"restart_every": None if self.carry_state else self.sequence_length}
+        return {**super()._network_kwargs(), "restart_every": None if self.carry_state else self.sequence_length}
 
     def _loss(self, rows: th.Tensor) -> th.Tensor:
         """Mean squared error of the actions over the steps, from (B,) rows on, that lie within an episode."""

@@ -1,6 +1,7 @@
 """What the offline baselines share: they learn from demonstrations alone, by steps that do nothing in the environment."""
 
 from abc import abstractmethod
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
@@ -75,9 +76,31 @@ class OfflineAlgorithm(LearnsFromDemonstrations):
         if _init_setup_model:
             self._setup_model()
 
-    @abstractmethod
+    def _setup_model(self) -> None:
+        self._setup_lr_schedule()
+        self.set_random_seed(self.seed)
+        kwargs = {**self._network_kwargs(), **self.policy_kwargs}
+        policy = self.policy_class(self.observation_space, self.action_space, self.lr_schedule, **kwargs)
+        self.policy = policy.to(self.device)
+        if self.env is not None:
+            self._load_demonstrations()
+
+    def _network_kwargs(self) -> dict[str, Any]:
+        """Keywords of the policy that follow from the algorithm's."""
+        return {}
+
     def train(self) -> None:
-        """One gradient step; counts it in ``_n_updates``."""
+        """One gradient step; every hundredth logs its losses."""
+        losses = self._gradient_step()
+        self._n_updates += 1
+        if self._n_updates % 100 == 0:
+            for name, loss in losses.items():
+                self.logger.record(f"train/{name}", float(loss))
+            self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+
+    @abstractmethod
+    def _gradient_step(self) -> Mapping[str, float | th.Tensor]:
+        """Learn from a batch: the losses, by name."""
 
     @abstractmethod
     def _take(self, shown: Demonstrations) -> None:

@@ -19,7 +19,7 @@ from sb3_actpc.actpc.arguments import Between, checked
 from sb3_actpc.baselines.bc_policies import LARGEST_INPUT, SMALLEST_SPREAD, State, StatefulPolicy
 from sb3_actpc.baselines.offline.installation import environment_python
 from sb3_actpc.baselines.offline.process import ServerProcess
-from sb3_actpc.baselines.offline.servers.frames import Arrays
+from sb3_actpc.baselines.offline.servers.frames import Arrays, Values
 from sb3_actpc.baselines.offline_algorithm import OfflineAlgorithm
 from sb3_actpc.demonstrations import Demonstrations, scaled_actions
 
@@ -93,18 +93,14 @@ class ServedAlgorithm(OfflineAlgorithm):
     def _setup_model(self) -> None:
         if not isinstance(self.observation_space, spaces.Box):
             raise ValueError(f"{type(self).__name__} needs Box observations, found {self.observation_space}")
-        self._setup_lr_schedule()
-        self.set_random_seed(self.seed)
         n_observations = int(np.prod(self.observation_space.shape))
-        policy_class: Any = self.policy_class
-        self.policy = policy_class(self.observation_space, self.action_space, self.lr_schedule, **self.policy_kwargs)
-        self.policy.owner = self
         self.normalization = th.stack([th.zeros(n_observations), th.ones(n_observations)])  # mean, standard deviation
         self.trained = th.empty(0, dtype=th.uint8)  # the networks as bytes, when they were last fetched
         self._shown: Arrays = {}
         if self.env is not None:
             self._command()  # before anything of a run is written
-            self._load_demonstrations()
+        super()._setup_model()
+        self.policy.owner = self
 
     def _take(self, shown: Demonstrations) -> None:
         assert isinstance(self.action_space, spaces.Box)
@@ -169,14 +165,9 @@ class ServedAlgorithm(OfflineAlgorithm):
             self._process.close()
             self._process = None
 
-    def train(self) -> None:
-        """One gradient step of every part of the method."""
-        losses, _ = self._server().ask("train")
-        self._n_updates += 1
-        if self._n_updates % 100 == 0:
-            for name, loss in losses.items():
-                self.logger.record(f"train/{name}", float(loss))
-            self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+    def _gradient_step(self) -> Values:
+        """Of every part of the method."""
+        return self._server().ask("train")[0]
 
     def act(self, observations: np.ndarray, starts: np.ndarray, state: State | None) -> tuple[np.ndarray, State | None]:
         """Actions (n, A), about in [-1, 1], and the next state, for observations (n, obs_dim); ``starts`` (n,) is true where
