@@ -15,10 +15,11 @@ from typing import Any
 
 import numpy as np
 
+from sb3_actpc.utils.files import file_hash
+
 FORMAT = "sb3_actpc checkpoint"
 VERSION = 5
 MANIFEST = "manifest.json"
-PIECE = 2**18  # bytes read at a time
 _NAME = re.compile(r"(\d{6,})_step_(\d+)")
 _TEMPORARY = ".writing-"
 Report = Callable[[str], None]
@@ -62,15 +63,7 @@ class BundleWriter:
 def _seal(path: Path) -> str:
     with open(path, "rb+") as file:
         os.fsync(file.fileno())
-    return _hash_file(path)
-
-
-def _hash_file(path: Path) -> str:
-    digest = hashlib.sha256()
-    with open(path, "rb") as file:
-        while piece := file.read(PIECE):
-            digest.update(piece)
-    return digest.hexdigest()
+    return file_hash(path)
 
 
 class Bundle:
@@ -91,7 +84,7 @@ class Bundle:
         for name, digest in self.manifest["files"].items():
             if not (self.path / name).is_file():
                 raise DamagedCheckpoint(f"{self.path}: {name} is missing")
-            if _hash_file(self.path / name) != digest:
+            if file_hash(self.path / name) != digest:
                 raise DamagedCheckpoint(f"{self.path}: {name} does not have the recorded SHA-256")
         return self
 

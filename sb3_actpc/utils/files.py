@@ -1,5 +1,6 @@
-"""Writing files so that a reader never meets half of one."""
+"""Writing files so that a reader never meets half of one, and telling whether one is what was written."""
 
+import hashlib
 import os
 import shutil
 import uuid
@@ -7,6 +8,18 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any, Literal
+
+PIECE = 2**18  # bytes read at a time
+
+
+def file_hash(*paths: Path) -> str:
+    """SHA-256 of the content of files, one after the other, in hex digits."""
+    digest = hashlib.sha256()
+    for path in paths:
+        with open(path, "rb") as file:
+            while piece := file.read(PIECE):
+                digest.update(piece)
+    return digest.hexdigest()
 
 
 @contextmanager

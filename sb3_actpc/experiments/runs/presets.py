@@ -20,9 +20,9 @@ from sb3_actpc.demonstrations.minari import minari_files
 from sb3_actpc.envs import sparse_env_id
 from sb3_actpc.experiments.runs.algorithms import check_keywords, load_algorithm
 from sb3_actpc.experiments.runs.environments import make_env
-from sb3_actpc.experiments.runs.provenance import file_hash
 from sb3_actpc.experiments.runs.schema import Run, merged
 from sb3_actpc.utils.constructors import constructor_keywords
+from sb3_actpc.utils.files import file_hash
 
 PACKAGE_FOLDER = Path(__file__).resolve().parents[2]
 # inside an installed wheel, or beside the package in a source checkout

@@ -1,6 +1,5 @@
 """Where the numbers of a run come from: versions of the packages, and the commit of a source checkout."""
 
-import hashlib
 import platform
 import subprocess
 from pathlib import Path
@@ -27,14 +26,6 @@ def git_state(checkout: Path = CHECKOUT) -> tuple[str | None, bool | None]:
     except (OSError, subprocess.SubprocessError):
         return None, None
     return commit, bool(changes)
-
-
-def file_hash(*paths: Path) -> str:
-    """SHA-256 of the content of files, one after the other, in hex digits."""
-    content = hashlib.sha256()
-    for path in paths:
-        content.update(path.read_bytes())
-    return content.hexdigest()
 
 
 def _git(checkout: Path, *arguments: str) -> str:
