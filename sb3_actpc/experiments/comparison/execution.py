@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from filelock import FileLock, Timeout
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback
 
 from sb3_actpc.checkpoints import TrainingStopped
 from sb3_actpc.experiments.runs import Run, finish_run
@@ -110,7 +110,7 @@ def execute_run(run: Run, report: Callable[[str], None], on_steps: Callable[[int
         with folder_lock(run.folder, LOCK_WAIT, report):
             (run.folder / ERROR).unlink(missing_ok=True)
             if run_status(run.folder) != FINISHED:
-                finish_run(run, report, [StepWatch(on_steps)])
+                finish_run(run, report, [step_watch(on_steps)])
     except TrainingStopped as stop:
         return Outcome(STOPPED, str(stop))
     except Exception as error:  # whatever it is, the other runs go on
@@ -130,27 +130,15 @@ def _failure(folder: Path, error: Exception) -> Outcome:
     return Outcome(FAILED, f"{type(error).__name__}: {message}")
 
 
-class StepWatch(BaseCallback):
-    """Tells the environment steps done, at most once in ``REPORT_INTERVAL`` seconds, and at the end."""
+def step_watch(on_steps: Callable[[int], None]) -> BaseCallback:
+    """A callback that tells the environment steps done, at most once in ``REPORT_INTERVAL`` seconds."""
+    last = -REPORT_INTERVAL
 
-    def __init__(self, on_steps: Callable[[int], None]) -> None:
-        super().__init__()
-        self.on_steps = on_steps
-        self._last = 0.0
-
-    def checkpoint_state(self) -> dict[str, Any]:
-        """Nothing: the clock of another process says nothing."""
-        return {}
-
-    def restore_checkpoint_state(self, state: dict[str, Any]) -> None:
-        """Nothing to restore."""
-
-    def _on_step(self) -> bool:
-        now = time.monotonic()
-        if now - self._last >= REPORT_INTERVAL:
-            self._last = now
-            self.on_steps(self.num_timesteps)
+    def watch(names: dict[str, Any], _: dict[str, Any]) -> bool:
+        nonlocal last
+        if time.monotonic() - last >= REPORT_INTERVAL:
+            last = time.monotonic()
+            on_steps(names["self"].num_timesteps)
         return True
 
-    def _on_training_end(self) -> None:
-        self.on_steps(self.num_timesteps)
+    return ConvertCallback(watch)
