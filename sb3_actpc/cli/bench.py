@@ -18,7 +18,6 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument("--output", type=Path, default=None, help="write the ratios to this JSON file")
     parser.add_argument("--table", type=Path, nargs="+", default=None, help="print written ratios as a Markdown table instead")
     parser.add_argument("--robosuite", action="store_true", help="time the robosuite tasks instead")
-    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:

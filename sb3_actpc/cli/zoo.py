@@ -1,8 +1,4 @@
-"""``sb3-actpc zoo``: rl-zoo3's own command line, with our algorithms, settings and tasks.
-
-``sb3-actpc zoo train | enjoy | optimize | plot ...`` puts the algorithms of ``sb3_actpc.experiments.runs.ALGORITHMS`` into
-``rl_zoo3.ALGOS`` and hands over to rl_zoo3: every option of its scripts works. Ours are ``--preset`` and ``--demonstrations``
-(as of ``sb3-actpc train``) before training, and ``--output`` of the plots.
+"""``sb3-actpc zoo``: rl-zoo3's own command line, with our algorithms, settings and tasks (see docs/baselines.md).
 
 What rl_zoo3 gets is a settings file with one entry, made from the preset, because rl_zoo3
 
