@@ -4,12 +4,10 @@ import argparse
 import importlib
 import pkgutil
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 from sb3_actpc import __version__
-
-RUN_OPTIONS = ("steps", "demonstrations", "gym_packages", "eval_freq", "eval_episodes", "checkpoint_freq", "device", "threads")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -41,7 +39,7 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 def add_run_options(parser: argparse.ArgumentParser, eval_episodes: int) -> None:
-    """Options that ``train`` and ``compare`` share, ``RUN_OPTIONS`` and ``--no-progress``; what is not given is None."""
+    """Options that ``train`` and ``compare`` share, keys of a run and ``--no-progress``; what is not given is None."""
     add = parser.add_argument
     add("--steps", type=steps, metavar="N", help="environment steps of a run, such as 1e5 (default: the preset's)")
     demonstrations = "file, id of a Minari dataset, 'weak' (the package's weaker) or 'none' (default: the package's)"
@@ -57,9 +55,9 @@ def add_run_options(parser: argparse.ArgumentParser, eval_episodes: int) -> None
     add("--no-progress", action="store_true", help="no progress bars")
 
 
-def given(args: argparse.Namespace, *names: str) -> dict[str, Any]:
-    """Those of the options, and of ``RUN_OPTIONS``, that the user gave."""
-    return {name: getattr(args, name) for name in (*names, *RUN_OPTIONS) if getattr(args, name) is not None}
+def given(args: argparse.Namespace, keys: Iterable[str]) -> dict[str, Any]:
+    """Those of the keys that are options here and that the user gave."""
+    return {name: getattr(args, name) for name in keys if getattr(args, name, None) is not None}
 
 
 def steps(text: str) -> int:

@@ -37,11 +37,12 @@ def run(args: argparse.Namespace) -> int:
     from sb3_actpc.checkpoints import EXIT_STOPPED
     from sb3_actpc.experiments.comparison import make_engine, plan_runs, read_comparison
     from sb3_actpc.experiments.comparison.display import Display, describe_runs
-    from sb3_actpc.experiments.comparison.plan import read_comparison_file
+    from sb3_actpc.experiments.comparison.plan import OWN_KEYS, read_comparison_file
     from sb3_actpc.experiments.comparison.schedule import run_comparison
+    from sb3_actpc.experiments.runs import Run
 
     from_file = {} if args.file is None else read_comparison_file(Path(args.file))
-    options = given(args, "envs", "algos", "ablate", "seeds", "first_seed", "output")
+    options = given(args, (*OWN_KEYS, *Run.known_keys()))
     if "steps" in options:  # a file may call them n_timesteps
         from_file.pop("n_timesteps", None)
     comparison = read_comparison({**from_file, **options})

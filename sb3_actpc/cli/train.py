@@ -42,7 +42,7 @@ def run(args: argparse.Namespace) -> int:
     try:
         if args.resume is None:
             settings, env_kwargs = parse_assignments(args.set or ()), parse_assignments(args.env_kwarg or ())
-            chosen = given(args, "env", "algo", "preset", "seed", "output", "n_envs")
+            chosen = given(args, Run.known_keys())
             run = Run(**chosen, settings=settings, env_kwargs=env_kwargs, progress=not args.no_progress)
             result = train_run(run, report)
         else:
