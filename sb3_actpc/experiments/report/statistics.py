@@ -52,10 +52,7 @@ def probability_of_improvement(scores: Scores, others: Scores) -> float:
 
 def probability_of_improvement_interval(scores: Scores, others: Scores, seed: int = 0) -> Interval:
     """Bounds of the 95 % interval of :func:`probability_of_improvement`."""
-    sizes = [len(part) for part in (*scores, *others)]
-    if all(size == 1 for size in sizes):
-        return math.nan, math.nan
-    ends = np.cumsum(sizes)
+    ends = np.cumsum([len(part) for part in (*scores, *others)])
 
     def statistic(joined: np.ndarray) -> np.ndarray:
         parts = np.split(joined, ends[:-1], axis=-1)
