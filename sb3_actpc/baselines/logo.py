@@ -190,20 +190,25 @@ class LOGO(LearnsFromDemonstrations, TRPO):
         with th.no_grad():
             old = copy.copy(self.policy.get_distribution(guidance.observations))
         objective, divergence = self._surrogate(guidance, old)
-        parameters, gradient, grad_kl, _ = self._compute_actor_grad(divergence, objective)
+        parameters, gradient, grad_kl, shapes = self._compute_actor_grad(divergence, objective)
         product = partial(self.hessian_vector_product, parameters, grad_kl)
         direction = conjugate_gradient_solver(product, gradient, max_iter=self.cg_max_steps)
         step = direction * th.sqrt(2.0 * max_kl / th.dot(direction, product(direction, retain_graph=False)))
-        start, scale = nn.utils.parameters_to_vector(parameters).detach(), 1.0
+        steps = [part.view(shape) for part, shape in zip(step.split([p.numel() for p in parameters]), shapes, strict=True)]
+        before = [parameter.detach().clone() for parameter in parameters]
+        scale = 1.0
         for _ in range(self.line_search_max_iter):
-            nn.utils.vector_to_parameters(start + scale * step, parameters)
             with th.no_grad():
+                for parameter, start, change in zip(parameters, before, steps, strict=True):
+                    parameter.copy_(start + scale * change)
                 found, divergence = self._surrogate(guidance, old)
             if divergence < max_kl and found > objective:
                 self.logger.record("train/guidance_kl", divergence.item())
                 return True
             scale *= self.line_search_shrinking_factor
-        nn.utils.vector_to_parameters(start, parameters)
+        with th.no_grad():
+            for parameter, start in zip(parameters, before, strict=True):
+                parameter.copy_(start)
         return False
 
     def _surrogate(self, guidance: Guidance, old: Any) -> tuple[th.Tensor, th.Tensor]:
