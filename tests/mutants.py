@@ -391,8 +391,35 @@ MUTANTS = [
         "",
         f"{HABIT} -k clone",
     ),
-    Mutant("clones for a learner that is ahead", TRIALS, " and not self.is_ahead()", "", f"{HABIT} -k better"),
+    Mutant(
+        "clones for a learner that is ahead",
+        TRIALS,
+        "self.n_rejected > self.is_ahead()",
+        "self.n_rejected > 0",
+        f"{HABIT} -k better",
+    ),
     Mutant("a clone's noise is the last one's", TRIALS, "[] if self.is_clone else", "", f"{HABIT} -k not_count"),
+    Mutant(
+        "a learner that is ahead bars clones",
+        TRIALS,
+        "self.n_rejected > self.is_ahead()",
+        "self.n_rejected and not self.is_ahead()",
+        f"{HABIT} -k keeps",
+    ),
+    Mutant(
+        "others' noisy episodes count",
+        TRIALS,
+        " and self.generations[env] == self.generation:  # else",
+        ":  # else",
+        f"{HABIT} -k began",
+    ),
+    Mutant(
+        "a warm start that was saved goes on",
+        AGENT,
+        "min(self.n_pretraining_updates, n_prior)",
+        "self.n_pretraining_updates",
+        f"{CLONES} -k saved",
+    ),
     Mutant("clones for ever", TRIALS, "self.n_clones > 0 and ", "", f"{HABIT} -k clone"),
     Mutant(
         "clones after every learner",
@@ -459,7 +486,7 @@ MUTANTS = [
     ),
     Mutant("own episodes keep old distances", AGENT, "memory.episodes.distances = None", "pass", f"{HABIT} -k anew"),
     Mutant("a given noise is not heeded", AGENT, "return self.refresh.noise\n", "return 1.0\n", f"{LEARNS} -k ridge"),
-    Mutant("clones imitate without noise", AGENT, "noise=self.clone_noise)", "noise=0.0)", f"{HABIT} -k noise"),
+    Mutant("clones imitate without noise", AGENT, "_imitated(n, self.clone_noise)", "_imitated(n)", f"{HABIT} -k noise"),
     Mutant(
         "the learning actor is blurred", AGENT, "n: int, noise: float = 0.0) -> t", "n: int, noise: float = 0.5) -> t", HABIT
     ),
@@ -545,7 +572,7 @@ MUTANTS = [
         "th.full_like(self.policy.spread, self.exploration_noise)",
         f"{HABIT} -k noise",
     ),
-    Mutant("the warm start's rate stands", AGENT, "* (last / first) ** progress", "", f"{HABIT} -k rates"),
+    Mutant("the warm start's rate stands", CLONING, " * (last / first) ** (done / self.n_updates)", "", f"{CLONES} -k rates"),
     Mutant("the delay is ignored", AGENT, "self._n_updates % self.policy_delay == 0", "True", f"{HABIT} -k once"),
     # ------------------------------------------------------------------ the batch
     Mutant(

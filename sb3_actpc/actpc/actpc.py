@@ -501,7 +501,8 @@ class ActPC(OffPolicyAlgorithm):
 
     def pretrain(self, before_update: Callable[[], None] = lambda: None, progress_bar: bool = False) -> None:
         """
-        Train the prior (and, if asked for, the actor) on the demonstrations, once; ``learn`` calls this.
+        Train the prior (and, if asked for, the actor's teachers and the actor) on the demonstrations, once; ``learn`` calls
+        this. It goes on where a checkpoint was taken.
 
         :param before_update: called before each update
         :param progress_bar: show one
@@ -515,7 +516,9 @@ class ActPC(OffPolicyAlgorithm):
                 stacklevel=2,
             )
         n_prior = self.prior_updates if self.alpha_in else 0  # without a weight the prior has no role
-        self.cloning = self.cloning or self._clone_into(self.actor.circuit, self.refresh.ensemble_size)
+        if self.cloning is None:  # of an agent that was saved meanwhile it begins again: its teachers are not in the file
+            self.n_pretraining_updates = min(self.n_pretraining_updates, n_prior)
+            self.cloning = self._clone_into(self.actor.circuit, self.refresh.ensemble_size)
         n_updates = n_prior + len(self.cloning)
         updates: Iterable[int] = range(self.n_pretraining_updates, n_updates)
         if progress_bar:
@@ -537,8 +540,10 @@ class ActPC(OffPolicyAlgorithm):
 
     def _clone_into(self, circuit: NGCCircuit, ensemble_size: int = 1) -> Cloning:
         """What makes an actor's circuit a clone of whatever is imitated by now."""
-        sample = partial(self._sample_imitated, noise=self.clone_noise)
-        return Cloning(circuit, self.policy.make_actor, sample, self.actor_warm_start, ensemble_size)
+        return Cloning(circuit, self.policy.make_actor, self._sample_for_clones, self.actor_warm_start, ensemble_size)
+
+    def _sample_for_clones(self, n: int) -> tuple[th.Tensor, th.Tensor, th.Tensor | None]:
+        return self._sample_imitated(n, self.clone_noise)
 
     def _start_from(self, clone: NGCCircuit) -> None:
         """Learning begins with this actor."""
@@ -992,8 +997,9 @@ class ActPC(OffPolicyAlgorithm):
         if self.expert is not None:
             self.expert.epistemic, self.expert.instrumental, self.expert.has_signals = signals
         self.pretrained, self.n_pretraining_updates = state["pretrained"], state["n_pretraining_updates"]
+        self.cloning = None
         if state["cloning"] is not None:
-            self.cloning = self._clone_into(self.actor.circuit, self.refresh.ensemble_size)
+            self.cloning = self._clone_into(self.actor.circuit)
             self.cloning.restore_checkpoint_state(state["cloning"])
         self._rollout_state, self._rollout_starts = state["rollout_state"], state["rollout_starts"]
         self.signals.restore_checkpoint_state(state["signals"])

@@ -15,7 +15,7 @@ from sb3_actpc.ngc import NGCCircuit
 
 RATES, BATCH_SIZE = (1e-3, 5e-5), 256  # a precise clone: what follows can only be as good as its habit
 
-TEACHING_NOISE = 0.1  # standard deviation of the noise on the features where teachers are asked
+TEACHING_NOISE = 0.1  # standard deviation of the noise where teachers are asked, on features as the circuits see them
 
 # n -> features (n, n_features), actions (n, A) and working memory of n imitated steps
 Sample = Callable[[int], tuple[th.Tensor, th.Tensor, th.Tensor | None]]
@@ -29,7 +29,7 @@ class Cloning:
     :param make_circuit: gives circuits like it that have learned nothing
     :param sample: draws imitated steps
     :param n_updates: of every circuit
-    :param ensemble_size: how many teach the clone; with 1 nobody does
+    :param ensemble_size: how many teach the clone, 2 or more; with 1 it learns alone
     """
 
     def __init__(
@@ -49,7 +49,10 @@ class Cloning:
         return self.n_updates * (1 if self.ensemble_size == 1 else self.ensemble_size + 1)
 
     def update(self, index: int) -> None:
-        """:param index: how many were before this one"""
+        """One update of the circuit whose turn it is.
+
+        :param index: how many were before this one
+        """
         stage, done = divmod(index, self.n_updates)
         features, actions, memory = self.sample(BATCH_SIZE)
         circuit = self.clone
@@ -65,14 +68,16 @@ class Cloning:
             group["lr"] = own["lr"]
         circuit.apply_changes(circuit.hebbian_update(circuit.settle(features, actions, memory)))
 
-    def checkpoint_state(self) -> list[Any]:
-        """The teachers and their optimizers' moments, as plain values and tensors."""
-        return [(dict(teacher.state_dict()), teacher.optimizer.state_dict()["state"]) for teacher in self.teachers]
+    def checkpoint_state(self) -> dict[str, Any]:
+        """The sizes, the teachers and their optimizers' moments, as plain values and tensors."""
+        teachers = [(dict(teacher.state_dict()), teacher.optimizer.state_dict()["state"]) for teacher in self.teachers]
+        return {"n_updates": self.n_updates, "ensemble_size": self.ensemble_size, "teachers": teachers}
 
-    def restore_checkpoint_state(self, state: list[Any]) -> None:
+    def restore_checkpoint_state(self, state: dict[str, Any]) -> None:
         """:param state: what :meth:`checkpoint_state` returned"""
-        self.teachers = [self.make_circuit() for _ in state]
-        for teacher, (synapses, moments) in zip(self.teachers, state, strict=True):
+        self.n_updates, self.ensemble_size = state["n_updates"], state["ensemble_size"]
+        self.teachers = [self.make_circuit() for _ in state["teachers"]]
+        for teacher, (synapses, moments) in zip(self.teachers, state["teachers"], strict=True):
             teacher.load_state_dict(synapses)
             teacher.optimizer.load_state_dict({**teacher.optimizer.state_dict(), "state": moments})
 

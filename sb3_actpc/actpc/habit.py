@@ -38,8 +38,9 @@ class Trials:
     again: what made it the habit was partly luck.
 
     Clones of the same demonstrations can do very differently, by their first synapses alone. So while the habit is paid less
-    than what it imitates, by more than ``SHORTFALL`` of it, further clones are candidates: after a rejected learner, unless it
-    is paid more than the habit even with noise and was rejected by chance. Learning begins anew with one that is accepted.
+    than what it imitates, by more than ``SHORTFALL`` of it, further clones are candidates: after a rejected learner, or after
+    the second in a row where the learner is paid more than the habit even with noise, and the first rejection may have been
+    chance. Learning begins anew with one that is accepted.
 
     :param n_envs: environments, each with an episode of its own
     """
@@ -63,7 +64,7 @@ class Trials:
     on_trial: bool = False  # there is a candidate that is not judged yet
     is_clone: bool = False  # it is one, not the learning actor's average
     has_learned: bool = False
-    learner_was_rejected: bool = False  # the last candidate was one
+    n_rejected: int = 0  # learners in a row
     tests_habit: bool = True  # before the next candidate: its return must be known, or known better
 
     def __post_init__(self) -> None:
@@ -87,7 +88,7 @@ class Trials:
 
     def needs_clone(self) -> bool:
         """Whether the next candidate is a clone."""
-        is_due = self.learner_was_rejected and not self.is_ahead()
+        is_due = self.n_rejected > self.is_ahead()
         least = self.imitated_return - SHORTFALL * abs(self.imitated_return)
         return is_due and self.n_clones > 0 and self.habit_return < least
 
@@ -110,7 +111,7 @@ class Trials:
         role, episode_return, length = self.roles[env], self.returns[env], self.lengths[env]
         self.returns[env], self.lengths[env] = 0.0, 0
         self.quiet_due[env] = length if role == "actor" else self.quiet_due[env] - length
-        if role == "actor":
+        if role == "actor" and self.generations[env] == self.generation:  # else another actor began it
             self.noisy_returns = [*self.noisy_returns, episode_return][-KEPT_NOISY_RETURNS:]
         if role == "habit":
             self.habit_returns = [*self.habit_returns, episode_return][-KEPT_RETURNS:]
@@ -160,7 +161,7 @@ class Trials:
             self.roles = ["actor" if role == "habit" else role for role in self.roles]
         elif has_time and abs(gain) + SURE * error > smallest:
             return None
-        self.learner_was_rejected = verdict == "rejected" and not self.is_clone
+        self.n_rejected = self.n_rejected + 1 if verdict == "rejected" and not self.is_clone else 0
         self.tests_habit = verdict != "accepted"
         self.candidate_returns, self.candidate_steps, self.on_trial = [], 0, False
         self.habit_proofs, self.habit_steps = 0, 0

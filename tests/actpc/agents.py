@@ -3,10 +3,10 @@
 from typing import Any
 
 import torch as th
-from stable_baselines3.common.vec_env import DummyVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from sb3_actpc import ActPC
-from tests.actpc.envs import CountingEnv
+from tests.actpc.envs import CountingEnv, demonstrations
 
 SMALL = {
     "policy_kwargs": {"net_arch": [16, 16]},
@@ -51,6 +51,14 @@ def plain(**keywords: Any) -> dict[str, Any]:
     policy = {**PLAIN_POLICY, **keywords.pop("policy_kwargs", {})}
     policy["circuit_kwargs"] = {**PLAIN_POLICY["circuit_kwargs"], **policy["circuit_kwargs"]}  # type: ignore[dict-item]
     return {**PLAIN, **keywords, "policy_kwargs": policy}
+
+
+def imitating(env=CountingEnv, policy_kwargs=None, **keywords):
+    """The constructor's defaults but for sizes: with demonstrations there is a habit."""
+    env = env if isinstance(env, VecEnv) else DummyVecEnv([env])
+    policy_kwargs = {"net_arch": [16, 16], **(policy_kwargs or {})}
+    keywords = {"demonstrations": demonstrations(), **QUICK, **keywords, "policy_kwargs": policy_kwargs}
+    return ActPC("MlpPolicy", env, **keywords)
 
 
 def make(env=None, n_envs=1, **keywords) -> ActPC:

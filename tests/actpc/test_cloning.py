@@ -3,13 +3,14 @@
 import numpy as np
 import pytest
 import torch as th
+from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_actpc import ActPC
 from sb3_actpc.actpc import cloning as cloning_module
 from sb3_actpc.actpc.cloning import BATCH_SIZE, TEACHING_NOISE, Cloning, taught
 from sb3_actpc.ngc import NGCCircuit
-from tests.actpc.agents import differ, weights_of
-from tests.actpc.test_habit import imitating
+from tests.actpc.agents import differ, imitating, weights_of
+from tests.actpc.envs import CountingEnv
 
 
 def make_circuit() -> NGCCircuit:
@@ -171,6 +172,57 @@ def test_batches_are_of_one_size(monkeypatch):
     monkeypatch.setattr(ActPC, "_sample_imitated", lambda self, n, noise=0.0: (seen.append(n), original(self, n, noise))[1])
     imitating().pretrain()
     assert seen == [BATCH_SIZE] * 20 and BATCH_SIZE == 256
+
+
+class Stop(Exception):
+    pass
+
+
+def stopped_after(n_updates: int) -> ActPC:
+    """An agent whose warm start was interrupted."""
+
+    def update(self, index):
+        if index == n_updates:
+            raise Stop
+        original(self, index)
+
+    original = Cloning.update
+    model = imitating()
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(Stop):
+        patch.setattr(Cloning, "update", update)
+        model.learn(9)
+    assert model.n_pretraining_updates == n_updates and not model.pretrained
+    return model
+
+
+@pytest.mark.parametrize("n_done", [2, 7, 12, 17])
+def test_an_agent_saved_within_the_warm_start_begins_it_again(n_done, tmp_path):
+    model = stopped_after(n_done)
+    model.save(tmp_path / "model")
+    again = ActPC.load(tmp_path / "model", env=DummyVecEnv([CountingEnv]))
+    seen, update = [], Cloning.update
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Cloning, "update", lambda self, index: (seen.append(index), update(self, index)))
+        again.pretrain()
+    assert seen == list(range(20)) and again.pretrained and again.n_pretraining_updates == 20
+
+
+@pytest.mark.parametrize("n_done", [2, 7, 12, 17])
+@pytest.mark.parametrize("others", [{"refresh_kwargs": {"ensemble_size": 1}}, {"actor_warm_start": 3}])
+def test_a_clone_in_the_making_keeps_the_sizes_that_it_was_begun_with(n_done, others):
+    """Whatever the agent that a checkpoint is restored into was made with."""
+    model = stopped_after(n_done)
+    other = imitating(**others)
+    other.restore_checkpoint_state(model.checkpoint_state())
+    assert len(other.cloning) == 20 and len(other.cloning.teachers) == len(model.cloning.teachers)
+    other.pretrain()
+    assert other.n_pretraining_updates == 20
+
+
+def test_without_a_warm_start_there_is_nothing_to_measure():
+    model = imitating(actor_warm_start=0)
+    model.pretrain()
+    assert model.pretrained and model.expert.leaves_room is None
 
 
 def test_settings_are_checked():

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_actpc import ActPC
 from sb3_actpc.actpc import actpc as actpc_module
@@ -28,7 +28,7 @@ from sb3_actpc.actpc.habit import (
 )
 from sb3_actpc.actpc.self_imitation import imitated_return
 from sb3_actpc.actpc.trust_region import FIRST_MULTIPLIER, RADIUS_FACTORS, spread_of
-from tests.actpc.agents import QUICK, differ, make, weights_of
+from tests.actpc.agents import QUICK, differ, imitating, make, weights_of
 from tests.actpc.envs import CountingEnv, demonstrations
 from tests.checkpoints.runs import assert_same, learn_in_two, learn_straight
 
@@ -351,7 +351,7 @@ def test_while_nothing_is_learned_no_clone_is_tried():
     ],
 )
 def test_a_clone_is_needed_where_a_tenth_of_what_is_imitated_is_missing(imitated, paid, n_clones, is_needed):
-    trials = Trials(1, imitated_return=imitated, n_clones=n_clones, habit_returns=[paid, paid], learner_was_rejected=True)
+    trials = Trials(1, imitated_return=imitated, n_clones=n_clones, habit_returns=[paid, paid], n_rejected=1)
     assert trials.needs_clone() == is_needed
 
 
@@ -411,13 +411,15 @@ def test_once_something_is_learned_a_clone_is_tried_after_a_rejected_learner_and
     ],
 )
 def test_no_clone_is_needed_while_the_rejected_learner_does_better_even_with_noise(noisy, is_needed):
-    trials = Trials(1, imitated_return=100.0, n_clones=1, learner_was_rejected=True)
+    trials = Trials(1, imitated_return=100.0, n_clones=1, n_rejected=1)
     for one in noisy:
         trials.roles[0] = "actor"
         play(trials, one, 3)
     trials.habit_returns = [50.0, 50.0]
     assert trials.needs_clone() == is_needed
-    trials.learner_was_rejected = False
+    trials.n_rejected = 2  # noise can keep an actor up that falls without: the second is no chance
+    assert trials.needs_clone()
+    trials.n_rejected = 0
     assert not trials.needs_clone()
 
 
@@ -430,6 +432,30 @@ def test_what_was_paid_with_noise_before_a_clone_was_accepted_does_not_count(is_
     assert trials.noisy_returns == ([] if is_clone else [7.0, 8.0])
 
 
+def test_of_learners_that_noise_keeps_up_every_second_in_a_row_is_followed_by_a_clone():
+    trials = Trials(1, imitated_return=100.0, n_clones=2)
+    candidates = []
+    for _ in range(40):
+        played = trials.roles[0]
+        is_new = play(trials, {"actor": 80.0, "habit": 50.0, "candidate": 0.0}[played])[1] == "rejected"
+        candidates += [trials.is_clone] if is_new else []
+    assert candidates[:6] == [False, False, True] * 2 and not any(candidates[6:])
+
+
+def test_noisy_episodes_that_another_actor_began_do_not_count():
+    trials = Trials(2, imitated_return=100.0, n_clones=2)
+    trials.habit_returns, trials.tests_habit, trials.roles = [10.0, 10.0], False, ["candidate", "actor"]
+    trials.on_trial = trials.is_clone = True
+    play(trials, 60.0)
+    trials.roles[0] = "candidate"
+    assert play(trials, 60.0)[1] == "accepted"
+    play(trials, 7.0, env=1)  # begun by the learner of before
+    assert trials.noisy_returns == []
+    trials.roles[1] = "actor"
+    play(trials, 8.0, env=1)
+    assert trials.noisy_returns == [8.0]
+
+
 def test_a_clone_that_is_accepted_late_is_no_candidate_before_it_has_learned_again():
     trials = Trials(1, imitated_return=100.0, n_clones=1)
     assert play_clones(trials, 50.0, 50.0, 0.0, 50.0, has_learned=True)[-2][1] == "rejected"
@@ -439,7 +465,7 @@ def test_a_clone_that_is_accepted_late_is_no_candidate_before_it_has_learned_aga
 
 
 def test_what_the_habit_is_paid_elsewhere_meanwhile_does_not_stop_the_trial_of_a_clone():
-    trials = Trials(2, imitated_return=100.0, n_clones=1, learner_was_rejected=True)
+    trials = Trials(2, imitated_return=100.0, n_clones=1, n_rejected=1)
     for _ in range(2):
         assert play(trials, 0.0, 3)[0] == "actor"
         assert play(trials, 50.0) == ("habit", None)
@@ -460,14 +486,6 @@ class Unpaid(CountingEnv):
 
     def __init__(self, lengths=(5, 9, 3, 12)):
         super().__init__(lengths=lengths, returns=(0.0,))
-
-
-def imitating(env=CountingEnv, policy_kwargs=None, **keywords):
-    """The constructor's defaults but for sizes: with demonstrations there is a habit."""
-    env = env if isinstance(env, VecEnv) else DummyVecEnv([env])
-    policy_kwargs = {"net_arch": [16, 16], **(policy_kwargs or {})}
-    keywords = {"demonstrations": demonstrations(), **QUICK, **keywords, "policy_kwargs": policy_kwargs}
-    return ActPC("MlpPolicy", env, **keywords)
 
 
 def actions_of(model, circuit):
@@ -547,7 +565,7 @@ def test_a_clone_that_is_accepted_is_where_learning_begins(paid, verdict, monkey
     """Of other first synapses, trained as the warm start was; about the pressure its verdict says nothing."""
     model = imitating()
     model.learn(30)
-    model.trials = Trials(1, imitated_return=1.0, n_clones=3, learner_was_rejected=True)
+    model.trials = Trials(1, imitated_return=1.0, n_clones=3, n_rejected=1)
     before = [weights_of(model.actor.habit), weights_of(model.actor.circuit)]
     region, n_stored = model.policy.trust_region, model.replay_buffer.size()
     radius = float(region.radius)
