@@ -34,7 +34,8 @@ class Trials:
     the habit or a candidate; episodes that soon end in a fall would else be few. A gain must pass a share of the habit's
     absolute mean return and ``SURE`` of its own standard errors, from the variance that candidate and habit have in common,
     and a loss that share and ``LIKELY``. In between the candidate plays on, unless it surely is neither; when it has had its
-    steps, ``LIKELY`` is enough of a gain and the share of a loss. After a candidate that did not prove itself the habit plays
+    steps, the share is enough of a loss, and ``LIKELY`` of a gain, but for a learner that is paid less than the habit where it
+    plays with noise: two good episodes may be luck. After a candidate that did not prove itself the habit plays
     again: what made it the habit was partly luck.
 
     Clones of the same demonstrations can do very differently, by their first synapses alone. So while the habit is paid less
@@ -149,12 +150,13 @@ class Trials:
         if not _is_tried(n, self.candidate_steps) and not (n >= N_PROOFS and great_loss):
             return None
         has_time = self.candidate_steps < MOST_PROOF_STEPS
+        is_doubtful = not self.is_clone and not self.is_ahead()
         verdict: Verdict = "tied"
         if great_loss or (n >= N_PROOFS and gain < -max(smallest, has_time * LIKELY * error)):
             verdict = "rejected"
         elif n < N_PROOFS:
             return None
-        elif gain > 0.0 and gain >= max(smallest, (SURE if has_time else LIKELY) * error):
+        elif gain > 0.0 and gain >= max(smallest, (SURE if has_time or is_doubtful else LIKELY) * error):
             verdict, self.habit_returns = "accepted", own[-KEPT_RETURNS:]
             self.noisy_returns = [] if self.is_clone else self.noisy_returns
             # what the old habit has begun elsewhere is no return of the new one
