@@ -420,6 +420,10 @@ MUTANTS = [
         "self.n_pretraining_updates",
         f"{CLONES} -k saved",
     ),
+    Mutant("two good episodes are proof", TRIALS, "not self.is_clone and not self.is_ahead()", "False", f"{HABIT} -k luck"),
+    Mutant(
+        "noise judges clones", TRIALS, "not self.is_clone and not self.is_ahead()", "not self.is_ahead()", f"{HABIT} -k luck"
+    ),
     Mutant("clones for ever", TRIALS, "self.n_clones > 0 and ", "", f"{HABIT} -k clone"),
     Mutant(
         "clones after every learner",

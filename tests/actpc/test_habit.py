@@ -181,6 +181,26 @@ def test_a_gain_must_pass_its_standard_error_and_the_candidate_plays_on_until_it
 
 
 @pytest.mark.parametrize(
+    ("noisy", "is_clone", "verdict"),
+    [(101.0, False, "accepted"), (99.0, False, "tied"), (99.0, True, "accepted")],
+)
+def test_what_may_be_luck_is_no_proof_for_a_learner_that_noise_makes_worse_than_the_habit(noisy, is_clone, verdict):
+    """A gain of 7.5 by errors of 9.4, when the candidate had its steps: of clones the noise says nothing."""
+    trials = Trials(1)
+    assert tried(100.0, [90.0, 120.0, 110.0], trials=trials) == [None] * 3
+    trials.is_clone, trials.noisy_returns, trials.roles = is_clone, [noisy] * 4, ["candidate"]
+    assert play(trials, 110.0)[1] == verdict
+
+
+@pytest.mark.parametrize("noisy", [99.0, 101.0])
+def test_a_sure_gain_is_proof_whatever_the_noise_does(noisy):
+    trials = Trials(1)
+    tried(100.0, [90.0], trials=trials)
+    trials.candidate_returns, trials.noisy_returns, trials.roles = [118.0, 120.0, 122.0], [noisy] * 4, ["candidate"]
+    assert play(trials, 120.0, MOST_PROOF_STEPS)[1] == "accepted"
+
+
+@pytest.mark.parametrize(
     ("candidate", "verdicts"),
     [
         ([90.0, 110.0], [None, None]),  # neither, and 1.5 errors of 10
