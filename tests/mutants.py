@@ -380,7 +380,7 @@ MUTANTS = [
     Mutant(
         "candidates before anything is learned",
         TRIALS,
-        "(not self.tests_habit and self.has_learned)",
+        "(not self.tests_habit and (self.has_learned or self.needs_clone()))",
         "not self.tests_habit",
         f"{HABIT} -k late",
     ),
@@ -424,7 +424,15 @@ MUTANTS = [
     Mutant(
         "noise judges clones", TRIALS, "not self.is_clone and not self.is_ahead()", "not self.is_ahead()", f"{HABIT} -k luck"
     ),
-    Mutant("clones for ever", TRIALS, "self.n_clones > 0 and ", "", f"{HABIT} -k clone"),
+    Mutant(
+        "a decent beginning is not enough",
+        TRIALS,
+        "SHORTFALL if self.has_learned else GREAT_SHORTFALL",
+        "SHORTFALL",
+        f"{HABIT} -k half",
+    ),
+    Mutant("clones whatever was learned", TRIALS, "(self.has_learned and not is_due)", "False", HABIT),
+    Mutant("clones for ever", TRIALS, "not self.n_clones or ", "", f"{HABIT} -k clone"),
     Mutant(
         "clones after every learner",
         TRIALS,
@@ -484,8 +492,8 @@ MUTANTS = [
     Mutant(
         "a costly habit needs clones",
         TRIALS,
-        "SHORTFALL * abs(self.imitated_return)",
-        "SHORTFALL * self.imitated_return",
+        "shortfall * abs(self.imitated_return)",
+        "shortfall * self.imitated_return",
         f"{HABIT} -k tenth",
     ),
     Mutant("own episodes keep old distances", AGENT, "memory.episodes.distances = None", "pass", f"{HABIT} -k anew"),
@@ -502,7 +510,6 @@ MUTANTS = [
     Mutant("the first teacher alone", CLONING, "for teacher in teachers]).mean(0)", "for teacher in teachers])[0]", CLONES),
     Mutant("teachers everywhere", CLONING, "actions[::2] = th", "actions[:] = th", CLONES),
     Mutant("one fall of the rates for all", CLONING, "(done / self.n_updates)", "(index / len(self))", CLONES),
-    Mutant("further clones are taught too", AGENT, "self.policy.make_actor())\n", "self.policy.make_actor(), 4)\n", CLONES),
     Mutant(
         "a stop forgets the teachers",
         AGENT,

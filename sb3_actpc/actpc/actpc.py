@@ -518,7 +518,7 @@ class ActPC(OffPolicyAlgorithm):
         n_prior = self.prior_updates if self.alpha_in else 0  # without a weight the prior has no role
         if self.cloning is None:  # of an agent that was saved meanwhile it begins again: its teachers are not in the file
             self.n_pretraining_updates = min(self.n_pretraining_updates, n_prior)
-            self.cloning = self._clone_into(self.actor.circuit, self.refresh.ensemble_size)
+            self.cloning = self._clone_into(self.actor.circuit)
         n_updates = n_prior + len(self.cloning)
         updates: Iterable[int] = range(self.n_pretraining_updates, n_updates)
         if progress_bar:
@@ -538,9 +538,10 @@ class ActPC(OffPolicyAlgorithm):
             self.trials.n_clones = self.refresh.n_clones - 1
         self.pretrained = True
 
-    def _clone_into(self, circuit: NGCCircuit, ensemble_size: int = 1) -> Cloning:
+    def _clone_into(self, circuit: NGCCircuit) -> Cloning:
         """What makes an actor's circuit a clone of whatever is imitated by now."""
-        return Cloning(circuit, self.policy.make_actor, self._sample_for_clones, self.actor_warm_start, ensemble_size)
+        size = self.refresh.ensemble_size
+        return Cloning(circuit, self.policy.make_actor, self._sample_for_clones, self.actor_warm_start, size)
 
     def _sample_for_clones(self, n: int) -> tuple[th.Tensor, th.Tensor, th.Tensor | None]:
         return self._sample_imitated(n, self.clone_noise)

@@ -1,7 +1,7 @@
 """Clones: actors that have learned from imitation alone.
 
 Clones of the same demonstrations agree where these have steps and differ beside them, by their first synapses; and a gait
-stands or falls by what an actor does beside them. The mean action of several clones is steadier than theirs. So the first
+stands or falls by what an actor does beside them. The mean action of several clones is steadier than theirs. So a
 clone has an *ensemble* of teachers: they imitate what is shown, and then it imitates what is shown and, around it, their mean
 (distillation: Hinton, Vinyals and Dean 2015). Every circuit settles and changes by Hebbian updates, as always.
 """

@@ -18,7 +18,8 @@ N_PROOFS = 2  # episodes of a candidate at least, before it is judged by less th
 PROOF_STEPS, ENOUGH_PROOFS = 500, 10
 MOST_PROOF_STEPS = 2000  # that a candidate has for a proof
 KEPT_RETURNS, KEPT_NOISY_RETURNS = 20, 4  # of the habit, and of the learning actor
-SHORTFALL = 0.1  # of what the imitated episodes were paid: a clone that is paid less by more is no good one
+# of what the imitated episodes were paid: a clone that is paid less by more is no good one, and no good beginning
+SHORTFALL, GREAT_SHORTFALL = 0.1, 0.5
 # standard errors: that a gain must pass at any time, and after ``MOST_PROOF_STEPS``; the second is also a loss's before
 SURE, LIKELY = 1.5, 0.5
 # shares of the habit's mean return: what counts as a gain or a loss, and with what loss a candidate is rejected at once
@@ -39,9 +40,10 @@ class Trials:
     again: what made it the habit was partly luck.
 
     Clones of the same demonstrations can do very differently, by their first synapses alone. So while the habit is paid less
-    than what it imitates, by more than ``SHORTFALL`` of it, further clones are candidates: after a rejected learner, or after
-    the second in a row where the learner is paid more than the habit even with noise, and the first rejection may have been
-    chance. Learning begins anew with one that is accepted.
+    than what it imitates, further clones are candidates: before anything is learned, where ``GREAT_SHORTFALL`` of it is
+    missing; then, where ``SHORTFALL`` is, after a rejected learner, or after the second in a row where the learner is paid more
+    than the habit even with noise, and the first rejection may have been chance. Learning begins anew with one that is
+    accepted.
 
     :param n_envs: environments, each with an episode of its own
     """
@@ -90,8 +92,10 @@ class Trials:
     def needs_clone(self) -> bool:
         """Whether the next candidate is a clone."""
         is_due = self.n_rejected > self.is_ahead()
-        least = self.imitated_return - SHORTFALL * abs(self.imitated_return)
-        return is_due and self.n_clones > 0 and self.habit_return < least
+        if not self.n_clones or (self.has_learned and not is_due):
+            return False
+        shortfall = SHORTFALL if self.has_learned else GREAT_SHORTFALL
+        return self.habit_return < self.imitated_return - shortfall * abs(self.imitated_return)
 
     def step(self, env: int, reward: float) -> None:
         """:param env: which environment
@@ -103,7 +107,7 @@ class Trials:
         """
         The episode of ``env`` has ended.
 
-        :param has_learned: whether the learning actor differs from the habit by more than imitation; before, there are no
+        :param has_learned: whether the learning actor differs from the habit by more than imitation; before, clones alone are
             candidates
         :return: "accepted": the candidate becomes the habit; "tied": it is dropped, being neither proven better nor worse;
             "rejected": it is dropped, being worse; None: nothing follows yet
@@ -118,7 +122,7 @@ class Trials:
             self.habit_returns = [*self.habit_returns, episode_return][-KEPT_RETURNS:]
             self.habit_proofs, self.habit_steps = self.habit_proofs + 1, self.habit_steps + length
             is_known = len(self.habit_returns) >= N_PROOFS and _is_tried(self.habit_proofs, self.habit_steps)
-            self.tests_habit = not (is_known and has_learned)
+            self.tests_habit = not (is_known and (has_learned or self.needs_clone()))
         if role != "candidate" or self.generations[env] != self.generation:
             return None
         self.candidate_returns.append(episode_return)
@@ -132,7 +136,7 @@ class Trials:
         :return: whether a new candidate plays it, which is to be made now: a clone where ``is_clone`` says so, else the
             learning actor's average
         """
-        has_candidate = self.on_trial or (not self.tests_habit and self.has_learned)
+        has_candidate = self.on_trial or (not self.tests_habit and (self.has_learned or self.needs_clone()))
         quiet: Role = "candidate" if has_candidate else "habit"
         self.roles[env] = quiet if self.roles[env] == "actor" or self.quiet_due[env] > 0 else "actor"
         self.generations[env] = self.generation

@@ -150,7 +150,7 @@ def test_rates_fall_geometrically_for_every_circuit_and_leave_nothing_behind(ens
     assert [group["lr"] for group in model.critic.first().optimizer.param_groups] == pytest.approx([8e-4, 0.9 * 8e-4])
 
 
-def test_the_first_clone_has_an_ensemble_and_further_ones_have_none(monkeypatch):
+def test_further_clones_are_made_as_the_first_was(monkeypatch):
     made, original = [], Cloning.__init__
 
     def watched(self, *given):
@@ -162,7 +162,7 @@ def test_the_first_clone_has_an_ensemble_and_further_ones_have_none(monkeypatch)
     model.pretrain()
     model.trials.on_trial = model.trials.is_clone = True
     model._make_candidate()
-    assert [(cloning.ensemble_size, len(cloning)) for cloning in made] == [(4, 25), (1, 5)]
+    assert [(cloning.ensemble_size, len(cloning)) for cloning in made] == [(4, 25), (4, 25)]
     assert made[0].clone is model.actor.circuit is not made[1].clone
     assert not differ(weights_of(made[1].clone), weights_of(model.policy.candidate))
 

@@ -353,9 +353,16 @@ def play_clones(trials, *paid, has_learned=False):
     return played
 
 
-def test_while_nothing_is_learned_no_clone_is_tried():
+def test_while_nothing_is_learned_and_the_habit_is_paid_less_than_half_of_what_it_imitates_clones_are_tried():
+    """The habit is known before a clone is tried, and better after one that is no better; none where it is half as good."""
     trials = Trials(1, imitated_return=100.0, n_clones=2)
-    assert play_clones(trials, 50.0, 60.0, 10.0, 40.0) == [("habit", None, False)] * 4 and trials.n_clones == 2
+    assert play_clones(trials, 40.0, 50.0) == [("habit", None, False)] * 2
+    assert play_clones(trials, 10.0) == [("candidate", "rejected", True)]
+    assert play_clones(trials, 45.0) == [("habit", None, False)]
+    assert play_clones(trials, 60.0, 60.0) == [("candidate", None, True), ("candidate", "accepted", False)]
+    assert play_clones(trials, 60.0, 60.0) == [("habit", None, False)] * 2 and trials.n_clones == 0
+    decent = Trials(1, imitated_return=100.0, n_clones=2)
+    assert play_clones(decent, 51.0, 55.0, 52.0) == [("habit", None, False)] * 3 and decent.n_clones == 2
 
 
 @pytest.mark.parametrize(
@@ -371,7 +378,7 @@ def test_while_nothing_is_learned_no_clone_is_tried():
     ],
 )
 def test_a_clone_is_needed_where_a_tenth_of_what_is_imitated_is_missing(imitated, paid, n_clones, is_needed):
-    trials = Trials(1, imitated_return=imitated, n_clones=n_clones, habit_returns=[paid, paid], n_rejected=1)
+    trials = Trials(1, imitated_return=imitated, n_clones=n_clones, habit_returns=[paid, paid], n_rejected=1, has_learned=True)
     assert trials.needs_clone() == is_needed
 
 
@@ -387,7 +394,7 @@ def test_clones_imitate_with_noise_and_the_learning_actor_without(monkeypatch):
     model.trials.on_trial = model.trials.is_clone = True
     seen.clear()
     model._make_candidate()
-    assert seen == [0.5] * model.actor_warm_start
+    assert seen == [0.5] * n
 
 
 def test_own_episodes_are_measured_anew_from_other_demonstrations():
@@ -595,7 +602,7 @@ def test_a_clone_that_is_accepted_is_where_learning_begins(paid, verdict, monkey
     updates, update = [], Cloning.update
     monkeypatch.setattr(Cloning, "update", lambda self, index: (updates.append((self.clone, index)), update(self, index)))
     prove(model, 0.0, 0.5, 0.0, 0.5, 0.0)  # noise, the habit, twice, and noise: now a clone is made
-    assert [index for _, index in updates] == list(range(5))
+    assert [index for _, index in updates] == list(range(20))
     assert n_stored == model.replay_buffer.size() == 30
     clone = weights_of(model.policy.candidate)
     assert not differ(clone, weights_of(updates[-1][0])) and differ(clone, before[0])
