@@ -357,7 +357,7 @@ MUTANTS = [
     Mutant("the learning actor acts", POLICIES, "self.circuit if self.habit is None", "self.circuit if True", HABIT),
     Mutant("one proof is enough", TRIALS, "elif n < N_PROOFS:", "elif n < 1:", HABIT),
     Mutant("a tie is a proof", TRIALS, "gain >= max(smallest, (SURE", "gain >= max(0.0, (SURE", HABIT),
-    Mutant("chance is a proof", TRIALS, "(SURE if has_time else LIKELY) * error", "0.0", HABIT),
+    Mutant("chance is a proof", TRIALS, "(SURE if has_time or is_doubtful else LIKELY) * error", "0.0", HABIT),
     Mutant("chance is a tie", TRIALS, "abs(gain) + SURE * error > smallest", "abs(gain) > smallest", f"{HABIT} -k chance"),
     Mutant("a chance loss is held against a candidate", TRIALS, "has_time * LIKELY * error", "0.0", f"{HABIT} -k chance"),
     Mutant(
@@ -387,8 +387,8 @@ MUTANTS = [
     Mutant(
         "a clone whatever the habit is paid",
         TRIALS,
-        " and self.habit_return < least",
-        "",
+        "self.habit_return < self.imitated_return - shortfall * abs(self.imitated_return)",
+        "True",
         f"{HABIT} -k clone",
     ),
     Mutant(
