@@ -38,7 +38,7 @@ class Refresh:
     :param own_episodes: which of them are imitated too: "paid" (every one, as often as its return says; "best" where steps are
         not drawn by returns, or nothing is demonstrated) or "best" (those that are paid at least what the best one was: the
         paper)
-    :param ensemble_size: clones that teach the first one what to do around the imitated steps, 2 or more; 1 for none (the
+    :param ensemble_size: others that teach a clone what to do around the imitated steps, 2 or more; 1 for none (the
         paper). See :mod:`sb3_actpc.actpc.cloning`
     :param n_clones: clones that are tried at most, the first included, while the habit is paid less than nine tenths of what
         it imitates (:mod:`sb3_actpc.actpc.habit`): returns of environment and demonstrations must be of one scale. 1 for the
