@@ -1,7 +1,10 @@
 """Packages that only a part of the users needs."""
 
 import importlib
+import sys
 from typing import Any
+
+NUMPY_1_PYTHON = (3, 12)  # the newest with wheels of NumPy 1, which robosuite, d3rlpy and robomimic need
 
 
 def import_extra(module: str, extra: str) -> Any:
@@ -10,4 +13,7 @@ def import_extra(module: str, extra: str) -> Any:
     try:
         return importlib.import_module(module)
     except ImportError as error:
-        raise ImportError(f'{error}: install what is needed with pip install "sb3-actpc[{extra}]"') from error
+        where = ""
+        if module == "robosuite" and sys.version_info[:2] > NUMPY_1_PYTHON:  # where the extra leaves it out
+            where = f" from Python 3.{NUMPY_1_PYTHON[1]} or older, which has wheels of the NumPy 1 that robosuite needs"
+        raise ImportError(f'{error}: install what is needed with pip install "sb3-actpc[{extra}]"{where}') from error

@@ -11,6 +11,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from sb3_actpc.utils.extras import NUMPY_1_PYTHON
+
 FOLDER_VARIABLE = "SB3_ACTPC_BASELINES"
 ABANDONED_AFTER = 24 * 3600  # seconds
 COMPLETE = "sb3_actpc_complete.json"  # written last, into an environment that is whole
@@ -26,7 +28,6 @@ class Recipe:
 
 # torch comes first and by number, so that no CUDA libraries come with it where an index of CPU wheels is set
 _TORCH = ("torch==2.13.0", "numpy==1.26.4")
-NEWEST_PYTHON = (3, 12)  # with wheels of that NumPy: where there is none, pip would compile it
 RECIPES = {
     "d3rlpy": Recipe((_TORCH, ("d3rlpy==2.8.1",)), "import d3rlpy"),
     # without its dependencies: egl_probe has to be compiled, torchvision must fit torch, and neither is used without images
@@ -62,10 +63,10 @@ def install(name: str, folder: Path | None = None, report: Callable[[str], None]
     if _is_complete(name, place):
         report(f"{name} is already installed in {place}")
         return place
-    if sys.version_info[:2] > NEWEST_PYTHON:
+    if sys.version_info[:2] > NUMPY_1_PYTHON:  # pip would compile it
         raise ValueError(
             f"{name} needs NumPy 1, which has no wheels for Python {sys.version_info[0]}.{sys.version_info[1]}: install it "
-            f"from Python 3.10 to 3.{NEWEST_PYTHON[1]}, {place} then serves any other too"
+            f"from Python 3.10 to 3.{NUMPY_1_PYTHON[1]}, {place} then serves any other too"
         )
     folder.mkdir(parents=True, exist_ok=True)
     for left in folder.glob(f".{name}.*.tmp"):  # of a command that was killed, not of one that is at work
