@@ -313,10 +313,9 @@ class ActPC(OffPolicyAlgorithm):
         self._convert_train_freq()
         self._create_aliases()
         if self.policy.habit:
-            self.trials = self.trials or Trials(self.n_envs)  # a loaded agent knows what its habit was paid
-            self.trials.n_envs = self.n_envs
             clones = self.refresh.n_clones - 1 if self.demonstrations is not None and self.actor_warm_start else 0
-            self.trials.n_clones = min(self.trials.n_clones, clones)
+            known = self.trials or Trials(1)  # of a loaded agent, whose environment may be another: what it paid is forgotten
+            self.trials = Trials(self.n_envs, n_clones=min(known.n_clones, clones), begun_at=known.begun_at)
         self._setup_demonstrations()
         self.diagnostics = Diagnostics(self.policy)
         self._compiled: CompiledUpdate | None = None
@@ -621,6 +620,8 @@ class ActPC(OffPolicyAlgorithm):
         self._rollout_starts = np.array(dones, dtype=bool)
         # a running normaliser pays the same episode differently from day to day
         paid = reward if self._vec_normalize_env is None else self._vec_normalize_env.get_original_reward()
+        if self.expert is not None and np.any(dones):
+            self.expert.check_scale(replay_buffer.rewards[: replay_buffer.size()])
         self._prove(paid, dones)
 
     def _prove(self, rewards: np.ndarray, dones: np.ndarray) -> None:

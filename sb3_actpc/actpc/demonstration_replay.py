@@ -1,5 +1,6 @@
 """The demonstrations, as the agent uses them: imitated by the actor, predicted by the prior, mixed into the critic's batch."""
 
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -14,6 +15,8 @@ from sb3_actpc.demonstrations.dataset import Demonstrations
 from sb3_actpc.demonstrations.rows import split_observations
 
 RawSignals = Callable[[th.Tensor, th.Tensor, th.Tensor, th.Tensor | None], tuple[np.ndarray, np.ndarray]]
+# environment steps before their rewards are compared with the demonstrated ones, and how many times larger one may be
+ENOUGH_REWARDS, OTHER_SCALE = 500, 30.0
 
 
 class DemonstrationReplay:
@@ -41,7 +44,7 @@ class DemonstrationReplay:
             self.episodes.returns,
         )
         self.epistemic, self.instrumental = np.zeros((2, len(demonstrations)), dtype=np.float32)
-        self.has_signals = False
+        self.has_signals = self.has_scale = False
         self.leaves_room: bool | None = None  # whether noise fills what lies between the episodes; None before that is asked
 
     def __len__(self) -> int:
@@ -97,6 +100,30 @@ class DemonstrationReplay:
         if inputs.vec_normalize is not None:
             task = inputs.vec_normalize.normalize_reward(task)
         return weights[0] * task + weights[1] * self.epistemic[rows] + weights[2] * self.instrumental[rows]
+
+    def check_scale(self, rewards: np.ndarray) -> None:
+        """
+        Warn, once, where the environment's rewards cannot be of the demonstrated ones' scale: the largest and the mean of the
+        steps that are paid, and of those that are punished, differ all alike. One may differ by what is done: a beginner comes
+        to no prize and makes greater mistakes.
+
+        :param rewards: of all environment steps so far; of few, or without a common sign, they say nothing
+        """
+        if self.has_scale or rewards.size < ENOUGH_REWARDS:
+            return
+        ratios: list[float] = []
+        for sign in (1.0, -1.0):
+            shown, paid = (sign * part[sign * part > 0.0] for part in (self.demonstrations.rewards, rewards))
+            if len(shown) and len(paid):
+                ratios += [shown.mean() / paid.mean(), shown.max() / paid.max()]
+        self.has_scale = bool(ratios)
+        if ratios and (min(ratios) > OTHER_SCALE or max(ratios) < 1 / OTHER_SCALE):
+            warnings.warn(
+                f"the rewards in the demonstrations are {min(ratios):.3g} to {max(ratios):.3g} times the environment's: where "
+                "they were recorded otherwise, bring them to its scale, as returns are compared and mixed: demonstrations = "
+                "dataclasses.replace(demonstrations, rewards=demonstrations.rewards * ...)",
+                stacklevel=2,
+            )
 
     def refresh_signals(
         self, raw_signals: RawSignals, inputs: CircuitInputs, epistemic: Normalize, instrumental: Normalize

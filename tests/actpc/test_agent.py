@@ -19,6 +19,7 @@ from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_actpc import ActPC
 from sb3_actpc.actpc import actpc as actpc_module
+from sb3_actpc.actpc import demonstration_replay
 from sb3_actpc.actpc.diagnostics import Diagnostics
 from sb3_actpc.actpc.self_imitation import distances_to_nearest
 from sb3_actpc.ngc import NGCCircuit, settle_coupled
@@ -598,6 +599,41 @@ def test_a_trained_agent_acts_without_its_demonstrations_and_says_what_is_missin
     assert np.array_equal(loaded.predict(obs)[0], model.predict(obs)[0]) and loaded.reward_weights == (1.0, 1.0, 1.0)
     with pytest.raises(ValueError, match=r"no demonstrations file at .*demos\.npz"):
         loaded.learn(10)
+
+
+@pytest.mark.parametrize(
+    ("shown", "paid", "is_other"),
+    [
+        ([0.0, 1.0], [0.0, 1.0], False),
+        ([0.0, 100.0], [0.0, 1.0], True),
+        ([0.0, 1.0], [0.0, 100.0], True),
+        ([0.0, 100.0], [0.0, 0.0], False),  # not yet paid
+        ([0.0, 100.0], [0.0, -1.0], False),  # what is demonstrated pays, the beginner falls
+        ([-0.1] * 99 + [100.0], [-0.1] * 100, False),  # the beginner comes to no prize
+        ([-10.0] + [-0.001] * 99, [-10.0] * 100, False),  # and makes greater mistakes
+        ([-1000.0] + [-10.0] * 99, [-10.0] * 100, False),  # slips, of the same height
+        ([-1000.0, 500.0], [-10.0, 5.0], True),
+        ([-1000.0, 5.0], [-10.0, 5.0], False),
+    ],
+)
+def test_demonstrations_that_were_paid_on_another_scale_are_named_once(shown, paid, is_other):
+    data = demonstrations()
+    model = make(demonstrations=dataclasses.replace(data, rewards=np.resize(shown, len(data))))
+    rewards = np.resize(paid, (500, 1))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        model.expert.check_scale(rewards[:499])
+        assert not caught
+        model.expert.check_scale(rewards)
+        model.expert.check_scale(rewards)
+    assert [("times the environment's" in str(one.message)) for one in caught] == [True] * is_other
+
+
+def test_rewards_are_compared_with_the_demonstrated_ones_as_they_come(monkeypatch):
+    monkeypatch.setattr(demonstration_replay, "ENOUGH_REWARDS", 20)
+    data = demonstrations()
+    with pytest.warns(UserWarning, match="the rewards in the demonstrations are 50 to 66.7 times the environment's"):
+        make(demonstrations=dataclasses.replace(data, rewards=100 * data.rewards)).learn(29)
 
 
 def test_fewer_demonstrations_can_be_used():
