@@ -291,6 +291,7 @@ def test_a_python_without_wheels_is_refused_before_anything_is_compiled(
 @pytest.mark.skipif(os.name == "nt", reason="other paths")
 def test_an_environment_is_made_once_and_half_of_one_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(installation, "_make", make_nothing)
+    monkeypatch.setattr(installation, "NUMPY_1_PYTHON", sys.version_info[:2])
     with pytest.raises(ImportError, match=r"robomimic is not installed in .*: run sb3-actpc baselines install robomimic"):
         environment_python("robomimic", tmp_path)
     place = install("robomimic", tmp_path)
@@ -315,6 +316,7 @@ def test_a_failing_step_is_one_line_and_leaves_nothing(
 ) -> None:
     recipe = installation.Recipe((), "import no_such_module")
     monkeypatch.setitem(installation.RECIPES, "d3rlpy", recipe)
+    monkeypatch.setattr(installation, "NUMPY_1_PYTHON", sys.version_info[:2])
     assert main(["baselines", "install", "d3rlpy", "--dir", str(tmp_path)]) == 2
     error = capsys.readouterr().err
     assert error.count("\n") == 1 and "No module named 'no_such_module'" in error

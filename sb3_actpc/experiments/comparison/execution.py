@@ -30,7 +30,9 @@ REPORT_INTERVAL = 1.0  # seconds between two reports of the steps done
 class Outcome:
     """What has become of a run."""
 
-    status: str  # "finished", "failed", "stopped" (by a signal, saved), "lost" (its process ended without a word), "disk full"
+    # "finished", "failed", "disk full", "stopped" (by a signal, saved), "lost" (its process ended without a word, or found
+    # another at work)
+    status: str
     message: str = ""  # what went wrong, one line
 
 
@@ -113,6 +115,8 @@ def execute_run(run: Run, report: Callable[[str], None], on_steps: Callable[[int
                 finish_run(run, report, [step_watch(on_steps)])
     except TrainingStopped as stop:
         return Outcome(STOPPED, str(stop))
+    except FolderBusy as error:  # the worker of a killed command makes a clone first, say: the run goes on after it
+        return Outcome(LOST, str(error))
     except Exception as error:  # whatever it is, the other runs go on
         return _failure(run.folder, error)
     return Outcome(FINISHED)

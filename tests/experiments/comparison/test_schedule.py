@@ -245,8 +245,8 @@ def test_a_run_that_another_process_works_on_waits(monkeypatch: pytest.MonkeyPat
     with folder_lock(run.folder, 0.0):
         lines: list[str] = []
         outcome = execute_run(run, lines.append, lambda steps: None)
-        assert outcome.status == FAILED and "is in use by another process" in outcome.message
-        assert "waiting" in lines[0]
+        assert outcome.status == LOST and "is in use by another process" in outcome.message
+        assert "waiting" in lines[0] and run_status(run.folder) == NEW
     with folder_lock(run.folder, 0.0):  # free again
         pass
     with folder_lock(run.folder, 0.0), pytest.raises(FolderBusy), folder_lock(run.folder, 0.0):
