@@ -39,7 +39,8 @@ class RayEngine(Engine):
             self.ray.init(log_to_driver=False, **options)
         self._task = self.ray.remote(num_cpus=threads, max_retries=0)(_execute)
         # the actor to which runs tell their steps; on this node, so that no other's death takes it along
-        node = self.ray.get_runtime_context().get_node_id()
+        context = self.ray.get_runtime_context()
+        node, self._head = context.get_node_id(), context.gcs_address
         here = import_extra("ray.util.scheduling_strategies", "ray").NodeAffinitySchedulingStrategy(node, soft=True)
         self._board = self.ray.remote(num_cpus=0, scheduling_strategy=here)(StepBoard).remote()
         self._tasks: dict[Any, Run] = {}  # by Ray's reference to the answer
@@ -65,6 +66,12 @@ class RayEngine(Engine):
             time.sleep(timeout)
             return []
         ended, _ = self.ray.wait(list(self._tasks), num_returns=1, timeout=timeout)
+        try:
+            _check_address(self._head)
+        except ConnectionError as error:  # Ray would wait for a minute and end this process
+            self._tasks, self._is_mine = {}, False
+            died = f"the head of the Ray cluster at {self._head} has died"
+            raise ConnectionError(f"{died}: start a cluster again, with whose address the same command goes on") from error
         return [*self._progress(), *(self._end(reference) for reference in ended)]
 
     def stop(self) -> None:

@@ -2,11 +2,13 @@
 
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from sb3_actpc.cli import main
 from sb3_actpc.experiments.comparison import make_engine
+from sb3_actpc.experiments.comparison.cluster import RayEngine
 from sb3_actpc.experiments.comparison.engines import Event
 from sb3_actpc.experiments.comparison.execution import run_status
 from sb3_actpc.experiments.comparison.schedule import run_comparison
@@ -81,6 +83,20 @@ def test_a_cluster_of_its_own_is_started_and_stops_when_told(tmp_path: Path) -> 
     assert run_status(run.folder) == "unfinished"
     _, inline, _ = bring_to_end([run], tmp_path / "out")
     assert "from step" in inline.lines[0]
+
+
+def test_a_head_that_dies_ends_the_command_and_no_run(tmp_path: Path) -> None:
+    """Ray itself would end the process, a minute later, and not say that the comparison can go on."""
+    [run] = small_runs(tmp_path / "out")
+    engine = RayEngine.__new__(RayEngine)
+    engine.ray, engine._head = SimpleNamespace(wait=lambda *_, **__: ([], [])), "127.0.0.1:1"
+    engine._tasks, engine._is_mine = {object(): run}, True
+    with pytest.raises(
+        ConnectionError, match=r"the head of the Ray cluster at 127\.0\.0\.1:1 has died: .* same command goes on"
+    ):
+        engine.poll(0.1)
+    engine.close()  # asks nobody who is dead
+    assert run_status(run.folder) == "new"
 
 
 def test_no_cluster_at_the_address_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
