@@ -26,7 +26,7 @@ from sb3_actpc.checkpoints import (
     list_bundles,
     restore,
 )
-from sb3_actpc.checkpoints.bundle import _manifest_hash
+from sb3_actpc.checkpoints.bundle import VERSION, _manifest_hash
 from sb3_actpc.checkpoints.state import check_weights
 from tests.actpc.envs import CountingEnv
 from tests.checkpoints.runs import assert_same, make_actpc
@@ -142,7 +142,7 @@ def test_another_version_is_not_read(tmp_path: Path, saved: Path) -> None:
     manifest["version"] += 1
     del manifest["sha256"]
     file.write_text(json.dumps({**manifest, "sha256": _manifest_hash(manifest)}))
-    with pytest.raises(ValueError, match="format version 6, this sb3_actpc reads 5"):
+    with pytest.raises(ValueError, match=f"format version {VERSION + 1}, this sb3_actpc reads {VERSION}"):
         find_bundle(tmp_path / "newer")
 
 
