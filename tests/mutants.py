@@ -357,7 +357,7 @@ MUTANTS = [
     Mutant("the learning actor acts", POLICIES, "self.circuit if self.habit is None", "self.circuit if True", HABIT),
     Mutant("one proof is enough", TRIALS, "elif n < N_PROOFS:", "elif n < 1:", HABIT),
     Mutant("a tie is a proof", TRIALS, "gain >= max(smallest, (SURE", "gain >= max(0.0, (SURE", HABIT),
-    Mutant("chance is a proof", TRIALS, "(SURE if has_time or is_doubtful else LIKELY) * error", "0.0", HABIT),
+    Mutant("chance is a proof", TRIALS, "(SURE if has_time else LIKELY) * error", "0.0", HABIT),
     Mutant("chance is a tie", TRIALS, "abs(gain) + SURE * error > smallest", "abs(gain) > smallest", f"{HABIT} -k chance"),
     Mutant("a chance loss is held against a candidate", TRIALS, "has_time * LIKELY * error", "0.0", f"{HABIT} -k chance"),
     Mutant(
@@ -373,7 +373,7 @@ MUTANTS = [
     Mutant(
         "a candidate plays on for ever",
         TRIALS,
-        "has_time = self.candidate_steps < MOST_PROOF_STEPS",
+        "has_time = self.candidate_steps < MOST_PROOF_STEPS * (1 + is_doubtful)",
         "has_time = True",
         f"{HABIT} -k plays_on",
     ),
@@ -431,7 +431,17 @@ MUTANTS = [
         "SHORTFALL",
         f"{HABIT} -k half",
     ),
-    Mutant("clones whatever was learned", TRIALS, "(self.has_learned and not is_due)", "False", HABIT),
+    Mutant("clones whatever was learned", TRIALS, "not self.n_clones or not is_due", "not self.n_clones", HABIT),
+    Mutant("early clones for ever", TRIALS, "else self.generation < EARLY_CLONES", "else True", f"{HABIT} -k half"),
+    Mutant("noise between a candidate's first episodes", TRIALS, "is_quiet = begins or ", "is_quiet = ", f"{HABIT} -k turns"),
+    Mutant("candidates play alone", TRIALS, " and len(self.candidate_returns) < N_PROOFS", "", f"{HABIT} -k taken"),
+    Mutant(
+        "a known habit is tested until something is learned",
+        TRIALS,
+        "or not _is_tried(self.habit_proofs, self.habit_steps)",
+        "or not has_learned or not _is_tried(self.habit_proofs, self.habit_steps)",
+        f"{HABIT} -k resized",
+    ),
     Mutant("clones for ever", TRIALS, "not self.n_clones or ", "", f"{HABIT} -k clone"),
     Mutant(
         "clones after every learner",

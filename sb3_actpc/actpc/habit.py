@@ -17,9 +17,10 @@ N_PROOFS = 2  # episodes of a candidate at least, before it is judged by less th
 # environment steps, or episodes however short, of a candidate before it is judged, and of the habit between two candidates
 PROOF_STEPS, ENOUGH_PROOFS = 500, 10
 MOST_PROOF_STEPS = 2000  # that a candidate has for a proof
-KEPT_RETURNS, KEPT_NOISY_RETURNS = 20, 4  # of the habit, and of the learning actor
+KEPT_RETURNS, KEPT_NOISY_RETURNS = 20, 2  # of the habit, and of the learning actor
 # of what the imitated episodes were paid: a clone that is paid less by more is no good one, and no good beginning
 SHORTFALL, GREAT_SHORTFALL = 0.1, 0.5
+EARLY_CLONES = 2  # that are tried before anything is learned: where these do no better, it was not by chance
 # standard errors: that a gain must pass at any time, and after ``MOST_PROOF_STEPS``; the second is also a loss's before
 SURE, LIKELY = 1.5, 0.5
 # shares of the habit's mean return: what counts as a gain or a loss, and with what loss a candidate is rejected at once
@@ -32,16 +33,16 @@ class Trials:
     Who plays which episode, and what follows from its return. Holds no circuits: the agent copies them as it is told.
 
     Episodes alternate: one with exploration noise by the learning actor, then as many steps without (an episode at least) by
-    the habit or a candidate; episodes that soon end in a fall would else be few. A gain must pass a share of the habit's
-    absolute mean return and ``SURE`` of its own standard errors, from the variance that candidate and habit have in common,
-    and a loss that share and ``LIKELY``. In between the candidate plays on, unless it surely is neither; when it has had its
-    steps, the share is enough of a loss, and ``LIKELY`` of a gain, but for a learner that is paid less than the habit where it
-    plays with noise: two good episodes may be luck. After a candidate that did not prove itself the habit plays
-    again: what made it the habit was partly luck.
+    the habit or a candidate; episodes that soon end in a fall would else be few. A candidate's first ``N_PROOFS`` follow each
+    other. A gain must pass a share of the habit's absolute mean return and ``SURE`` of its own standard errors, from the
+    variance that candidate and habit have in common, and a loss that share and ``LIKELY``. In between the candidate plays on,
+    unless it surely is neither; when it has had its steps, the share is enough of a loss, and ``LIKELY`` of a gain. A learner
+    that is paid less than the habit where it plays with noise has twice the steps: two good episodes may be luck. After a
+    candidate that did not prove itself the habit plays again: what made it the habit was partly luck.
 
     Clones of the same demonstrations can do very differently, by their first synapses alone. So while the habit is paid less
     than what it imitates, further clones are candidates: before anything is learned, where ``GREAT_SHORTFALL`` of it is
-    missing; then, where ``SHORTFALL`` is, after a rejected learner, or after the second in a row where the learner is paid
+    missing, ``EARLY_CLONES`` of them; then, where ``SHORTFALL`` is, after a rejected learner, or after the second in a row where the learner is paid
     more than the habit even with noise, and the first rejection may have been chance. Learning begins anew with one that is
     accepted.
 
@@ -91,8 +92,8 @@ class Trials:
 
     def needs_clone(self) -> bool:
         """Whether the next candidate is a clone."""
-        is_due = self.n_rejected > self.is_ahead()
-        if not self.n_clones or (self.has_learned and not is_due):
+        is_due = self.n_rejected > self.is_ahead() if self.has_learned else self.generation < EARLY_CLONES
+        if not self.n_clones or not is_due:
             return False
         shortfall = SHORTFALL if self.has_learned else GREAT_SHORTFALL
         return self.habit_return < self.imitated_return - shortfall * abs(self.imitated_return)
@@ -121,8 +122,7 @@ class Trials:
         if role == "habit":
             self.habit_returns = [*self.habit_returns, episode_return][-KEPT_RETURNS:]
             self.habit_proofs, self.habit_steps = self.habit_proofs + 1, self.habit_steps + length
-            is_known = len(self.habit_returns) >= N_PROOFS and _is_tried(self.habit_proofs, self.habit_steps)
-            self.tests_habit = not (is_known and (has_learned or self.needs_clone()))
+            self.tests_habit = len(self.habit_returns) < N_PROOFS or not _is_tried(self.habit_proofs, self.habit_steps)
         if role != "candidate" or self.generations[env] != self.generation:
             return None
         self.candidate_returns.append(episode_return)
@@ -138,7 +138,9 @@ class Trials:
         """
         has_candidate = self.on_trial or (not self.tests_habit and (self.has_learned or self.needs_clone()))
         quiet: Role = "candidate" if has_candidate else "habit"
-        self.roles[env] = quiet if self.roles[env] == "actor" or self.quiet_due[env] > 0 else "actor"
+        begins = self.on_trial and len(self.candidate_returns) < N_PROOFS  # its first episodes follow each other
+        is_quiet = begins or self.roles[env] == "actor" or self.quiet_due[env] > 0
+        self.roles[env] = quiet if is_quiet else "actor"
         self.generations[env] = self.generation
         if self.roles[env] != "candidate" or self.on_trial:
             return False
@@ -153,14 +155,14 @@ class Trials:
         great_loss = gain + SURE * error < -GREAT_LOSS * unit
         if not _is_tried(n, self.candidate_steps) and not (n >= N_PROOFS and great_loss):
             return None
-        has_time = self.candidate_steps < MOST_PROOF_STEPS
         is_doubtful = not self.is_clone and not self.is_ahead()
+        has_time = self.candidate_steps < MOST_PROOF_STEPS * (1 + is_doubtful)
         verdict: Verdict = "tied"
         if great_loss or (n >= N_PROOFS and gain < -max(smallest, has_time * LIKELY * error)):
             verdict = "rejected"
         elif n < N_PROOFS:
             return None
-        elif gain > 0.0 and gain >= max(smallest, (SURE if has_time or is_doubtful else LIKELY) * error):
+        elif gain > 0.0 and gain >= max(smallest, (SURE if has_time else LIKELY) * error):
             verdict, self.habit_returns = "accepted", own[-KEPT_RETURNS:]
             self.noisy_returns = [] if self.is_clone else self.noisy_returns
             # what the old habit has begun elsewhere is no return of the new one

@@ -53,8 +53,9 @@ def play(trials, episode_return, length=PROOF_STEPS, env=0, has_learned=True):
 
 
 def play_quiet(trials, episode_return, length=PROOF_STEPS, env=0):
-    """A noisy episode, whose return must not matter, and the quiet one after it."""
-    assert play(trials, 1e6, 1, env) == ("actor", None)
+    """A quiet episode; where a noisy one is due, that one before it, and its return must not matter."""
+    if trials.roles[env] == "actor":
+        assert play(trials, 1e6, 1, env) == ("actor", None)
     return play(trials, episode_return, length, env)
 
 
@@ -74,13 +75,12 @@ def tried(habit_return, candidate_returns, length=PROOF_STEPS, trials=None):
 # ---------------------------------------------------------------------- the rules
 
 
-def test_noisy_and_quiet_episodes_take_turns_and_the_habit_plays_first():
+def test_noisy_episodes_and_the_habits_take_turns_and_a_candidate_plays_until_it_is_judged():
     """Two whole episodes are what a tie takes; then the habit is tested again."""
     trials = Trials(1)
-    roles = [play(trials, 1.0)[0] for _ in range(26)]
-    assert roles[::2] == ["actor"] * 13
-    tie = ["candidate", "candidate"]
-    assert roles[1::2] == ["habit", "habit", *tie, "habit", *tie, "habit", *tie, "habit", *tie]
+    roles = [play(trials, 1.0)[0] for _ in range(17)]
+    habit, tie = ["actor", "habit"], ["actor", "candidate", "candidate"]
+    assert roles == [*habit, *habit, *tie, *habit, *tie, *habit, *tie]
 
 
 @pytest.mark.parametrize(("length", "n"), [(PROOF_STEPS, 1), (PROOF_STEPS - 1, 2), (PROOF_STEPS // 4, 4), (1, ENOUGH_PROOFS)])
@@ -98,13 +98,14 @@ def test_after_every_candidate_that_did_not_prove_itself_the_habit_is_tested_as_
 def test_as_many_steps_go_without_noise_as_the_noisy_episode_before_them_had(noisy, quiet, n):
     """An episode at least, whatever was quiet before; each environment by itself."""
     trials = Trials(2)
+    one = partial(play, trials, 1.0, has_learned=False)
     for _ in range(3):
-        assert play(trials, 1.0, noisy)[0] == "actor"
-        assert "actor" not in [play(trials, 1.0, quiet)[0] for _ in range(n)]
+        assert one(noisy)[0] == "actor"
+        assert "actor" not in [one(quiet)[0] for _ in range(n)]
     assert trials.roles == ["actor", "actor"]
-    play(trials, 1.0, 200)
-    play(trials, 1.0, 7, env=1)
-    roles = [(play(trials, 1.0, 50)[0], play(trials, 1.0, 50, env=1)[0]) for _ in range(4)]
+    one(200)
+    one(7, env=1)
+    roles = [(one(50)[0], one(50, env=1)[0]) for _ in range(4)]
     assert [first == "actor" for first, _ in roles] == [False] * 4
     assert [second == "actor" for _, second in roles] == [False, True, False, True]
 
@@ -182,15 +183,19 @@ def test_a_gain_must_pass_its_standard_error_and_the_candidate_plays_on_until_it
 
 
 @pytest.mark.parametrize(
-    ("noisy", "is_clone", "verdict"),
-    [(101.0, False, "accepted"), (99.0, False, "tied"), (99.0, True, "accepted")],
+    ("noisy", "is_clone", "n_needed"),
+    [([101.0, 101.0], False, 4), ([101.0, 98.0], False, 8), ([101.0], False, 8), ([99.0, 99.0], True, 4)],
 )
-def test_what_may_be_luck_is_no_proof_for_a_learner_that_noise_makes_worse_than_the_habit(noisy, is_clone, verdict):
-    """A gain of 7.5 by errors of 9.4, when the candidate had its steps: of clones the noise says nothing."""
-    trials = Trials(1)
-    assert tried(100.0, [90.0, 120.0, 110.0], trials=trials) == [None] * 3
-    trials.is_clone, trials.noisy_returns, trials.roles = is_clone, [noisy] * 4, ["candidate"]
-    assert play(trials, 110.0)[1] == verdict
+def test_a_learner_that_noise_makes_worse_than_the_habit_needs_twice_the_steps_for_a_likely_gain(noisy, is_clone, n_needed):
+    """A gain of 7.5 by errors of 9.4 and, then, 7.7: of clones the noise says nothing."""
+    trials = Trials(1, habit_returns=[100.0, 100.0], tests_habit=False)
+    verdicts = []
+    for paid in [90.0, 120.0, 110.0, 110.0] * 2:
+        trials.on_trial, trials.is_clone, trials.noisy_returns, trials.roles = True, is_clone, noisy, ["candidate"]
+        verdicts.append(play(trials, paid)[1])
+        if verdicts[-1]:
+            break
+    assert verdicts == [None] * (n_needed - 1) + ["accepted"]
 
 
 @pytest.mark.parametrize("noisy", [99.0, 101.0])
@@ -275,15 +280,15 @@ def test_a_new_candidate_is_taken_before_its_first_episode_and_not_between_its_e
         role = trials.roles[0]
         trials.end(0, True)
         taken.append((role, trials.begin(0)))
-    # at the end of: noise, habit, noise (here it is taken), candidate, noise, candidate (a tie), noise
+    # at the end of: noise, habit, noise (here it is taken), two of the candidate (a loss), noise, habit
     assert taken == [
         ("actor", False),
         ("habit", False),
         ("actor", True),
         ("candidate", False),
-        ("actor", False),
         ("candidate", False),
         ("actor", False),
+        ("habit", False),
     ]
 
 
@@ -348,14 +353,22 @@ def play_clones(trials, *paid, has_learned=False):
     """Quiet episodes with these returns: who played each, what followed, and whether a clone was to be made for it."""
     played = []
     for one in paid:
-        trials.end(0, has_learned)
-        clone = trials.begin(0) and trials.is_clone
+        clone = False
+        if trials.roles[0] == "actor":
+            trials.end(0, has_learned)
+            clone = trials.begin(0) and trials.is_clone
         played.append((*play(trials, one, has_learned=has_learned), clone))
     return played
 
 
 def test_while_nothing_is_learned_and_the_habit_is_paid_less_than_half_of_what_it_imitates_clones_are_tried():
-    """The habit is known before a clone is tried, and better after one that is no better; none where it is half as good."""
+    """
+    The habit is known before a clone is tried, and better after one that is no better; none where it is half as good. Two
+    alone: where these do no better, the habit is no exception.
+    """
+    poor = Trials(1, imitated_return=1000.0, n_clones=9)
+    assert play_clones(poor, 40.0, 40.0, 0.0, 40.0, 0.0)[2::2] == [("candidate", "rejected", True)] * 2
+    assert play_clones(poor, *[40.0] * 4) == [("habit", None, False)] * 4 and poor.n_clones == 7
     trials = Trials(1, imitated_return=100.0, n_clones=2)
     assert play_clones(trials, 40.0, 50.0) == [("habit", None, False)] * 2
     assert play_clones(trials, 10.0) == [("candidate", "rejected", True)]
@@ -434,8 +447,8 @@ def test_once_something_is_learned_a_clone_is_tried_after_a_rejected_learner_and
         ([60.0], True),  # one episode is chance
         ([60.0, 41.0], False),
         ([60.0, 39.0], True),
-        ([90.0, 10.0, 60.0, 60.0, 60.0], True),  # the last four
-        ([10.0, 50.0, 50.0, 50.0, 60.0], False),
+        ([90.0, 10.0, 60.0], True),  # the last two
+        ([10.0, 50.0, 60.0], False),
     ],
 )
 def test_no_clone_is_needed_while_the_rejected_learner_does_better_even_with_noise(noisy, is_needed):
@@ -489,7 +502,7 @@ def test_a_clone_that_is_accepted_late_is_no_candidate_before_it_has_learned_aga
     assert play_clones(trials, 50.0, 50.0, 0.0, 50.0, has_learned=True)[-2][1] == "rejected"
     assert [verdict for _, verdict, _ in play_clones(trials, 95.0, 95.0, has_learned=True)] == [None, "accepted"]
     assert play_clones(trials, 95.0, 95.0, 95.0, has_learned=False) == [("habit", None, False)] * 3
-    assert play_clones(trials, 95.0, 95.0, has_learned=True) == [("habit", None, False), ("candidate", None, False)]
+    assert play_clones(trials, 95.0, 95.0, has_learned=True) == [("candidate", None, False), ("candidate", "tied", False)]
 
 
 def test_what_the_habit_is_paid_elsewhere_meanwhile_does_not_stop_the_trial_of_a_clone():
@@ -497,12 +510,11 @@ def test_what_the_habit_is_paid_elsewhere_meanwhile_does_not_stop_the_trial_of_a
     for _ in range(2):
         assert play(trials, 0.0, 3)[0] == "actor"
         assert play(trials, 50.0) == ("habit", None)
-    play(trials, 0.0, 3, 1)  # its quiet episode is the clone's
+    play(trials, 0.0, 3, 1)  # its quiet episodes are the clone's
     assert trials.roles == ["actor", "candidate"] and trials.is_clone
     trials.roles[0] = "habit"  # as if it had begun before
     assert play(trials, 50.0) == ("habit", None)
     assert play(trials, 90.0, env=1) == ("candidate", None)
-    play(trials, 0.0, 3, 1)
     assert play(trials, 90.0, env=1) == ("candidate", "accepted")
 
 
@@ -550,7 +562,7 @@ def test_predict_is_the_warm_started_clone_until_a_candidate_is_accepted_and_the
     candidate = actions_of(model, model.policy.actor_average)
     disturb(model.policy.actor_average)
     assert np.array_equal(model.predict(OBSERVATIONS)[0], clone)
-    prove(model, 2.0, 0.0)
+    prove(model, 2.0)
     assert np.array_equal(model.predict(OBSERVATIONS)[0], clone)
     prove(model, 2.0)
     assert np.array_equal(model.predict(OBSERVATIONS)[0], candidate) and not np.array_equal(candidate, clone)
@@ -568,10 +580,9 @@ def test_the_trust_region_is_resized_by_verdicts_once_something_is_learned(paid,
     prove(model, *[0.0, habit_paid] * 4)  # before anything is learned: no candidate
     assert model.trials.generation == 0
     model._n_updates = model.critic_warmup + 1
-    prove(model, 0.0, habit_paid)
+    prove(model, 0.0)  # with noise: the habit is known
     radius = float(model.policy.trust_region.radius)
-    for one in paid:
-        prove(model, 0.0, one)
+    prove(model, *paid)
     factor = 1.0 if verdict is None else RADIUS_FACTORS[verdict]
     assert float(model.policy.trust_region.radius) == pytest.approx(factor * radius)
 
@@ -608,7 +619,7 @@ def test_a_clone_that_is_accepted_is_where_learning_begins(paid, verdict, monkey
     clone = weights_of(model.policy.candidate)
     assert not differ(clone, weights_of(updates[-1][0])) and differ(clone, before[0])
     assert not differ(before[1], weights_of(model.actor.circuit)) and model.trials.is_clone and model.trials.n_clones == 2
-    prove(model, paid, 0.0, paid)
+    prove(model, paid, paid)
     expected = [clone] * 4 if verdict == "accepted" else [before[0], before[1]]
     circuits = model.actor.habit, model.actor.circuit, model.actor_target, model.policy.actor_average
     for circuit, weights in zip(circuits, expected, strict=False):
@@ -727,9 +738,9 @@ def test_the_average_follows_the_actor_with_its_rate(target_update_interval):
 
 def test_a_normalised_reward_proves_by_what_was_really_paid():
     model = imitating(VecNormalize(DummyVecEnv([CountingEnv]), norm_obs=False))
-    model.learn(240)  # episodes of 5, 9, 3 and 12 steps in turn, paid 0, 1, 0 and 2; every second one is quiet
-    assert model.trials.habit_returns == [1.0, 2.0] * (ENOUGH_PROOFS // 2)
-    assert model.trials.candidate_returns == [1.0, 2.0] * 3
+    model.learn(240)  # episodes of 5, 9, 3 and 12 steps in turn, paid 0, 1, 0 and 2
+    assert {1.0, 2.0} <= set(model.trials.habit_returns) <= {0.0, 1.0, 2.0}
+    assert model.trials.noisy_returns and set(model.trials.noisy_returns) <= {0.0, 1.0, 2.0}
 
 
 def test_another_environment_may_pay_otherwise():
