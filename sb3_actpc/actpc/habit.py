@@ -42,9 +42,9 @@ class Trials:
 
     Clones of the same demonstrations can do very differently, by their first synapses alone. So while the habit is paid less
     than what it imitates, further clones are candidates: before anything is learned, where ``GREAT_SHORTFALL`` of it is
-    missing, ``EARLY_CLONES`` of them; then, where ``SHORTFALL`` is, after a rejected learner, or after the second in a row where the learner is paid
-    more than the habit even with noise, and the first rejection may have been chance. Learning begins anew with one that is
-    accepted.
+    missing, ``EARLY_CLONES`` of them; then, where ``SHORTFALL`` is, after a rejected learner, or after the second in a row
+    where the learner is paid more than the habit even with noise, and the first rejection may have been chance. Learning
+    begins anew with one that is accepted.
 
     :param n_envs: environments, each with an episode of its own
     """
