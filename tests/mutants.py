@@ -432,6 +432,23 @@ MUTANTS = [
         f"{HABIT} -k half",
     ),
     Mutant("clones whatever was learned", TRIALS, "not self.n_clones or not is_due", "not self.n_clones", HABIT),
+    Mutant(
+        "a late clone is on trial against itself",
+        TRIALS,
+        "self.has_learned = self.has_learned and not self.is_clone",
+        "pass",
+        f"{HABIT} -k against_itself",
+    ),
+    Mutant(
+        "the episodes that end first count first",
+        TRIALS,
+        "self.quiet.append([env, quiet, None, 0])",
+        "self.quiet.insert(0, [env, quiet, None, 0])",
+        f"{HABIT} -k order",
+    ),
+    Mutant(
+        "noise before a second beginning", TRIALS, "[self.generation] * self.n_envs", "[0] * self.n_envs", f"{HABIT} -k second"
+    ),
     Mutant("early clones for ever", TRIALS, "else self.generation < EARLY_CLONES", "else True", f"{HABIT} -k half"),
     Mutant("noise between a candidate's first episodes", TRIALS, "is_quiet = begins or ", "is_quiet = ", f"{HABIT} -k turns"),
     Mutant("candidates play alone", TRIALS, " and len(self.candidate_returns) < N_PROOFS", "", f"{HABIT} -k taken"),

@@ -55,6 +55,7 @@ class Trials:
     generation: int = 0
     returns: list[float] = field(default_factory=list)  # so far, of the running episodes
     lengths: list[int] = field(default_factory=list)
+    quiet: list[list[Any]] = field(default_factory=list)  # [environment, role, return or None, length], as they began
     quiet_due: list[int] = field(default_factory=list)  # steps without noise that are still due, for each environment
     habit_returns: list[float] = field(default_factory=list)
     noisy_returns: list[float] = field(default_factory=list)  # the learning actor's last ones
@@ -78,8 +79,9 @@ class Trials:
     def begin_all(self) -> None:
         """All environments were reset: episodes that were running do not count."""
         self.roles = ["actor"] * self.n_envs
-        self.generations, self.lengths, self.quiet_due = ([0] * self.n_envs for _ in range(3))
-        self.returns = [0.0] * self.n_envs
+        self.generations = [self.generation] * self.n_envs
+        self.lengths, self.quiet_due = ([0] * self.n_envs for _ in range(2))
+        self.returns, self.quiet = [0.0] * self.n_envs, []
 
     @property
     def habit_return(self) -> float:
@@ -119,15 +121,24 @@ class Trials:
         self.quiet_due[env] = length if role == "actor" else self.quiet_due[env] - length
         if role == "actor" and self.generations[env] == self.generation:  # else another actor began it
             self.noisy_returns = [*self.noisy_returns, episode_return][-KEPT_NOISY_RETURNS:]
-        if role == "habit":
-            self.habit_returns = [*self.habit_returns, episode_return][-KEPT_RETURNS:]
-            self.habit_proofs, self.habit_steps = self.habit_proofs + 1, self.habit_steps + length
-            self.tests_habit = len(self.habit_returns) < N_PROOFS or not _is_tried(self.habit_proofs, self.habit_steps)
-        if role != "candidate" or self.generations[env] != self.generation:
-            return None
-        self.candidate_returns.append(episode_return)
-        self.candidate_steps += length
-        return self._judge()
+        for one in self.quiet:
+            if one[0] == env and one[2] is None:
+                one[2:] = episode_return, length
+        verdict: Verdict | None = None
+        while self.quiet and self.quiet[0][2] is not None:
+            verdict = self._count(*self.quiet.pop(0)[1:]) or verdict
+        return verdict
+
+    def _count(self, role: Role, episode_return: float, length: int) -> Verdict | None:
+        """A quiet episode, once all that began before it have ended: of several environments those that end first are short."""
+        if role == "candidate":
+            self.candidate_returns.append(episode_return)
+            self.candidate_steps += length
+            return self._judge()
+        self.habit_returns = [*self.habit_returns, episode_return][-KEPT_RETURNS:]
+        self.habit_proofs, self.habit_steps = self.habit_proofs + 1, self.habit_steps + length
+        self.tests_habit = len(self.habit_returns) < N_PROOFS or not _is_tried(self.habit_proofs, self.habit_steps)
+        return None
 
     def begin(self, env: int) -> bool:
         """
@@ -142,6 +153,8 @@ class Trials:
         is_quiet = begins or self.roles[env] == "actor" or self.quiet_due[env] > 0
         self.roles[env] = quiet if is_quiet else "actor"
         self.generations[env] = self.generation
+        if is_quiet:
+            self.quiet.append([env, quiet, None, 0])
         if self.roles[env] != "candidate" or self.on_trial:
             return False
         self.on_trial, self.is_clone = True, self.needs_clone()
@@ -167,10 +180,12 @@ class Trials:
             self.noisy_returns = [] if self.is_clone else self.noisy_returns
             # what the old habit has begun elsewhere is no return of the new one
             self.roles = ["actor" if role == "habit" else role for role in self.roles]
+            self.has_learned = self.has_learned and not self.is_clone  # the next learner begins as this clone
         elif has_time and abs(gain) + SURE * error > smallest:
             return None
         self.n_rejected = self.n_rejected + 1 if verdict == "rejected" and not self.is_clone else 0
         self.tests_habit = verdict != "accepted"
+        self.quiet = [one for one in self.quiet if one[1] == "habit" and verdict != "accepted"]
         self.candidate_returns, self.candidate_steps, self.on_trial = [], 0, False
         self.habit_proofs, self.habit_steps = 0, 0
         self.generation += 1

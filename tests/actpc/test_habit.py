@@ -52,6 +52,12 @@ def play(trials, episode_return, length=PROOF_STEPS, env=0, has_learned=True):
     return role, verdict
 
 
+def cast(trials, role, env=0):
+    """The episode of ``env`` that is about to begin is played by this one."""
+    trials.roles[env] = role
+    trials.quiet = [one for one in trials.quiet if one[0] != env] + [[env, role, None, 0]] * (role != "actor")
+
+
 def play_quiet(trials, episode_return, length=PROOF_STEPS, env=0):
     """A quiet episode; where a noisy one is due, that one before it, and its return must not matter."""
     if trials.roles[env] == "actor":
@@ -191,7 +197,8 @@ def test_a_learner_that_noise_makes_worse_than_the_habit_needs_twice_the_steps_f
     trials = Trials(1, habit_returns=[100.0, 100.0], tests_habit=False)
     verdicts = []
     for paid in [90.0, 120.0, 110.0, 110.0] * 2:
-        trials.on_trial, trials.is_clone, trials.noisy_returns, trials.roles = True, is_clone, noisy, ["candidate"]
+        trials.on_trial, trials.is_clone, trials.noisy_returns = True, is_clone, noisy
+        cast(trials, "candidate")
         verdicts.append(play(trials, paid)[1])
         if verdicts[-1]:
             break
@@ -202,7 +209,8 @@ def test_a_learner_that_noise_makes_worse_than_the_habit_needs_twice_the_steps_f
 def test_a_sure_gain_is_proof_whatever_the_noise_does(noisy):
     trials = Trials(1)
     tried(100.0, [90.0], trials=trials)
-    trials.candidate_returns, trials.noisy_returns, trials.roles = [118.0, 120.0, 122.0], [noisy] * 4, ["candidate"]
+    trials.candidate_returns, trials.noisy_returns = [118.0, 120.0, 122.0], [noisy] * 4
+    cast(trials, "candidate")
     assert play(trials, 120.0, MOST_PROOF_STEPS)[1] == "accepted"
 
 
@@ -316,13 +324,38 @@ def test_a_candidate_that_still_plays_when_it_is_judged_does_not_keep_the_next_o
 
 
 def test_what_the_old_habit_has_begun_elsewhere_is_no_return_of_the_new_one():
-    trials = Trials(2, habit_returns=[100.0, 100.0], roles=["candidate", "habit"], generations=[0, 0])
-    trials.begin_all()
-    trials.roles = ["candidate", "habit"]
+    trials = Trials(2, habit_returns=[100.0, 100.0])
+    cast(trials, "candidate", 0)
+    cast(trials, "habit", 1)
     trials.candidate_returns, trials.candidate_steps = [200.0], PROOF_STEPS
     assert play(trials, 200.0, env=0) == ("candidate", "accepted")
     play(trials, 50.0, env=1)
     assert trials.habit_returns == [200.0, 200.0]
+
+
+def test_of_several_environments_episodes_count_in_the_order_in_which_they_began():
+    """Else the shortest, a bad gait's falls, would be all that a candidate is judged by."""
+    trials = Trials(2, habit_returns=[100.0, 100.0], tests_habit=False, has_learned=True)
+    for env in (0, 1):
+        play(trials, 0.0, 1, env)
+    assert trials.roles == ["candidate", "candidate"]
+    for paid in (10.0, 20.0):  # sure great losses, if they counted
+        assert play(trials, paid, 10, env=1) == ("candidate", None) and not trials.candidate_returns
+    assert play(trials, 300.0, 900) == ("candidate", None) and trials.candidate_returns == [300.0, 10.0, 20.0]
+    habits = Trials(2)
+    for env in (0, 1):
+        play(habits, 0.0, 1, env, has_learned=False)
+    play(habits, 5.0, env=1, has_learned=False)
+    assert habits.habit_returns == []
+    play(habits, 7.0, has_learned=False)
+    assert habits.habit_returns == [7.0, 5.0]
+
+
+def test_noisy_episodes_count_after_a_second_beginning_too():
+    trials = Trials(1, generation=3, habit_returns=[1.0])
+    trials.begin_all()
+    play(trials, 8.0)
+    assert trials.noisy_returns == [8.0]
 
 
 def test_a_reset_of_the_environments_forgets_running_episodes_and_nothing_else():
@@ -333,6 +366,7 @@ def test_a_reset_of_the_environments_forgets_running_episodes_and_nothing_else()
     known = trials.habit_returns, trials.candidate_returns, trials.candidate_steps, trials.generation
     trials.begin_all()
     assert trials.roles == ["actor", "actor"] and trials.returns == [0.0, 0.0] and trials.lengths == [0, 0]
+    assert trials.quiet == []
     assert (trials.habit_returns, trials.candidate_returns, trials.candidate_steps, trials.generation) == known
 
 
@@ -468,7 +502,8 @@ def test_no_clone_is_needed_while_the_rejected_learner_does_better_even_with_noi
 def test_what_was_paid_with_noise_before_a_clone_was_accepted_does_not_count(is_clone):
     trials = Trials(1, imitated_return=100.0, n_clones=2)
     play_clones(trials, 10.0, 10.0, 60.0, has_learned=True)
-    trials.is_clone, trials.noisy_returns, trials.roles = is_clone, [7.0, 8.0], ["candidate"]
+    trials.is_clone, trials.noisy_returns = is_clone, [7.0, 8.0]
+    cast(trials, "candidate")
     assert play(trials, 60.0)[1] == "accepted"
     assert trials.noisy_returns == ([] if is_clone else [7.0, 8.0])
 
@@ -485,10 +520,11 @@ def test_of_learners_that_noise_keeps_up_every_second_in_a_row_is_followed_by_a_
 
 def test_noisy_episodes_that_another_actor_began_do_not_count():
     trials = Trials(2, imitated_return=100.0, n_clones=2)
-    trials.habit_returns, trials.tests_habit, trials.roles = [10.0, 10.0], False, ["candidate", "actor"]
+    trials.habit_returns, trials.tests_habit = [10.0, 10.0], False
     trials.on_trial = trials.is_clone = True
+    cast(trials, "candidate")
     play(trials, 60.0)
-    trials.roles[0] = "candidate"
+    cast(trials, "candidate")
     assert play(trials, 60.0)[1] == "accepted"
     play(trials, 7.0, env=1)  # begun by the learner of before
     assert trials.noisy_returns == []
@@ -512,10 +548,10 @@ def test_what_the_habit_is_paid_elsewhere_meanwhile_does_not_stop_the_trial_of_a
         assert play(trials, 50.0) == ("habit", None)
     play(trials, 0.0, 3, 1)  # its quiet episodes are the clone's
     assert trials.roles == ["actor", "candidate"] and trials.is_clone
-    trials.roles[0] = "habit"  # as if it had begun before
+    trials.roles[0], trials.quiet = "habit", [[0, "habit", None, 0], *trials.quiet]  # as if it had begun before
     assert play(trials, 50.0) == ("habit", None)
     assert play(trials, 90.0, env=1) == ("candidate", None)
-    assert play(trials, 90.0, env=1) == ("candidate", "accepted")
+    assert play(trials, 90.0, env=0) == ("candidate", "accepted")
 
 
 # ---------------------------------------------------------------------- the agent
@@ -597,6 +633,14 @@ def test_a_candidate_is_taken_once_the_critic_has_pressed_long_enough(begun_at, 
     model._n_updates = max(model.critic_warmup, begun_at) + 7 + late
     prove(model, 0.0, 1.0, 0.0, 1.0, 0.0)
     assert model.trials.roles == [role]
+
+
+def test_a_clone_that_was_accepted_late_is_not_on_trial_against_itself():
+    """In the same breath, where more quiet steps are due: what learns is this clone until the critic has pressed it."""
+    trials = Trials(1, imitated_return=100.0, n_clones=1, n_rejected=1, habit_returns=[10.0, 10.0], tests_habit=False)
+    play(trials, 0.0, 1000)
+    assert trials.is_clone and [play(trials, 95.0, 100)[1] for _ in range(5)] == [None] * 4 + ["accepted"]
+    assert trials.roles == ["habit"] and not trials.on_trial
 
 
 @pytest.mark.parametrize(("paid", "verdict"), [(1.0, "accepted"), (0.0, "rejected")])
