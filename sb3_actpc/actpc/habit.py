@@ -130,7 +130,7 @@ class Trials:
         return verdict
 
     def _count(self, role: Role, episode_return: float, length: int) -> Verdict | None:
-        """A quiet episode, once all that began before it have ended: of several environments those that end first are short."""
+        """A quiet episode, once those that began before it have ended: of several environments the first to end are short."""
         if role == "candidate":
             self.candidate_returns.append(episode_return)
             self.candidate_steps += length
