@@ -40,7 +40,7 @@ from sb3_actpc.actpc.arguments import (
 )
 from sb3_actpc.actpc.buffers import CombinedHerReplayBuffer, SignalReplay, combined_buffer_class, relabels
 from sb3_actpc.actpc.cloning import Cloning
-from sb3_actpc.actpc.compiled import CompiledUpdate, compiled_update
+from sb3_actpc.actpc.compiled import CompiledUpdate, compiled_update, updates_per_step
 from sb3_actpc.actpc.demonstration_replay import DemonstrationReplay
 from sb3_actpc.actpc.diagnostics import Diagnostics
 from sb3_actpc.actpc.features import Batch, CircuitInputs
@@ -288,8 +288,7 @@ class ActPC(OffPolicyAlgorithm):
         self.observation_normalization: str = default(observation_normalization, "demonstrations", "none")
         self.compile = compile
         self.signal_kwargs = signal_kwargs
-        with named_in_errors(f"signal_kwargs={signal_kwargs!r}"):
-            self.signals = InternalSignals(**(signal_kwargs or {}))
+        self.signals = InternalSignals()
         self.pretrained, self.n_pretraining_updates = False, 0
         self.cloning: Cloning | None = None  # while the actor becomes a clone
         self.trials: Trials | None = None
@@ -304,7 +303,10 @@ class ActPC(OffPolicyAlgorithm):
         assert isinstance(self.action_space, spaces.Box)
         check_actions(self.action_space, self.action_noise)
         with named_in_errors(f"refresh_kwargs={self.refresh_kwargs!r}"):
-            self.refresh = Refresh(**(self.refresh_kwargs or {}))  # here, as a loaded agent may be given others
+            self.refresh = Refresh(**(self.refresh_kwargs or {}))  # here, as a loaded agent may be given others, and below too
+        with named_in_errors(f"signal_kwargs={self.signal_kwargs!r}"):
+            signals = InternalSignals(**(self.signal_kwargs or {}))
+            self.signals = self.signals if self.signals.settings == signals.settings else signals
         self._setup_lr_schedule()
         self.set_random_seed(self.seed)
         self.policy = self._make_policy().to(self.device)
@@ -393,8 +395,7 @@ class ActPC(OffPolicyAlgorithm):
         assert isinstance(self.action_space, spaces.Box)
         self.expert = DemonstrationReplay(demonstrations, self.observation_space, self.action_space, self.memory_history)
         if self.observation_normalization == "demonstrations" and not self.pretrained:
-            observations = self.inputs.observations(self.expert.episodes.observations)
-            self.actor.normalizer.fit(self.inputs.features(observations))
+            self.actor.normalizer.fit(self._features_of(self.expert.episodes, np.arange(len(self.expert))))
 
     def _follow_demonstrations(self) -> None:
         """
@@ -456,11 +457,19 @@ class ActPC(OffPolicyAlgorithm):
             memory.takes_all = is_weighted and self.refresh.own_episodes == "paid"
             if memory.episodes is not None:
                 memory.episodes.distances = None  # the demonstrations may be others by now
+        n_updates, needed = round(self._total_timesteps * updates_per_step(self)), self.critic_warmup + CANDIDATE_AGE
+        if self.n_envs > 1 and self.trials is not None and self.actor_pressure and n_updates <= needed:
+            warnings.warn(
+                f"{self._total_timesteps} steps of {self.n_envs} environments with gradient_steps={self.gradient_steps} are "
+                f"{n_updates} updates, and nothing but clones can become the habit before {needed}: gradient_steps=-1 makes "
+                "as many updates as there are steps",
+                stacklevel=3,
+            )
         if self.verbose:
             print(self.describe())
         self.pretrain(between_updates(result[1]), progress_bar)
         self.start_time = time.time_ns()  # of the frames per second: pre-training has none
-        self._compiled = self._compiled or compiled_update(self, total_timesteps)
+        self._compiled = self._compiled or compiled_update(self, self._total_timesteps)  # resumed, as straight
         return result
 
     def describe(self) -> str:
@@ -932,7 +941,8 @@ class ActPC(OffPolicyAlgorithm):
             self.logger.record("train/pressure", self.pressure)
             if self.policy.trust_region is not None:
                 self.logger.record("train/trust_radius", float(self.policy.trust_region.radius))
-            self.logger.record("train/habit_return", self.trials.habit_return)
+            if self.trials.habit_returns:  # it has played
+                self.logger.record("train/habit_return", self.trials.habit_return)
             self.logger.record("train/habit_generation", self.trials.generation)
 
     def learn(

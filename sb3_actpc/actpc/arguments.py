@@ -154,6 +154,11 @@ def check_actions(space: gym.spaces.Box, noise: ActionNoise | None) -> None:
     """
     if not np.all(np.isfinite([space.low, space.high])):
         raise ValueError(f"action_space={space} must have finite bounds; wrap the environment to rescale it")
+    if not np.issubdtype(space.dtype, np.floating):  # SB3's buffer would cut scaled actions off to whole numbers
+        raise ValueError(
+            f"action_space={space} must have a floating dtype: wrap the environment in a gymnasium.ActionWrapper whose "
+            f"action_space is Box(..., dtype=np.float32), which rounds"
+        )
     fixed = np.argwhere(space.low >= space.high)
     if len(fixed):
         where = tuple(map(int, fixed[0]))

@@ -96,7 +96,7 @@ def compiled_update(agent: Any, total_timesteps: int) -> CompiledUpdate | None:
     sweeps = all(circuit.settling == "scheduled" for _, circuit in agent.policy.named_circuits())
     if agent.compile is True and not sweeps:
         raise ValueError("compile=True needs settling='scheduled': steps that stop at a tolerance are no fixed graph")
-    earned = agent.compile == "auto" and total_timesteps * _updates_per_step(agent) >= ENOUGH_UPDATES
+    earned = agent.compile == "auto" and total_timesteps * updates_per_step(agent) >= ENOUGH_UPDATES
     if not sweeps or not (earned or agent.compile is True):
         return None
     if agent.device.type == "cpu" and not _has_compiler():
@@ -105,7 +105,7 @@ def compiled_update(agent: Any, total_timesteps: int) -> CompiledUpdate | None:
     return CompiledUpdate(agent)
 
 
-def _updates_per_step(agent: Any) -> float:
+def updates_per_step(agent: Any) -> float:
     """Updates for each transition collected; of episodes, whose length nobody knows beforehand, one."""
     every = agent.train_freq
     assert isinstance(every, TrainFreq)

@@ -14,7 +14,7 @@ Role = Literal["actor", "candidate", "habit"]
 Verdict = Literal["accepted", "tied", "rejected"]
 
 N_PROOFS = 2  # episodes of a candidate at least, before it is judged by less than a great loss
-# environment steps, or episodes however short, of a candidate before it is judged, and of the habit between two candidates
+# environment steps, or episodes however short: of a candidate before it is judged, and of the habit after one not accepted
 PROOF_STEPS, ENOUGH_PROOFS = 500, 10
 MOST_PROOF_STEPS = 2000  # that a candidate has for a proof
 KEPT_RETURNS, KEPT_NOISY_RETURNS = 20, 2  # of the habit, and of the learning actor

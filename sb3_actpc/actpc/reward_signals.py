@@ -102,6 +102,7 @@ class InternalSignals:
         instrumental_form: Literal["penalty", "unit"] = "penalty",
         errors: Literal["all", "output"] = "all",
     ) -> None:
+        self.settings = normalizer, normalization, instrumental_form, errors
         kinds: dict[str, type[Normalizer]] = {"max": RunningMaximum, "saturating": Saturating, "quantile": RunningQuantile}
         self.epistemic, self.instrumental = kinds[normalizer](), kinds[normalizer]()
         self.normalization, self.instrumental_form, self.errors = normalization, instrumental_form, errors

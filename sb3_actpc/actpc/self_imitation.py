@@ -41,8 +41,9 @@ class Refresh:
     :param ensemble_size: others that teach a clone what to do around the imitated steps, 2 or more; 1 for none (the
         paper). See :mod:`sb3_actpc.actpc.cloning`
     :param n_clones: clones that are tried at most, the first included, while the habit is paid less than nine tenths of what
-        it imitates (:mod:`sb3_actpc.actpc.habit`): returns of environment and demonstrations must be of one scale. 1 for the
-        warm-started actor alone (the paper); without a habit or a warm start there are no others
+        it imitates, before learning less than half (:mod:`sb3_actpc.actpc.habit`): returns of environment and demonstrations
+        must be of one scale. 1 for the warm-started actor alone (the paper); without a habit or a warm start there are no
+        others
     :raises ValueError: for another value
     """
 

@@ -120,8 +120,8 @@ def load_weights(
             raise ValueError(f"{path} was trained with {name}={header[name]}, the environment has {getattr(model, name)}")
     stored, present = header["normalizers"], _normalizers(model)
     if [one is None for one in stored] != [one is None for one in present]:
-        saved = "with" if stored else "without"
-        raise ValueError(f"{path} was saved {saved} VecNormalize's statistics: wrap the environment as it was in training")
+        saved = f"with VecNormalize(norm_obs={stored[0] is not None})" if stored else "without VecNormalize"
+        raise ValueError(f"{path} was saved {saved}: wrap the environment as it was in training")
     arrays = {name: tensors.pop(name).numpy() for name in list(tensors) if name.startswith("normalizers.")}
     Decoder(arrays, {}).decode(stored, present)
     try:

@@ -8,8 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from gymnasium import spaces
+from stable_baselines3.common.vec_env import VecTransposeImage, unwrap_vec_wrapper
 
 from sb3_actpc.demonstrations.dataset import DATA_FOLDER, Demonstrations, base_name
+from sb3_actpc.demonstrations.rows import box_paths, join_observations, split_observations
 from sb3_actpc.envs import SPARSE_MUJOCO_IDS, dense_env_id
 
 if TYPE_CHECKING:
@@ -68,7 +70,20 @@ def fit_demonstrations(
             sparse_id = f"Sparse{demonstrations.env_id.rpartition(':')[2]}"  # which then pays them anew
             demonstrations = dataclasses.replace(demonstrations, env_id=sparse_id, dense_rewards=demonstrations.rewards)
     demonstrations.check(observation_space, action_space, env_id)
-    return demonstrations if env is None else demonstrations.rewarded_by(env)
+    if env is None:
+        return demonstrations
+    transposes = unwrap_vec_wrapper(env, VecTransposeImage)  # SB3 wraps environments of images; they were recorded without
+    if transposes is not None:
+        columns = demonstrations.observations, demonstrations.next_observations
+        observations, following = (_channels_first(rows, transposes) for rows in columns)
+        demonstrations = dataclasses.replace(demonstrations, observations=observations, next_observations=following)
+    return demonstrations.rewarded_by(env)
+
+
+def _channels_first(rows: np.ndarray, env: VecTransposeImage) -> np.ndarray:
+    """(N, flat size), as the wrapper shows them, of rows as its inner environment does."""
+    observations = env.transpose_observations(split_observations(env.venv.observation_space, rows))
+    return join_observations(observations, box_paths(env.observation_space))
 
 
 def scaled_actions(demonstrations: Demonstrations, action_space: spaces.Box) -> np.ndarray:

@@ -124,6 +124,8 @@ class NGCCircuit(nn.Module):
             feedback_scale=feedback_scale,
             memory_weight=memory_weight,
         )
+        if synaptic_scaling != "none" and not weight_bound:
+            raise ValueError(f"weight_bound={weight_bound!r} must be above 0 with synaptic_scaling={synaptic_scaling!r}")
         _check_rate(settling_rate)
         _check_flags(derivative_free=derivative_free)
         if settling == "iterative" and dynamics == "krylov" and (leak or settling_rate != "auto"):

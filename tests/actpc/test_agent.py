@@ -22,8 +22,9 @@ from sb3_actpc.actpc import actpc as actpc_module
 from sb3_actpc.actpc import demonstration_replay
 from sb3_actpc.actpc.diagnostics import Diagnostics
 from sb3_actpc.actpc.self_imitation import distances_to_nearest
+from sb3_actpc.demonstrations import Demonstrations
 from sb3_actpc.ngc import NGCCircuit, settle_coupled
-from tests.actpc.agents import differ, make, plain, weights_of
+from tests.actpc.agents import QUICK, differ, imitating, make, plain, weights_of
 from tests.actpc.envs import CountingEnv, demonstrations
 
 NO_MEMORY = {"self_imitation_size": 0}
@@ -850,6 +851,72 @@ def test_discrete_actions_and_images_get_one_clear_line():
 def test_a_wrong_keyword_is_named(keywords, named):
     with pytest.raises(ValueError, match=named):
         make(**keywords)
+
+
+def test_whole_numbers_are_no_actions():
+    class Whole(CountingEnv):
+        def __init__(self):
+            super().__init__()
+            self.action_space = gym.spaces.Box(-2, 2, (2,), np.int64)
+
+    with pytest.raises(ValueError, match=r"int64\) must have a floating dtype: wrap the environment"):
+        ActPC("MlpPolicy", Whole())
+
+
+class Images(gym.Env):
+    """Every pixel says where it is and what was done before."""
+
+    observation_space = gym.spaces.Box(0, 255, (36, 40, 3), np.uint8)
+    action_space = gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
+
+    def observe(self):
+        return (np.arange(36 * 40 * 3).reshape(36, 40, 3) % 251 + self.n).astype(np.uint8)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.n = 0
+        return self.observe(), {}
+
+    def step(self, action):
+        self.n += 1
+        return self.observe(), 1.0, self.n == 4, False, {}
+
+
+def test_images_are_imitated_as_the_circuits_see_them():
+    """Recorded with channels last, as the environment shows them; SB3 puts the channels first."""
+    shown = Demonstrations.record(lambda _: np.zeros(1, np.float32), Images(), n_episodes=2)
+    model = ActPC("CnnPolicy", Images(), demonstrations=shown, **{**QUICK, "policy_kwargs": {"net_arch": [8]}})
+    env = model.get_env()
+    first = env.reset()
+    second = env.step(np.zeros((1, 1)))[0]
+    expert = model.expert.episodes.observations
+    assert first.shape == (1, 3, 36, 40) and np.array_equal(expert[0], first[0]) and np.array_equal(expert[1], second[0])
+    model.learn(5)
+    assert model.pretrained
+
+
+def test_a_loaded_agents_signals_are_those_asked_for(tmp_path):
+    model = make(demonstrations=demonstrations(), signal_kwargs={"normalizer": "max"}, learning_starts=1)
+    model.learn(30)
+    model.save(tmp_path / "agent")
+    same, other = ActPC.load(tmp_path / "agent"), ActPC.load(tmp_path / "agent", signal_kwargs={"normalizer": "saturating"})
+    assert same.signals.checkpoint_state() == model.signals.checkpoint_state()
+    assert type(other.signals.epistemic) is not type(model.signals.epistemic)
+
+
+@pytest.mark.parametrize(
+    ("keywords", "warns"), [({}, True), ({"gradient_steps": -1}, False), ({"actor_pressure": 0.0}, False)]
+)
+def test_a_run_of_several_environments_that_is_too_short_to_prove_anything_says_so(keywords, warns, monkeypatch):
+    monkeypatch.setattr(actpc_module, "CANDIDATE_AGE", 20)
+    model = imitating(DummyVecEnv([CountingEnv] * 4), **keywords)
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        model.learn(100)
+    said = [str(one.message) for one in said if "gradient_steps" in str(one.message)]
+    assert bool(said) == warns and all(
+        "100 steps of 4 environments with gradient_steps=1 are 25 updates" in one for one in said
+    )
 
 
 def test_an_action_that_cannot_vary_is_named_with_its_dimension():

@@ -5,6 +5,7 @@ import pytest
 import torch as th
 from stable_baselines3.common.logger import configure
 
+from sb3_actpc.actpc import actpc as actpc_module
 from sb3_actpc.actpc.compiled import ENOUGH_UPDATES, compiled_update
 from tests.actpc.agents import make
 from tests.actpc.envs import demonstrations
@@ -51,6 +52,16 @@ def test_auto_compiles_from_enough_updates_on_and_only_sweeps():
     assert compiled_update(model, ENOUGH_UPDATES) is not None
     model.compile = False
     assert compiled_update(model, ENOUGH_UPDATES) is None
+
+
+def test_a_resumed_run_compiles_as_the_whole_run_would(monkeypatch):
+    """Else the two would differ by rounding."""
+    asked = []
+    monkeypatch.setattr(actpc_module, "compiled_update", lambda agent, steps: asked.append(steps))
+    model = agent()
+    model.learn(60)
+    model.learn(40, reset_num_timesteps=False)
+    assert asked == [60, 100]
 
 
 @pytest.mark.parametrize(

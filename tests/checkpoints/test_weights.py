@@ -135,7 +135,7 @@ def test_files_that_do_not_fit_are_refused(tmp_path: Path) -> None:
         ActPC.from_weights(tmp_path / "nothing", make_vec_env(CountingEnv))
     with pytest.raises(ValueError, match="trained with observation_space"):
         ActPC.from_weights(path, "MountainCarContinuous-v0")
-    with pytest.raises(ValueError, match="VecNormalize"):
+    with pytest.raises(ValueError, match="was saved without VecNormalize: wrap"):
         ActPC.from_weights(path, VecNormalize(make_vec_env(CountingEnv)))
     with pytest.raises(ValueError, match="does not fit its own settings"):
         ActPC.from_weights(path, make_vec_env(CountingEnv), policy_kwargs={"net_arch": [16, 16], "n_critics": 3})

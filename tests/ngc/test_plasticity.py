@@ -109,6 +109,13 @@ def test_weight_decay_aligns_the_error_synapses_under_adam():
     assert cosines[0] < 0.9 and cosines[1] > 0.95
 
 
+@pytest.mark.parametrize("kind", ["soft_bound", "column_norm"])
+def test_a_bound_of_nothing_is_named(kind):
+    with pytest.raises(ValueError, match=f"weight_bound=0.0 must be above 0 with synaptic_scaling='{kind}'"):
+        NGCCircuit(8, 3, (16,), synaptic_scaling=kind, weight_bound=0.0)
+    NGCCircuit(8, 3, (16,), weight_bound=0.0)
+
+
 def test_a_synapse_at_its_soft_bound_still_decays():
     circuit = NGCCircuit(8, 3, (16,), synaptic_scaling="soft_bound", weight_bound=0.4, weight_decay=0.5)
     circuit.weights[0].fill_(0.4)
