@@ -216,6 +216,10 @@ def _download(args: argparse.Namespace) -> int:
 
     url = args.url or robomimic_url(args.env, args.kind)
     output = args.output or _default_output(args.env, f"_{args.kind}")
+    if output.suffix in HDF5_SUFFIXES:
+        raise ValueError(
+            f"--output {output} must end in .npz: what is fetched goes beside it, as {output.with_suffix('.hdf5')}"
+        )
     return _save(download_robomimic(args.env, output.with_suffix(".hdf5"), url, args.obs, _report), output)
 
 

@@ -101,17 +101,30 @@ def download_robomimic(
     env_id: str, path: str | os.PathLike[str], url: str, obs: str = "paper", report: Report = silent
 ) -> Demonstrations:
     """Download a robomimic file (http or https) to a path, unless it is there already, and read it, see
-    :func:`~sb3_actpc.demonstrations.read_robomimic`. The file appears under its name only when it is whole. OSError when it
-    cannot be fetched, ValueError when what arrived is not such a file, ImportError when h5py is not installed."""
-    import pooch
-
+    :func:`~sb3_actpc.demonstrations.read_robomimic`. The file stays under its name only when it is whole and of the task.
+    OSError when it cannot be fetched, ValueError when what arrived, or was there, is not such a file, ImportError when h5py is
+    not installed."""
     import_extra("h5py", "robosuite")  # before the long part
     path = Path(path)
     if not url.startswith(("http://", "https://")):
         raise ValueError(f"url={url!r} must begin with http:// or https://")
-    if path.is_file():
+    is_there = path.is_file()
+    if is_there:
         report(f"{path} is there already")
+    else:
+        _fetch(url, path, env_id, report)
+    try:
         return read_robomimic(path, env_id, obs)
+    except ValueError as error:
+        if is_there:
+            raise ValueError(f"{error}; it was there already: delete it, and it is downloaded") from None
+        path.unlink()  # the next try would take it for a good one
+        raise ValueError(f"{error}; what {url} gave was deleted: give the --url of a file of {env_id}") from None
+
+
+def _fetch(url: str, path: Path, env_id: str, report: Report) -> None:
+    import pooch
+
     report(f"fetching {url}")
     pooch.get_logger().setLevel("WARNING")
     try:
@@ -124,7 +137,6 @@ def download_robomimic(
             f"here with `sb3-actpc demos convert FILE --env {env_id}` ({reason})"
         ) from None
     report(f"wrote {path} ({path.stat().st_size / 1e6:.1f} MB)")
-    return read_robomimic(path, env_id, obs)
 
 
 def _filtered(data: Any, filter_key: str, source: str) -> list[str]:

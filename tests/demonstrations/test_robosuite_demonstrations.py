@@ -306,6 +306,14 @@ def server(tmp_path: Path) -> Iterator[tuple[str, Path]]:
         def log_message(self, format: str, *args: object) -> None:
             pass
 
+        def do_GET(self) -> None:
+            if "half" not in self.path:
+                return super().do_GET()
+            self.send_response(200)  # and the connection breaks
+            self.send_header("Content-Length", "1000")
+            self.end_headers()
+            self.wfile.write(b"\x89HDF")
+
     folder = tmp_path / "www"
     folder.mkdir()
     with http.server.ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(Quiet, directory=str(folder))) as running:
@@ -332,6 +340,32 @@ def test_download_fetches_checks_and_converts(
         error = capsys.readouterr().err
         assert message in error and len(error.strip().splitlines()) == 1
         assert not Path(f"{name}.npz").exists()
+
+
+@pytest.mark.parametrize(("name", "message"), [("page.hdf5", "expected a whole HDF5 file"), ("half.hdf5", "")])
+def test_of_a_failed_download_nothing_is_left(
+    name: str, message: str, server: tuple[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A page in the place of the file, and half a file: the next try fetches it."""
+    url, folder = server
+    (folder / "page.hdf5").write_text("<html>please log in</html>")
+    output = tmp_path / "out" / "lift.npz"
+    command = ["demos", "download", "--env", LIFT, "--output", str(output), "--url"]
+    assert main([*command, f"{url}/{name}"]) == 2
+    assert message in capsys.readouterr().err
+    assert list(output.parent.iterdir()) == []
+    write_robomimic(made_up(LIFT), folder / "lift.hdf5")
+    assert main([*command, f"{url}/lift.hdf5"]) == 0
+
+
+def test_a_bad_file_that_was_there_already_is_kept_and_named(lift_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command = ["demos", "download", "--env", LIFT, "--output"]
+    assert main([*command, str(lift_file)]) == 2
+    assert "must end in .npz" in capsys.readouterr().err
+    lift_file.write_bytes(lift_file.read_bytes()[:1000])
+    assert main([*command, str(lift_file.with_suffix(".npz"))]) == 2
+    assert "delete it, and it is downloaded" in capsys.readouterr().err
+    assert lift_file.stat().st_size == 1000
 
 
 def test_without_a_network_download_ends_with_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
