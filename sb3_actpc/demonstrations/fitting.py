@@ -69,7 +69,10 @@ def fit_demonstrations(
         if env_id in SPARSE_MUJOCO_IDS and base_name(dense_env_id(env_id)) == base_name(demonstrations.env_id):
             sparse_id = f"Sparse{demonstrations.env_id.rpartition(':')[2]}"  # which then pays them anew
             demonstrations = dataclasses.replace(demonstrations, env_id=sparse_id, dense_rewards=demonstrations.rewards)
-    demonstrations.check(observation_space, action_space, env_id)
+    try:
+        demonstrations.check(observation_space, action_space, env_id)
+    except ValueError as error:
+        raise ValueError(f"{error}: record them in this environment, wrapped as it is here (Demonstrations.record)") from None
     if env is None:
         return demonstrations
     transposes = unwrap_vec_wrapper(env, VecTransposeImage)  # SB3 wraps environments of images; they were recorded without

@@ -17,7 +17,7 @@ from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
-from sb3_actpc import ActPC
+from sb3_actpc import ActPC, Demonstrations
 from sb3_actpc.actpc import actpc as actpc_module
 from sb3_actpc.actpc import demonstration_replay
 from sb3_actpc.actpc.diagnostics import Diagnostics
@@ -949,6 +949,14 @@ def test_demonstrations_of_another_task_are_refused():
         ActPC("MlpPolicy", "Pendulum-v1", demonstrations=demonstrations(env_id="Pendulum-v1"))
     with pytest.raises(ValueError, match="env_id"):
         ActPC("MlpPolicy", "Pendulum-v1", demonstrations=demonstrations())
+
+
+def test_demonstrations_must_be_recorded_with_the_wrappers_of_the_environment():
+    env = gym.wrappers.RescaleAction(CountingEnv(), np.float32(-1.0), np.float32(1.0))
+    with pytest.raises(ValueError, match=r"'actions': .*: record them in this environment, wrapped as it is here"):
+        make(DummyVecEnv([lambda: env]), demonstrations=demonstrations())
+    shown = Demonstrations.record(lambda observation: np.full(2, 0.5, np.float32), env, 2)
+    assert make(DummyVecEnv([lambda: env]), demonstrations=shown).learn(15).num_timesteps == 15
 
 
 # ---------------------------------------------------------------------- saving, determinism
