@@ -48,6 +48,7 @@ from sb3_actpc.actpc.habit import Trials
 from sb3_actpc.actpc.policies import POLICIES, ActPCActor, ActPCPolicy, Critics, check_policy, check_policy_kwargs
 from sb3_actpc.actpc.reward_signals import InternalSignals, summed_squared_errors
 from sb3_actpc.actpc.self_imitation import (
+    MOST_DISTANCES,
     MOST_MEASURED,
     MOST_NEIGHBOURS,
     Episodes,
@@ -917,9 +918,12 @@ class ActPC(OffPolicyAlgorithm):
         for part in self._imitated():
             if part.distances is None:
                 near = np.arange(0, len(shown), -(-len(shown) // MOST_NEIGHBOURS))
-                features, others = self._features_of(part, np.arange(len(part))), self._features_of(shown, near)
-                numbers = shown.starts if part is shown else np.full(len(part), -1)  # own episodes are none of these
-                part.distances = distances_to_nearest(features, numbers, others, shown.starts[near])
+                every = -(-len(part) // MOST_DISTANCES)
+                rows = np.arange(0, len(part), every)
+                features, others = self._features_of(part, rows), self._features_of(shown, near)
+                numbers = shown.starts[rows] if part is shown else np.full(len(rows), -1)  # own episodes are none of these
+                measured = distances_to_nearest(features, numbers, others, shown.starts[near])
+                part.distances = np.repeat(measured, every, axis=0)[: len(part)]
 
     def _features_of(self, episodes: Episodes, rows: np.ndarray) -> th.Tensor:
         """(B, n_features) of (B,) rows, some at a time: there can be many images."""

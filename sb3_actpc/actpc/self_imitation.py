@@ -19,6 +19,7 @@ TensorObservations = th.Tensor | dict[str, th.Tensor]
 Weighting = Literal["returns", "uniform"]
 RETURN_EXPONENT = 4.0  # an episode that was paid half as much is imitated a sixteenth as often
 MOST_NEIGHBOURS = 20_000  # demonstrated steps among which the nearest is looked for
+MOST_DISTANCES = 100_000  # imitated steps of which that is done; those between them take the distances of the one before
 MOST_MEASURED = 1000  # steps by which it is judged whether there is room
 PATIENCE = 20  # episodes, all with a negative return, after which the memory warns
 

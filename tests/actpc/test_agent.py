@@ -473,6 +473,16 @@ def test_distances_of_long_sets_are_to_some_of_their_steps(monkeypatch):
     assert model.expert.episodes.distances[:, 0].tolist() == [10.0, 1.0, 10.0, 1.0, 20.0]
 
 
+@pytest.mark.parametrize(("most", "expected"), [(5, [3.0, 1.0, 1.0, 6.0, 20.0]), (3, [3.0, 3.0, 1.0, 1.0, 20.0])])
+def test_of_very_long_sets_some_steps_are_measured_and_the_next_ones_take_their_distances(most, expected, monkeypatch):
+    monkeypatch.setattr(actpc_module, "MOST_DISTANCES", most)
+    data = demonstrations(n_episodes=5, length=1)
+    observations = np.repeat(np.float32([[0.0], [3.0], [4.0], [10.0], [30.0]]), data.observations.shape[1], axis=1)
+    model = make(demonstrations=dataclasses.replace(data, observations=observations), refresh_kwargs={"noise": 1.0})
+    model._sample_imitated(1, 1.0)
+    assert model.expert.episodes.distances[:, 0].tolist() == expected
+
+
 @pytest.mark.parametrize(("weighting", "share"), [("returns", 0.0), ("uniform", 0.5)])
 def test_the_actor_imitates_the_episodes_that_were_paid(weighting, share):
     """Of two equally long halves, one unpaid: by returns its steps are never drawn, by the paper's rule half the time."""
