@@ -2,6 +2,8 @@
 
 import dataclasses
 import json
+import os
+import signal
 import sys
 import types
 from functools import partial
@@ -880,13 +882,38 @@ def test_a_run_stopped_between_verdicts_is_the_run_never_stopped(n_clones, n_env
     data = demonstrations()
     data = dataclasses.replace(data, rewards=5.0 * data.rewards)
     settings = {"demonstrations": data, "refresh_kwargs": {"n_clones": n_clones}, "buffer_size": 200}
+    settings["critic_warmup"] = 5 if n_clones == 1 else 1000  # clones are tried before anything is learned
 
     def make_agent():
         return imitating(DummyVecEnv([CountingEnv] * n_envs), {"memory_history": 3}, **settings)
 
     straight = learn_straight(make_agent, tmp_path / "straight", 150)
     resumed = learn_in_two(make_agent, tmp_path / "resumed", 150, stop_at=53)
-    assert straight.trials.generation >= 2 and straight.trials.n_clones < n_clones
+    assert straight.trials.generation >= 2 and straight.trials.n_clones < max(1, n_clones - 1)
+    assert_same(straight, resumed)
+
+
+def test_a_signal_while_a_clone_is_made_waits_for_it_and_loses_nothing(tmp_path, monkeypatch):
+    monkeypatch.setattr(habit_module, "PROOF_STEPS", 1)
+    data = demonstrations()
+    data = dataclasses.replace(data, rewards=5.0 * data.rewards)
+    settings = {"demonstrations": data, "critic_warmup": 1000, "buffer_size": 200}
+    original, steps, signals = ActPC._clone_into, [], []
+
+    def clone_into(self, circuit):
+        cloning = original(self, circuit)
+        if self.num_timesteps:  # not the warm start
+            steps.append(self.num_timesteps)
+            if signals:
+                os.kill(os.getpid(), signals.pop())
+        return cloning
+
+    monkeypatch.setattr(ActPC, "_clone_into", clone_into)
+    straight = learn_straight(lambda: imitating(**settings), tmp_path / "straight", 120)
+    first, n_clones = steps[0], len(steps)
+    signals.append(signal.SIGTERM)
+    resumed = learn_in_two(lambda: imitating(**settings), tmp_path / "resumed", 120, stop_at=first)
+    assert not signals and steps == [*steps[:n_clones], *steps[:n_clones]]  # the clone is made once
     assert_same(straight, resumed)
 
 
