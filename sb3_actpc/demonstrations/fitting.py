@@ -8,14 +8,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from gymnasium import spaces
-from stable_baselines3.common.vec_env import VecTransposeImage, unwrap_vec_wrapper
 
 from sb3_actpc.demonstrations.dataset import DATA_FOLDER, Demonstrations, base_name
 from sb3_actpc.demonstrations.rows import box_paths, join_observations, split_observations
 from sb3_actpc.envs import SPARSE_MUJOCO_IDS, dense_env_id
 
 if TYPE_CHECKING:
-    from stable_baselines3.common.vec_env import VecEnv
+    from stable_baselines3.common.vec_env import VecEnv, VecTransposeImage
 
 MINARI_ID = re.compile(r"([\w-]+/)*[\w-]+-v\d+")
 
@@ -75,6 +74,8 @@ def fit_demonstrations(
         raise ValueError(f"{error}: record them in this environment, wrapped as it is here (Demonstrations.record)") from None
     if env is None:
         return demonstrations
+    from stable_baselines3.common.vec_env import VecTransposeImage, unwrap_vec_wrapper  # heavy: demonstrations do without
+
     transposes = unwrap_vec_wrapper(env, VecTransposeImage)  # SB3 wraps environments of images; they were recorded without
     if transposes is not None:
         columns = demonstrations.observations, demonstrations.next_observations
@@ -83,7 +84,7 @@ def fit_demonstrations(
     return demonstrations.rewarded_by(env)
 
 
-def _channels_first(rows: np.ndarray, env: VecTransposeImage) -> np.ndarray:
+def _channels_first(rows: np.ndarray, env: "VecTransposeImage") -> np.ndarray:
     """(N, flat size), as the wrapper shows them, of rows as its inner environment does."""
     observations = env.transpose_observations(split_observations(env.venv.observation_space, rows))
     return join_observations(observations, box_paths(env.observation_space))

@@ -22,7 +22,6 @@ from sb3_actpc.actpc import actpc as actpc_module
 from sb3_actpc.actpc import demonstration_replay
 from sb3_actpc.actpc.diagnostics import Diagnostics
 from sb3_actpc.actpc.self_imitation import distances_to_nearest
-from sb3_actpc.demonstrations import Demonstrations
 from sb3_actpc.ngc import NGCCircuit, settle_coupled
 from tests.actpc.agents import QUICK, differ, imitating, make, plain, weights_of
 from tests.actpc.envs import CountingEnv, demonstrations
