@@ -420,9 +420,9 @@ MUTANTS = [
         "self.n_pretraining_updates",
         f"{CLONES} -k saved",
     ),
-    Mutant("two good episodes are proof", TRIALS, "not self.is_clone and not self.is_ahead()", "False", f"{HABIT} -k luck"),
+    Mutant("two good episodes are proof", TRIALS, "not self.is_clone and not self.is_ahead()", "False", f"{HABIT} -k twice"),
     Mutant(
-        "noise judges clones", TRIALS, "not self.is_clone and not self.is_ahead()", "not self.is_ahead()", f"{HABIT} -k luck"
+        "noise judges clones", TRIALS, "not self.is_clone and not self.is_ahead()", "not self.is_ahead()", f"{HABIT} -k twice"
     ),
     Mutant(
         "a decent beginning is not enough",
@@ -448,6 +448,30 @@ MUTANTS = [
     ),
     Mutant(
         "noise before a second beginning", TRIALS, "[self.generation] * self.n_envs", "[0] * self.n_envs", f"{HABIT} -k second"
+    ),
+    Mutant(
+        "images as recorded", "demonstrations/fitting.py", "if transposes is not None:", "if False:", f"{LEARNS} -k images"
+    ),
+    Mutant(
+        "a resumed run compiles by what is left",
+        AGENT,
+        "compiled_update(self, self._total_timesteps)",
+        "compiled_update(self, total_timesteps)",
+        "tests/actpc/test_compiled.py -k resumed",
+    ),
+    Mutant(
+        "loaded signals are the old ones",
+        AGENT,
+        "self.signals if self.signals.settings == signals.settings else signals",
+        "self.signals",
+        f"{LEARNS} -k loaded_agents",
+    ),
+    Mutant(
+        "loaded signals have seen nothing",
+        AGENT,
+        "self.signals if self.signals.settings == signals.settings else signals",
+        "signals",
+        f"{LEARNS} -k loaded_agents",
     ),
     Mutant("early clones for ever", TRIALS, "else self.generation < EARLY_CLONES", "else True", f"{HABIT} -k half"),
     Mutant("noise between a candidate's first episodes", TRIALS, "is_quiet = begins or ", "is_quiet = ", f"{HABIT} -k turns"),
