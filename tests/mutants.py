@@ -450,7 +450,7 @@ MUTANTS = [
         "noise before a second beginning", TRIALS, "[self.generation] * self.n_envs", "[0] * self.n_envs", f"{HABIT} -k second"
     ),
     Mutant(
-        "images as recorded", "demonstrations/fitting.py", "if transposes is not None:", "if False:", f"{LEARNS} -k images"
+        "images are as recorded", "demonstrations/fitting.py", "if transposes is not None:", "if False:", f"{LEARNS} -k images"
     ),
     Mutant(
         "a resumed run compiles by what is left",
@@ -619,7 +619,14 @@ MUTANTS = [
     Mutant("the multiplier is let go", REGION, ".clamp_(*MULTIPLIERS)", "", REGIONS),
     Mutant("ties change nothing", REGION, '"tied": 2.0', '"tied": 1.0', REGIONS),
     Mutant("unpaid ties widen", AGENT, "verdict is not None and is_paid", "verdict is not None", f"{HABIT} -k resized"),
-    Mutant("old candidates count", TRIALS, " or self.generations[env] != self.generation", "", f"{HABIT} -k meanwhile"),
+    Mutant(
+        "old candidates count",
+        TRIALS,
+        'if one[1] == "habit" and verdict != "accepted"',
+        'if one[1] == "candidate" or verdict != "accepted"',
+        f"{HABIT} -k judged_meanwhile",
+    ),
+    Mutant("old habits count", TRIALS, ' and verdict != "accepted"]', "]", f"{HABIT} -k old_habit"),
     Mutant(
         "short episodes prove at once",
         TRIALS,
