@@ -91,6 +91,13 @@ def test_noisy_episodes_and_the_habits_take_turns_and_a_candidate_plays_until_it
     assert roles == [*habit, *habit, *tie, *habit, *tie, *habit, *tie]
 
 
+def test_after_its_first_episodes_a_candidate_takes_turns_with_noise():
+    """The learning actor's replay needs it: goals are found by noise."""
+    trials = Trials(1, habit_returns=[100.0, 100.0], tests_habit=False)
+    roles = [play(trials, paid)[0] for paid in (0.0, 90.0, 110.0, 0.0, 90.0, 0.0)]
+    assert roles == ["actor", "candidate", "candidate", "actor", "candidate", "actor"]
+
+
 @pytest.mark.parametrize(("length", "n"), [(PROOF_STEPS, 1), (PROOF_STEPS - 1, 2), (PROOF_STEPS // 4, 4), (1, ENOUGH_PROOFS)])
 def test_after_every_candidate_that_did_not_prove_itself_the_habit_is_tested_as_long_as_one(length, n):
     """However well it is known: what it was accepted for may have been luck."""
