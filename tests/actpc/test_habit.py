@@ -445,6 +445,9 @@ def test_clones_imitate_with_noise_and_the_learning_actor_without(monkeypatch):
         ActPC, "_sample_imitated", lambda self, n, noise=0.0: (seen.append(noise), original(self, n, noise))[1]
     )
     model = imitating(refresh_kwargs={"noise": 0.5}, policy_delay=1)
+    shown = model._features_of(model.expert.episodes, np.arange(len(model.expert)))
+    refreshed, cloned = (original(model, 64, *noise)[0][:, None] for noise in ((), (0.5,)))
+    assert [bool((one == shown).all(2).any(1).all()) for one in (refreshed, cloned)] == [True, False]
     model.learn(20)
     n = 4 * model.actor_warm_start  # of three members and the clone
     assert seen[:n] == [0.5] * n and seen[n:] and not any(seen[n:])
@@ -551,16 +554,18 @@ def test_a_clone_that_is_accepted_late_is_no_candidate_before_it_has_learned_aga
 
 
 def test_what_the_habit_is_paid_elsewhere_meanwhile_does_not_stop_the_trial_of_a_clone():
-    trials = Trials(2, imitated_return=100.0, n_clones=1, n_rejected=1)
+    trials = Trials(2, imitated_return=100.0, n_clones=1)
+    early = partial(play, trials, has_learned=False)
     for _ in range(2):
-        assert play(trials, 0.0, 3)[0] == "actor"
-        assert play(trials, 50.0) == ("habit", None)
-    play(trials, 0.0, 3, 1)  # its quiet episodes are the clone's
+        assert early(0.0, 3)[0] == "actor"
+        assert early(40.0) == ("habit", None)
+    early(0.0, 3, 1)  # its quiet episodes are the clone's
     assert trials.roles == ["actor", "candidate"] and trials.is_clone
     trials.roles[0], trials.quiet = "habit", [[0, "habit", None, 0], *trials.quiet]  # as if it had begun before
-    assert play(trials, 50.0) == ("habit", None)
-    assert play(trials, 90.0, env=1) == ("candidate", None)
-    assert play(trials, 90.0, env=0) == ("candidate", "accepted")
+    assert early(40.0) == ("habit", None)
+    assert early(90.0, env=1) == ("candidate", None)
+    assert trials.roles == ["candidate", "candidate"] and not trials.n_clones
+    assert early(90.0, env=0) == ("candidate", "accepted")
 
 
 # ---------------------------------------------------------------------- the agent
