@@ -94,7 +94,7 @@ MUTANTS = [
         CIRCUIT,
         "in range(1, self.n_settling_steps + 1):",
         "in range(1, self.n_settling_steps + 2):",
-        f"{SETTLING} -k one_step_is",
+        f"{SETTLING} -k 'one_step or further'",
     ),
     Mutant(
         "projection without the last bias",
