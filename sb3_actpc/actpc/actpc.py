@@ -79,6 +79,7 @@ PRETRAINING_INTERVAL = 1000  # updates between two lines about pre-training
 ACTOR_SLOWNESS = 4.0  # how much slower than the others the actor learns, after a warm start
 TARGET_NOISE_CLIP = 2.5  # standard deviations, as TD3's 0.5 for 0.2
 AVERAGING_RATE = 0.001  # per update, of the average of the actor that becomes the habit
+ENDLESS = 5000  # steps of an episode, after which a habit's user is warned
 CANDIDATE_AGE = 2000  # updates of a pressing critic before that average is a candidate: one that begins is wrong
 
 
@@ -641,6 +642,12 @@ class ActPC(OffPolicyAlgorithm):
         for env, (reward, done) in enumerate(zip(rewards, dones, strict=True)):
             self.trials.step(env, float(reward))
             if not done:
+                if self.trials.lengths[env] == ENDLESS:
+                    warnings.warn(
+                        f"an episode has gone on for {ENDLESS} steps: the habit is replaced by what whole episodes are paid, so "
+                        "end them with gymnasium.wrappers.TimeLimit",
+                        stacklevel=2,
+                    )
                 continue
             if self.trials.n_clones:
                 self.trials.imitated_return = imitated_return(self._imitated(), self.refresh.weighting)

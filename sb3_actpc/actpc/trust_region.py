@@ -36,6 +36,7 @@ class TrustRegion(nn.Module):
     outcomes: it widens with candidates that hold their own, and shrinks with those that do not.
 
     :param radius: at first
+    :raises ValueError: for one outside ``RADII``, within which outcomes move it
     """
 
     radius: th.Tensor
@@ -43,6 +44,9 @@ class TrustRegion(nn.Module):
     multiplier: th.Tensor
 
     def __init__(self, radius: float) -> None:
+        smallest, largest = RADII
+        if not smallest <= radius <= largest:
+            raise ValueError(f"trust_radius={radius!r} must be from {smallest:g} to {largest:g}, or 0 for a fixed pressure")
         super().__init__()
         self.register_buffer("radius", th.tensor(float(radius)))
         self.register_buffer("deviation", th.tensor(0.0))

@@ -877,6 +877,14 @@ def test_an_agent_without_its_environment_acts_by_its_habit(tmp_path):
     assert np.array_equal(loaded.predict(OBSERVATIONS)[0], model.predict(OBSERVATIONS)[0])
 
 
+def test_an_episode_that_does_not_end_is_named_once(monkeypatch):
+    monkeypatch.setattr(actpc_module, "ENDLESS", 30)
+    model = imitating(lambda: CountingEnv(lengths=(10, 1000)))
+    with pytest.warns(UserWarning, match="gone on for 30 steps: .* end them with gymnasium.wrappers.TimeLimit") as said:
+        model.learn(90)
+    assert len([one for one in said if "gone on" in str(one.message)]) == 1
+
+
 def test_random_actions_prove_nothing():
     """What comes before ``learning_starts`` is nobody's: an episode that begins there counts for nothing either."""
     model, roles = imitating(learning_starts=20), Roles()

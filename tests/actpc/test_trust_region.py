@@ -104,3 +104,9 @@ def test_what_is_returned_does_not_change_with_the_next_update():
     kept = float(first)
     region.regulate(ZEROS, ZEROS, WORTH, ONES)
     assert float(first) == kept < float(region.multiplier)
+
+
+@pytest.mark.parametrize("radius", [0.05, 2000.0])
+def test_a_radius_that_no_verdict_could_leave_is_named(radius):
+    with pytest.raises(ValueError, match=f"trust_radius={radius} must be from 0.1 to 1000, or 0 for a fixed pressure"):
+        TrustRegion(radius)
