@@ -644,8 +644,8 @@ class ActPC(OffPolicyAlgorithm):
             if not done:
                 if self.trials.lengths[env] == ENDLESS:
                     warnings.warn(
-                        f"an episode has gone on for {ENDLESS} steps: the habit is replaced by what whole episodes are paid, so "
-                        "end them with gymnasium.wrappers.TimeLimit",
+                        f"an episode has gone on for {ENDLESS} steps: the habit is replaced by what whole episodes are paid, "
+                        "so end them with gymnasium.wrappers.TimeLimit",
                         stacklevel=2,
                     )
                 continue
