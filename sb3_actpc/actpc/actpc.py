@@ -304,8 +304,9 @@ class ActPC(OffPolicyAlgorithm):
             raise ValueError("env=None: an environment or the id of one is needed, such as 'Pendulum-v1'")
         assert isinstance(self.action_space, spaces.Box)
         check_actions(self.action_space, self.action_noise)
+        # both here, as a loaded agent may be given others; of the same signals it keeps what their normalisers have seen
         with named_in_errors(f"refresh_kwargs={self.refresh_kwargs!r}"):
-            self.refresh = Refresh(**(self.refresh_kwargs or {}))  # here, as a loaded agent may be given others, and below too
+            self.refresh = Refresh(**(self.refresh_kwargs or {}))
         with named_in_errors(f"signal_kwargs={self.signal_kwargs!r}"):
             signals = InternalSignals(**(self.signal_kwargs or {}))
             self.signals = self.signals if self.signals.settings == signals.settings else signals
@@ -459,20 +460,24 @@ class ActPC(OffPolicyAlgorithm):
             memory.takes_all = is_weighted and self.refresh.own_episodes == "paid"
             if memory.episodes is not None:
                 memory.episodes.distances = None  # the demonstrations may be others by now
-        n_updates, needed = round(self._total_timesteps * updates_per_step(self)), self.critic_warmup + CANDIDATE_AGE
-        if self.n_envs > 1 and self.trials is not None and self.actor_pressure and n_updates <= needed:
-            warnings.warn(
-                f"{self._total_timesteps} steps of {self.n_envs} environments with gradient_steps={self.gradient_steps} are "
-                f"{n_updates} updates, and nothing but clones can become the habit before {needed}: gradient_steps=-1 makes "
-                "as many updates as there are steps",
-                stacklevel=3,
-            )
+        self._check_length()
         if self.verbose:
             print(self.describe())
         self.pretrain(between_updates(result[1]), progress_bar)
         self.start_time = time.time_ns()  # of the frames per second: pre-training has none
         self._compiled = self._compiled or compiled_update(self, self._total_timesteps)  # resumed, as straight
         return result
+
+    def _check_length(self) -> None:
+        """Warns of a run whose environments share too few updates for a learner to prove itself."""
+        n_updates, needed = round(self._total_timesteps * updates_per_step(self)), self.critic_warmup + CANDIDATE_AGE
+        if self.n_envs > 1 and self.trials is not None and self.actor_pressure and n_updates <= needed:
+            warnings.warn(
+                f"{self._total_timesteps} steps of {self.n_envs} environments with gradient_steps={self.gradient_steps} are "
+                f"{n_updates} updates, and nothing but clones can become the habit before {needed}: gradient_steps=-1 makes "
+                "as many updates as there are steps",
+                stacklevel=4,
+            )
 
     def describe(self) -> str:
         """What the reward is made of, from which demonstrations, and what is off; ``learn`` prints it with ``verbose=1``."""

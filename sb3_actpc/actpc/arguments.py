@@ -157,7 +157,7 @@ def check_actions(space: gym.spaces.Box, noise: ActionNoise | None) -> None:
     if not np.issubdtype(space.dtype, np.floating):  # SB3's buffer would cut scaled actions off to whole numbers
         raise ValueError(
             f"action_space={space} must have a floating dtype: wrap the environment in a gymnasium.ActionWrapper whose "
-            f"action_space is Box(..., dtype=np.float32), which rounds"
+            "action_space is Box(..., dtype=np.float32), which rounds"
         )
     fixed = np.argwhere(space.low >= space.high)
     if len(fixed):
