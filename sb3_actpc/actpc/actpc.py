@@ -79,6 +79,7 @@ PRETRAINING_INTERVAL = 1000  # updates between two lines about pre-training
 ACTOR_SLOWNESS = 4.0  # how much slower than the others the actor learns, after a warm start
 TARGET_NOISE_CLIP = 2.5  # standard deviations, as TD3's 0.5 for 0.2
 AVERAGING_RATE = 0.001  # per update, of the average of the actor that becomes the habit
+LARGEST_BOUND = 1e6  # of an observation; larger ones stand for none
 ENDLESS = 5000  # steps of an episode, after which a habit's user is warned
 CANDIDATE_AGE = 2000  # updates of a pressing critic before that average is a candidate: one that begins is wrong
 
@@ -148,7 +149,7 @@ class ActPC(OffPolicyAlgorithm):
     :param alpha_in: weight of the instrumental signal
     :param alpha_ext: weight of the task's reward (the paper's is 0 with demonstrations)
     :param signal_kwargs: keywords of :class:`~sb3_actpc.actpc.reward_signals.InternalSignals`: ``normalizer``,
-        ``normalization``, ``instrumental_form``, ``errors``; the defaults are the paper's
+        ``normalization`` (which by default keep the signals alive), ``instrumental_form``, ``errors``
     :param actor_pressure: weight of the critic's pressure on the actor; with a habit a trust region multiplies it
         (:mod:`sb3_actpc.actpc.trust_region`; ``pressure`` is the present product). 0 leaves refresh alone (cloning)
     :param scale_pressure: divide the pressure by the batch's mean absolute action-value (at least 1: one paid step)
@@ -158,7 +159,8 @@ class ActPC(OffPolicyAlgorithm):
     :param target_policy_noise: standard deviation of the noise on the target actor's action; 0 for none
     :param target_update_interval: the targets move after every update (1), or every so many environment steps; hard copies
         as in DQN are ``tau=1, target_update_interval=C``
-    :param observation_normalization: "none" (the paper) or "demonstrations" (their mean and standard deviation, fixed)
+    :param observation_normalization: "none" (the paper), "demonstrations" (their mean and standard deviation, fixed) or
+        "bounds" (those of the observation space, which must be finite, become -1 and 1)
     :param compile: run the updates of sweeping circuits as one graph of ``torch.compile`` (see
         :mod:`~sb3_actpc.actpc.compiled`): True, False or "auto", where the run is long enough to earn it
     :param policy_kwargs: keywords of :class:`~sb3_actpc.actpc.policies.ActPCPolicy`: ``net_arch``, ``n_critics``, ``habit``,
@@ -225,7 +227,7 @@ class ActPC(OffPolicyAlgorithm):
         bootstrap: Literal["joint", "literal"] = "joint",
         target_policy_noise: Weight = 0.2,
         target_update_interval: Annotated[int, Between(1)] = 1,
-        observation_normalization: Literal["none", "demonstrations"] | None = None,
+        observation_normalization: Literal["none", "demonstrations", "bounds"] | None = None,
         compile: Annotated[bool | str, check_compile] = "auto",
         policy_kwargs: Annotated[Settings | None, check_policy_kwargs] = None,
         stats_window_size: Size = 100,
@@ -322,6 +324,8 @@ class ActPC(OffPolicyAlgorithm):
             known = self.trials or Trials(1)  # of a loaded agent, whose environment may be another: what it paid is forgotten
             self.trials = Trials(self.n_envs, n_clones=min(known.n_clones, clones), begun_at=known.begun_at)
         self._setup_demonstrations()
+        if self.observation_normalization == "bounds":
+            self.actor.normalizer.fit(self._bounds())
         self.diagnostics = Diagnostics(self.policy)
         self._compiled: CompiledUpdate | None = None
 
@@ -399,6 +403,18 @@ class ActPC(OffPolicyAlgorithm):
         self.expert = DemonstrationReplay(demonstrations, self.observation_space, self.action_space, self.memory_history)
         if self.observation_normalization == "demonstrations" and not self.pretrained:
             self.actor.normalizer.fit(self._features_of(self.expert.episodes, np.arange(len(self.expert))))
+
+    def _bounds(self) -> th.Tensor:
+        """Features of the lowest and the highest observation, whose mean and standard deviation map them to -1 and 1."""
+        space, wrapper = self.observation_space, self._vec_normalize_env
+        bounds = np.stack([space.low, space.high]) if isinstance(space, spaces.Box) else np.full(1, np.inf)
+        if bounds.ndim != 2 or not np.all(np.abs(bounds) < LARGEST_BOUND) or (wrapper and wrapper.norm_obs):
+            raise ValueError(
+                f"observation_normalization='bounds' needs a flat Box whose bounds are below {LARGEST_BOUND:g}, and no "
+                f"VecNormalize(norm_obs=True): observation_space={space}; where there are no bounds, use "
+                "VecNormalize(env, norm_reward=False) with 'none'"
+            )
+        return self.inputs.features(self.inputs.observations(bounds))
 
     def _follow_demonstrations(self) -> None:
         """
@@ -994,6 +1010,11 @@ class ActPC(OffPolicyAlgorithm):
             if hasattr(model, name):
                 raise ValueError(of_another_version.format(f"before {later}"))
         return model
+
+    def set_parameters(self, *args: Any, **kwargs: Any) -> None:
+        """As in SB3; an agent that is given an actor which has imitated does not begin with imitation."""
+        super().set_parameters(*args, **kwargs)
+        self.pretrained = self.pretrained or bool(self.policy.spread.isfinite().all())
 
     def checkpoint_state(self) -> dict[str, Any]:
         """What a checkpoint (:mod:`sb3_actpc.checkpoints`) keeps beside SB3's state: plain values and arrays."""

@@ -86,9 +86,10 @@ Normalizer = RunningMaximum | Saturating | RunningQuantile
 class InternalSignals:
     """What both signals are made of, and what their normalisers have seen.
 
-    :param normalizer: "max" (running maximum, the paper), "saturating" (r / (r + 1)) or "quantile"
-    :param normalization: "stored" (once, when a transition is seen, the paper) or "sampled" (whenever it is replayed, by what
-        the normalisers have seen until then)
+    :param normalizer: "quantile" (:class:`RunningQuantile`), "saturating" (r / (r + 1)) or "max" (running maximum, the paper:
+        the first transitions set it, and signals soon are near zero)
+    :param normalization: "sampled" (whenever a transition is replayed, by what the normalisers have seen until then) or
+        "stored" (once, when it is seen, the paper)
     :param instrumental_form: see :func:`instrumental_reward`
     :param errors: the squared errors of "all" layers are summed (the paper) or of the "output" alone
     :raises ValueError: for another value
@@ -97,8 +98,8 @@ class InternalSignals:
     @checked
     def __init__(
         self,
-        normalizer: Literal["max", "saturating", "quantile"] = "max",
-        normalization: Literal["stored", "sampled"] = "stored",
+        normalizer: Literal["quantile", "saturating", "max"] = "quantile",
+        normalization: Literal["sampled", "stored"] = "sampled",
         instrumental_form: Literal["penalty", "unit"] = "penalty",
         errors: Literal["all", "output"] = "all",
     ) -> None:

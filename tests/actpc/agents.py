@@ -41,6 +41,7 @@ PLAIN: dict[str, Any] = {
     "alpha_ep": 1.0,
     "alpha_in": 1.0,
     "alpha_ext": 1.0,
+    "signal_kwargs": {"normalizer": "max", "normalization": "stored"},
 }
 # the constructor's defaults, but for sizes: a warm start and a warm-up of no time
 QUICK: dict[str, Any] = {**SMALL, "learning_starts": None, "actor_warm_start": 5, "critic_warmup": 5}

@@ -95,7 +95,7 @@ def test_output_errors_alone_give_smaller_signals():
 
 @pytest.mark.parametrize("normalizer", ["max", "saturating", "quantile"])
 def test_every_normalizer_keeps_signals_in_their_range(normalizer):
-    model = make(demonstrations=demonstrations(), signal_kwargs={"normalizer": normalizer})
+    model = make(demonstrations=demonstrations(), signal_kwargs={"normalizer": normalizer, "normalization": "stored"})
     model.learn(60)
     assert 0 < model.replay_buffer.epistemic[:60].max() <= 1 and -1 <= model.replay_buffer.instrumental[:60].min() < 0
 
@@ -121,7 +121,7 @@ def test_signals_normalised_when_sampled_follow_the_maximum_that_was_seen_last()
     for normalization in ("stored", "sampled"):
         models[normalization] = make(
             demonstrations=demonstrations(),
-            signal_kwargs={"normalization": normalization},
+            signal_kwargs={"normalizer": "max", "normalization": normalization},
             learning_starts=1000,
             alpha_in=0.0,
             alpha_ext=0.0,
@@ -142,7 +142,7 @@ def test_signals_normalised_when_sampled_follow_the_maximum_that_was_seen_last()
 
 @pytest.mark.parametrize("form", ["penalty", "unit"])
 def test_demonstrated_transitions_are_paid_in_the_same_form(form):
-    signals = {"instrumental_form": form}
+    signals = {"instrumental_form": form, "normalizer": "max"}
     model = make(demonstrations=demonstrations(), demonstration_fraction=0.5, signal_kwargs=signals, alpha_ep=0.0)
     model.learn(30)
     paid = model.expert.instrumental
@@ -660,6 +660,21 @@ def test_observations_are_normalised_by_the_demonstrations_and_do_not_drift():
     assert th.allclose(features.std(0, correction=0), th.ones(3), atol=1e-4)
     model.learn(60)
     assert th.equal(features, model.inputs.features(th.as_tensor(data.observations)))
+
+
+def test_observations_are_normalised_by_their_bounds():
+    """Position in [-1.2, 0.6], velocity in [-0.07, 0.07]."""
+    model = ActPC("MlpPolicy", "MountainCarContinuous-v0", **plain(observation_normalization="bounds"))
+    seen = th.tensor([[-1.2, 0.07], [-0.3, 0.0], [0.15, -0.035]])
+    assert th.allclose(model.inputs.features(seen), th.tensor([[-1.0, 1.0], [0.0, 0.0], [0.5, -0.5]]), atol=1e-6)
+
+
+def test_bounds_that_are_not_there_cannot_normalise():
+    with pytest.raises(ValueError, match="needs a flat Box whose bounds are below"):
+        make(observation_normalization="bounds")
+    normalised = VecNormalize(DummyVecEnv([lambda: gym.make("MountainCarContinuous-v0")]))
+    with pytest.raises(ValueError, match="no VecNormalize"):
+        ActPC("MlpPolicy", normalised, **plain(observation_normalization="bounds"))
 
 
 # ---------------------------------------------------------------------- working memory

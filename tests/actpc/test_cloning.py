@@ -219,6 +219,20 @@ def test_a_clone_in_the_making_keeps_the_sizes_that_it_was_begun_with(n_done, ot
     assert other.n_pretraining_updates == 20
 
 
+def test_parameters_that_have_imitated_are_not_trained_over():
+    """SB3's own way to hand an actor on: before, the warm start of the agent that took them trained another in its place."""
+    model = imitating()
+    model.pretrain()
+    other = imitating(seed=1)
+    other.set_parameters(model.get_parameters())
+    other.pretrain()
+    for mine, theirs in zip(model.actor.circuit.state_dict().values(), other.actor.circuit.state_dict().values(), strict=True):
+        assert th.equal(mine, theirs)
+    untrained = imitating()
+    untrained.set_parameters(imitating(seed=1).get_parameters())
+    assert not untrained.pretrained
+
+
 def test_without_a_warm_start_there_is_nothing_to_measure():
     model = imitating(actor_warm_start=0)
     model.pretrain()

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch as th
 
-from sb3_actpc.actpc.reward_signals import RunningQuantile
+from sb3_actpc.actpc.reward_signals import InternalSignals, RunningQuantile
 from tests.actpc.agents import make
 from tests.actpc.envs import demonstrations
 
@@ -33,6 +33,17 @@ def test_the_running_quantile_is_passed_by_as_many_values_as_it_says(quantile):
     for value in drawn:
         normalizer(np.array([value]))
     assert np.mean(drawn <= normalizer.estimate) == pytest.approx(quantile, abs=0.05)
+
+
+def test_signals_outlive_the_surprises_of_the_first_steps_by_default():
+    """The first transition surprises a thousand times as much as all that follow: by the paper's maximum nothing is new again,
+    while the quantile falls by exp(-0.02 * 0.1) a step, and is where they are after 3454."""
+    first, later = np.full(1, 1000.0), np.ones(1)
+    for settings, expected in (({}, 1.0), ({"normalizer": "max", "normalization": "stored"}, 0.001)):
+        signals = InternalSignals(**settings)
+        for raw in (first, *[later] * 4000):
+            signals.score(raw, np.zeros(1), alpha_ep=1.0, alpha_in=0.0)
+        assert signals.paid[0](later) == pytest.approx(expected, rel=0.02)
 
 
 def test_demonstrated_steps_are_rewarded_by_surprise_and_punished_for_leaving_the_prior():
