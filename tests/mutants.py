@@ -304,6 +304,27 @@ MUTANTS = [
         "_copy(self.actor.circuit, self.actor.habit",
         f"{EQUATIONS} -k warm_start",
     ),
+    Mutant(
+        "an actor that was given is trained over",
+        AGENT,
+        "self.pretrained = self.pretrained or bool(self.policy.spread.isfinite().all())",
+        "pass",
+        f"{CLONES} -k parameters",
+    ),
+    Mutant(
+        "parameters of an agent that has not imitated count as pre-trained",
+        AGENT,
+        "self.pretrained or bool(self.policy.spread.isfinite().all())",
+        "True",
+        f"{CLONES} -k 'parameters or saved_within'",
+    ),
+    Mutant(
+        "the lowest observation is both bounds",
+        AGENT,
+        "np.stack([space.low, space.high])",
+        "np.stack([space.low, space.low])",
+        f"{LEARNS} -k by_their_bounds",
+    ),
     Mutant("the agent ignores the nudge", AGENT, "memory, self.policy.nudge)", "memory)", f"{LEARNS} -k nudge"),
     Mutant(
         "pressure from the first update on",
@@ -693,6 +714,13 @@ MUTANTS = [
         "else state.errors[-1:]",
         "else state.errors",
         f"{LEARNS} -k output_errors",
+    ),
+    Mutant(
+        "the paper's maximum is the default: signals die",
+        SIGNALS,
+        '"saturating", "max"] = "quantile"',
+        '"saturating", "max"] = "max"',
+        EQUATIONS,
     ),
     Mutant(
         "the low quantile in the place of the high",
