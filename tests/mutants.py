@@ -307,16 +307,16 @@ MUTANTS = [
     Mutant(
         "an actor that was given is trained over",
         AGENT,
-        "self.pretrained = self.pretrained or bool(self.policy.spread.isfinite().all())",
-        "pass",
+        "return bool(self.policy.has_imitated)",
+        "return self.num_timesteps > 0",
         f"{CLONES} -k parameters",
     ),
     Mutant(
-        "parameters of an agent that has not imitated count as pre-trained",
+        "what a habit was paid is said of one that was given in its place",
         AGENT,
-        "self.pretrained or bool(self.policy.spread.isfinite().all())",
-        "True",
-        f"{CLONES} -k 'parameters or saved_within'",
+        "super().set_parameters(*args, **kwargs)\n        self._forget_trials()",
+        "super().set_parameters(*args, **kwargs)",
+        f"{CLONES} -k parameters",
     ),
     Mutant(
         "the lowest observation is both bounds",
@@ -437,8 +437,8 @@ MUTANTS = [
     Mutant(
         "a warm start that was saved goes on",
         AGENT,
-        "min(self.n_pretraining_updates, n_prior)",
-        "self.n_pretraining_updates",
+        "self.n_cloning_updates = 0  # an agent",
+        "pass  # an agent",
         f"{CLONES} -k saved",
     ),
     Mutant("two good episodes are proof", TRIALS, "not self.is_clone and not self.is_ahead()", "False", f"{HABIT} -k twice"),

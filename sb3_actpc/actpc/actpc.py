@@ -17,7 +17,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule, TrainFreq
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 from tqdm import tqdm
 
@@ -127,6 +127,7 @@ class ActPC(OffPolicyAlgorithm):
         none), and those of SB3's class
     :param optimize_memory_usage: as in SB3
     :param n_steps: length of n-step returns; 1 by default where they cannot be had (hindsight, ``optimize_memory_usage``)
+        or mean nothing (``bootstrap="literal"``)
     :param settling: "scheduled" (one ordered sweep of the errors, the zero-divergence schedule or Z-IL of the
         predictive-coding literature) or "iterative" (the paper: K steps of eq. 1)
     :param exploration_noise: standard deviation of the Gaussian noise on the actions in [-1, 1]; with demonstrations at most
@@ -242,7 +243,8 @@ class ActPC(OffPolicyAlgorithm):
         def default(given: Any, with_demonstrations: Any, without: Any) -> Any:
             return given if given is not None else with_demonstrations if shown else without
 
-        n_steps = default(n_steps, 1 if relabels(replay_buffer_class) or optimize_memory_usage else 5, 1)
+        of_one_step = relabels(replay_buffer_class) or optimize_memory_usage or bootstrap == "literal"
+        n_steps = default(n_steps, 1 if of_one_step else 5, 1)
         super().__init__(
             policy,
             env,
@@ -293,7 +295,7 @@ class ActPC(OffPolicyAlgorithm):
         self.compile = compile
         self.signal_kwargs = signal_kwargs
         self.signals = InternalSignals()
-        self.pretrained, self.n_pretraining_updates = False, 0
+        self.n_cloning_updates = 0
         self.cloning: Cloning | None = None  # while the actor becomes a clone
         self.trials: Trials | None = None
         if _init_setup_model:
@@ -324,8 +326,7 @@ class ActPC(OffPolicyAlgorithm):
             known = self.trials or Trials(1)  # of a loaded agent, whose environment may be another: what it paid is forgotten
             self.trials = Trials(self.n_envs, n_clones=min(known.n_clones, clones), begun_at=known.begun_at)
         self._setup_demonstrations()
-        if self.observation_normalization == "bounds":
-            self.actor.normalizer.fit(self._bounds())
+        self._fit_to_bounds()
         self.diagnostics = Diagnostics(self.policy)
         self._compiled: CompiledUpdate | None = None
 
@@ -343,7 +344,12 @@ class ActPC(OffPolicyAlgorithm):
 
     def _make_replay_buffer(self) -> SignalReplay:
         kind = combined_buffer_class(self.replay_buffer_class, self.observation_space, self.n_steps)
-        kwargs = {"history": self.memory_history, "n_steps": self.n_steps, "gamma": self.gamma, **self.replay_buffer_kwargs}
+        kwargs: dict[str, Any] = {"history": self.memory_history, "n_steps": self.n_steps, "gamma": self.gamma}
+        for name in kwargs.keys() & self.replay_buffer_kwargs:
+            raise ValueError(
+                f"replay_buffer_kwargs has {name!r}: give it to the agent (history: policy_kwargs['memory_history'])"
+            )
+        kwargs |= self.replay_buffer_kwargs
         if issubclass(kind, HerReplayBuffer):
             assert self.env is not None, "You must pass an environment when using `HerReplayBuffer`"  # as SB3 does
             kwargs["env"] = self.env
@@ -396,16 +402,19 @@ class ActPC(OffPolicyAlgorithm):
                 self.demonstrations, self.env, self.observation_space, self.action_space, *limits
             )
         except FileNotFoundError:
-            if not self.pretrained:
+            if not (self.pretrained or self.num_timesteps or self.n_cloning_updates):
                 raise
             return  # a trained agent acts without them; ``learn`` says what is missing
         assert isinstance(self.action_space, spaces.Box)
         self.expert = DemonstrationReplay(demonstrations, self.observation_space, self.action_space, self.memory_history)
         if self.observation_normalization == "demonstrations" and not self.pretrained:
+            self.actor.normalizer.begin()
             self.actor.normalizer.fit(self._features_of(self.expert.episodes, np.arange(len(self.expert))))
 
-    def _bounds(self) -> th.Tensor:
-        """Features of the lowest and the highest observation, whose mean and standard deviation map them to -1 and 1."""
+    def _fit_to_bounds(self) -> None:
+        """The mean and standard deviation of the lowest and the highest observation map them to -1 and 1."""
+        if self.observation_normalization != "bounds":
+            return
         space, wrapper = self.observation_space, self._vec_normalize_env
         bounds = np.stack([space.low, space.high]) if isinstance(space, spaces.Box) else np.full(1, np.inf)
         if bounds.ndim != 2 or not np.all(np.abs(bounds) < LARGEST_BOUND) or (wrapper and wrapper.norm_obs):
@@ -414,7 +423,8 @@ class ActPC(OffPolicyAlgorithm):
                 f"VecNormalize(norm_obs=True): observation_space={space}; where there are no bounds, use "
                 "VecNormalize(env, norm_reward=False) with 'none'"
             )
-        return self.inputs.features(self.inputs.observations(bounds))
+        self.actor.normalizer.begin()
+        self.actor.normalizer.fit(self.inputs.features(self.inputs.observations(bounds)))
 
     def _follow_demonstrations(self) -> None:
         """
@@ -435,10 +445,22 @@ class ActPC(OffPolicyAlgorithm):
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         super().set_env(env, force_reset)
-        if self.trials is not None:  # another environment may pay for other steps
-            self.trials = Trials(self.n_envs, n_clones=self.trials.n_clones, begun_at=self.trials.begun_at)
+        self._forget_trials()  # another environment may pay for other steps
+        if isinstance(self.replay_buffer, HerReplayBuffer):  # SB3 goes on paying by the old one
+            assert self.env is not None
+            self.replay_buffer.env = self.env
         if self.demonstrations is not None:
             self._setup_demonstrations()
+        self._fit_to_bounds()
+
+    def _forget_trials(self) -> None:
+        if self.trials is not None:
+            self.trials = Trials(self.n_envs, n_clones=self.trials.n_clones, begun_at=self.trials.begun_at)
+
+    @property
+    def pretrained(self) -> bool:
+        """Whether the actor has imitated the demonstrations (:meth:`pretrain`), or was given synapses that have."""
+        return bool(self.policy.has_imitated)
 
     @property
     def inputs(self) -> CircuitInputs:
@@ -470,7 +492,10 @@ class ActPC(OffPolicyAlgorithm):
         result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
         self._check_observations(self._last_obs)
         self._follow_demonstrations()
-        memory = None if self.replay_buffer is None else self.replay_buffer.self_imitation
+        assert self.replay_buffer is not None
+        # one discount and one length of returns for what is replayed and what is shown, of a loaded buffer too
+        self.replay_buffer.gamma, self.replay_buffer.n_steps = self.gamma, self.n_steps
+        memory = self.replay_buffer.self_imitation
         if memory is not None:
             is_weighted = self.expert is not None and is_by_return([self.expert.episodes], self.refresh.weighting)
             memory.takes_all = is_weighted and self.refresh.own_episodes == "paid"
@@ -485,13 +510,20 @@ class ActPC(OffPolicyAlgorithm):
         return result
 
     def _check_length(self) -> None:
-        """Warns of a run whose environments share too few updates for a learner to prove itself."""
-        n_updates, needed = round(self._total_timesteps * updates_per_step(self)), self.critic_warmup + CANDIDATE_AGE
-        if self.n_envs > 1 and self.trials is not None and self.actor_pressure and n_updates <= needed:
+        """Warns of a run with too few updates for a learner to prove itself, and of a signal that nobody makes."""
+        if self.alpha_in and self.demonstrations is None:
             warnings.warn(
-                f"{self._total_timesteps} steps of {self.n_envs} environments with gradient_steps={self.gradient_steps} are "
-                f"{n_updates} updates, and nothing but clones can become the habit before {needed}: gradient_steps=-1 makes "
-                "as many updates as there are steps",
+                f"alpha_in={self.alpha_in:g} pays nothing without demonstrations=, which the prior learns from: rewards are "
+                f"alpha_ext={self.alpha_ext:g} times the task's and alpha_ep={self.alpha_ep:g} times the epistemic signal",
+                stacklevel=4,
+            )
+        n_updates, needed = round(self._total_timesteps * updates_per_step(self)), self.critic_warmup + CANDIDATE_AGE
+        if updates_per_step(self) < 1.0 and self.trials is not None and self.actor_pressure and n_updates <= needed:
+            every = self.train_freq.frequency if isinstance(self.train_freq, TrainFreq) else self.train_freq
+            warnings.warn(
+                f"{self._total_timesteps} steps of n_envs={self.n_envs} with gradient_steps={self.gradient_steps} and "
+                f"train_freq={every} are {n_updates} updates, and nothing but clones can become the habit before {needed}: "
+                "gradient_steps=-1 makes as many updates as there are steps",
                 stacklevel=4,
             )
 
@@ -538,7 +570,9 @@ class ActPC(OffPolicyAlgorithm):
         :param before_update: called before each update
         :param progress_bar: show one
         """
-        if self.pretrained or self.expert is None:
+        # without a weight the prior has no role
+        n_prior = self.prior_updates - int(self.policy.n_prior_updates) if self.alpha_in else 0
+        if self.expert is None or (self.pretrained and n_prior <= 0):
             return
         if self._vec_normalize_env is not None and self._vec_normalize_env.norm_obs:
             warnings.warn(
@@ -546,28 +580,27 @@ class ActPC(OffPolicyAlgorithm):
                 "observation_normalization='demonstrations'",
                 stacklevel=2,
             )
-        n_prior = self.prior_updates if self.alpha_in else 0  # without a weight the prior has no role
-        if self.cloning is None:  # of an agent that was saved meanwhile it begins again: its teachers are not in the file
-            self.n_pretraining_updates = min(self.n_pretraining_updates, n_prior)
+        if self.cloning is None and not self.pretrained:
+            self.n_cloning_updates = 0  # an agent that was saved meanwhile begins again: its teachers are not in the file
             self.cloning = self._clone_into(self.actor.circuit)
-        n_updates = n_prior + len(self.cloning)
-        updates: Iterable[int] = range(self.n_pretraining_updates, n_updates)
-        if progress_bar:
-            updates = tqdm(updates, "pre-training", n_updates, initial=self.n_pretraining_updates)
-        for update in updates:
+        n_updates = max(n_prior, 0) + (0 if self.cloning is None else len(self.cloning) - self.n_cloning_updates)
+        for update in tqdm(range(n_updates), "pre-training", disable=not progress_bar):
             if self.verbose and update % PRETRAINING_INTERVAL == 0:
                 print(f"pre-training: update {update} of {n_updates}")
             before_update()
             if update < n_prior:
                 self._update_prior(self.policy.batch_size_of("prior", self.batch_size))
-            else:
-                self.cloning.update(update - n_prior)
-            self.n_pretraining_updates += 1
+                self.policy.n_prior_updates.add_(1)
+            elif self.cloning is not None:
+                self.cloning.update(self.n_cloning_updates)
+                self.n_cloning_updates += 1
+        if self.pretrained:
+            return
         self.cloning = None
         self._start_from(self.actor.circuit)
         if self.actor_warm_start and self.trials is not None:
             self.trials.n_clones = self.refresh.n_clones - 1
-        self.pretrained = True
+        self.policy.has_imitated.fill_(True)
 
     def _clone_into(self, circuit: NGCCircuit) -> Cloning:
         """What makes an actor's circuit a clone of whatever is imitated by now."""
@@ -621,7 +654,7 @@ class ActPC(OffPolicyAlgorithm):
 
     def _exploration(self, shape: tuple[int, ...]) -> np.ndarray:
         """Gaussian noise, no wider in any dimension than the demonstrations spread around the warm-started actor."""
-        scale = self.policy.spread.clamp_max(self.exploration_noise).cpu().numpy().reshape(shape[1:])
+        scale = self.policy.spread.clamp_max(float(self.exploration_noise)).cpu().numpy().reshape(shape[1:])
         return np.random.normal(size=shape).astype(np.float32) * scale
 
     def _imitation_residuals(self) -> th.Tensor:
@@ -795,7 +828,7 @@ class ActPC(OffPolicyAlgorithm):
         if self.expert is None or not self.demonstration_fraction or not any(self.reward_weights[1:]):
             return
         if self._n_updates % EXPERT_SIGNALS_INTERVAL == 1 or not self.expert.has_signals:
-            self.expert.refresh_signals(self._raw_signals, self.inputs, *self.signals.paid)
+            self.expert.refresh_signals(self._raw_signals, self.inputs, *self.signals.rescored)
 
     def _sample_batch(self, batch_size: int) -> Batch:
         """Replayed transitions, the newest among them, then the share that comes from the demonstrations."""
@@ -807,9 +840,10 @@ class ActPC(OffPolicyAlgorithm):
         replayed = self.replay_buffer.sample(largest - n_expert, self._vec_normalize_env, signals)
         batch = inputs.replayed(replayed, weights, self.gamma)
         internal = batch.rewards - weights[0] * replayed.rewards
-        self.diagnostics.follow(internal_reward=internal.mean, task_reward=replayed.rewards.mean)
+        if len(internal):
+            self.diagnostics.follow(internal_reward=internal.mean, task_reward=replayed.rewards.mean)
         if n_expert and self.expert is not None:
-            batch = batch.join(self.expert.sample(n_expert, inputs, weights, self.gamma, self.n_steps))
+            batch = batch.join(self.expert.sample(n_expert, inputs, weights, self.gamma, self.n_steps, signals))
         if min(sizes) == largest:
             return batch
         # circuits with a smaller batch take its first rows: the newest, then a fair mixture of the rest
@@ -1012,16 +1046,15 @@ class ActPC(OffPolicyAlgorithm):
         return model
 
     def set_parameters(self, *args: Any, **kwargs: Any) -> None:
-        """As in SB3; an agent that is given an actor which has imitated does not begin with imitation."""
+        """As in SB3. What a habit was paid says nothing of one that is given in its place."""
         super().set_parameters(*args, **kwargs)
-        self.pretrained = self.pretrained or bool(self.policy.spread.isfinite().all())
+        self._forget_trials()
 
     def checkpoint_state(self) -> dict[str, Any]:
         """What a checkpoint (:mod:`sb3_actpc.checkpoints`) keeps beside SB3's state: plain values and arrays."""
         expert = self.expert
         return {
-            "pretrained": self.pretrained,
-            "n_pretraining_updates": self.n_pretraining_updates,
+            "n_cloning_updates": self.n_cloning_updates,
             "cloning": None if self.cloning is None else self.cloning.checkpoint_state(),
             "rollout_state": self._rollout_state,
             "rollout_starts": self._rollout_starts,
@@ -1045,7 +1078,7 @@ class ActPC(OffPolicyAlgorithm):
             )
         if self.expert is not None:
             self.expert.epistemic, self.expert.instrumental, self.expert.has_signals = signals
-        self.pretrained, self.n_pretraining_updates = state["pretrained"], state["n_pretraining_updates"]
+        self.n_cloning_updates = state["n_cloning_updates"]
         self.cloning = None
         if state["cloning"] is not None:
             self.cloning = self._clone_into(self.actor.circuit)
@@ -1086,9 +1119,7 @@ class ActPC(OffPolicyAlgorithm):
         """
         with_demonstrations = keywords.get("demonstrations") is not None
         needing = (*NEED_DEMONSTRATIONS, "observation_normalization")
-        model = load_weights(cls, path, env, without=() if with_demonstrations else needing, **keywords)
-        model.pretrained = True  # the weights hold what the demonstrations taught
-        return model
+        return load_weights(cls, path, env, without=() if with_demonstrations else needing, **keywords)
 
     def _excluded_save_params(self) -> list[str]:
         aliases = ["actor", "critic", "generator", "prior", "actor_target", "critic_target"]

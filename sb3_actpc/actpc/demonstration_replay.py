@@ -9,7 +9,7 @@ import torch as th
 from gymnasium import spaces
 
 from sb3_actpc.actpc.features import Batch, CircuitInputs
-from sb3_actpc.actpc.reward_signals import Normalize
+from sb3_actpc.actpc.reward_signals import STORED, Normalize
 from sb3_actpc.actpc.self_imitation import Episodes
 from sb3_actpc.demonstrations.dataset import Demonstrations
 from sb3_actpc.demonstrations.rows import split_observations
@@ -50,20 +50,25 @@ class DemonstrationReplay:
     def __len__(self) -> int:
         return len(self.demonstrations)
 
-    def sample(
-        self, n: int, inputs: CircuitInputs, weights: tuple[float, float, float], gamma: float, n_steps: int = 1
-    ) -> Batch:
+    def sample(self, n: int, *how: Any) -> Batch:
         """``n`` transitions drawn uniformly; see :meth:`batch`."""
-        return self.batch(np.random.randint(0, len(self), size=n), inputs, weights, gamma, n_steps)
+        return self.batch(np.random.randint(0, len(self), size=n), *how)
 
     def batch(
-        self, rows: np.ndarray, inputs: CircuitInputs, weights: tuple[float, float, float], gamma: float, n_steps: int = 1
+        self,
+        rows: np.ndarray,
+        inputs: CircuitInputs,
+        weights: tuple[float, float, float],
+        gamma: float,
+        n_steps: int = 1,
+        signals: tuple[Normalize, Normalize] | None = None,
     ) -> Batch:
         """:param rows: (B,) which transitions
         :param inputs: turns observations into features
         :param weights: (α_ext, α_ep, α_in)
         :param gamma: discount
         :param n_steps: length of the returns, which end with the episode
+        :param signals: what the stored signals pay, epistemic and instrumental; None for themselves
         :return: the transitions as the circuits see them
         """
         samples = self.episodes.take(rows, self.history)
@@ -72,7 +77,7 @@ class DemonstrationReplay:
         window = rows[:, None] + steps
         counts = window < self.ends[rows][:, None]
         last = rows + counts.sum(1) - 1
-        rewards = self._rewards(window.clip(max=len(self) - 1), inputs, weights) * counts * gamma**steps
+        rewards = self._rewards(window.clip(max=len(self) - 1), inputs, weights, signals or STORED) * counts * gamma**steps
         next_features = bootstrap_features = self._next_features(last, inputs)
         next_past: tuple[Any, Any] = (None, None)
         if n_steps > 1:
@@ -94,12 +99,21 @@ class DemonstrationReplay:
     def _next_features(self, rows: np.ndarray, inputs: CircuitInputs) -> th.Tensor:
         return inputs.features(inputs.observations(self.next_observations.take(rows).observations))
 
-    def _rewards(self, rows: np.ndarray, inputs: CircuitInputs, weights: tuple[float, float, float]) -> np.ndarray:
+    def _rewards(
+        self,
+        rows: np.ndarray,
+        inputs: CircuitInputs,
+        weights: tuple[float, float, float],
+        signals: tuple[Normalize, Normalize],
+    ) -> np.ndarray:
         """The weighted sum of the three parts at some rows, in the shape of ``rows``."""
         task = self.demonstrations.rewards[rows]
         if inputs.vec_normalize is not None:
             task = inputs.vec_normalize.normalize_reward(task)
-        return weights[0] * task + weights[1] * self.epistemic[rows] + weights[2] * self.instrumental[rows]
+        epistemic, instrumental = (
+            pays(kind[rows]) for pays, kind in zip(signals, (self.epistemic, self.instrumental), strict=True)
+        )
+        return weights[0] * task + weights[1] * epistemic + weights[2] * instrumental
 
     def check_scale(self, rewards: np.ndarray) -> None:
         """
@@ -129,7 +143,7 @@ class DemonstrationReplay:
         self, raw_signals: RawSignals, inputs: CircuitInputs, epistemic: Normalize, instrumental: Normalize
     ) -> None:
         """Signals of all transitions under the present generator and prior: from the summed squared errors of both circuits,
-        by (features, actions, next features, memory), and what each of the two pays."""
+        by (features, actions, next features, memory), and what is stored of each of the two."""
         for start in range(0, len(self), 1024):
             rows = np.arange(start, min(start + 1024, len(self)))
             batch = self.batch(rows, inputs, (0.0, 0.0, 0.0), 0.0)

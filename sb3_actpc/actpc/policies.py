@@ -29,7 +29,7 @@ from sb3_actpc.actpc.arguments import (
     checked,
 )
 from sb3_actpc.actpc.trust_region import TrustRegion
-from sb3_actpc.ngc import NGCCircuit, WorkingMemory
+from sb3_actpc.ngc import NGCCircuit, WorkingMemory, check_agreement
 from sb3_actpc.ngc.activations import ACTIVATIONS
 from sb3_actpc.utils.checks import LARGEST_SIZE, check_kinds, named_in_errors
 
@@ -53,8 +53,14 @@ class ObservationNormalizer(nn.Module):
         self.register_buffer("scale", th.ones(n_features))
         self.register_buffer("clip", th.full((), float("inf")))
 
+    def begin(self) -> None:
+        """As before the first fit: features come as they are."""
+        self.mean.zero_()
+        self.scale.fill_(1.0)
+        self.clip.fill_(float("inf"))
+
     def fit(self, features: th.Tensor) -> None:
-        """:param features: (N, n_features) whose mean and standard deviation are used from now on"""
+        """:param features: (N, n_features), not normalised, whose mean and standard deviation are used from now on"""
         self.mean.copy_(features.mean(0))
         std = features.std(0, correction=0)
         self.scale.copy_(th.where(std > 1e-4, 1.0 / std, 1.0))  # a feature that never changed says nothing of its scale
@@ -276,6 +282,8 @@ class ActPCPolicy(BasePolicy):
     actor: ActPCActor
     action_space: spaces.Box
     spread: th.Tensor
+    has_imitated: th.Tensor
+    n_prior_updates: th.Tensor
 
     @checked
     def __init__(
@@ -347,10 +355,14 @@ class ActPCPolicy(BasePolicy):
         )
         self.generator = self._circuit("generator", n_features + n_actions, n_features, n_memory=n_memory)
         self.prior = self._circuit("prior", n_features, n_features, n_memory=n_memory)
+        check_agreement(self.actor.circuit, self.critic.first())
         self.actor_target = copy.deepcopy(self.actor.circuit)
         self.critic_target = copy.deepcopy(self.critic)
         # of the demonstrated actions around their clone; unknown before there is one
         self.register_buffer("spread", th.full((n_actions,), th.inf))
+        # what the demonstrations have taught so far: it goes where the synapses go
+        self.register_buffer("has_imitated", th.tensor(False))
+        self.register_buffer("n_prior_updates", th.tensor(0))
         # the slow average of the learning actor, and a frozen copy of it that has to prove itself
         self.actor_average = copy.deepcopy(self.actor.circuit) if self.habit else None
         self.candidate = copy.deepcopy(self.actor.circuit) if self.habit else None
@@ -405,6 +417,10 @@ class ActPCPolicy(BasePolicy):
         kwargs = dict(self.optimizer_kwargs)
         if self.optimizer_class is th.optim.Adam:
             kwargs.setdefault("fused", True)  # one kernel for all synapses
+        if own and not start:
+            raise ValueError(
+                f"{name}_kwargs has learning_rate={own}, a multiple of the agent's, which begins at 0: begin above"
+            )
         with named_in_errors(f"optimizer_kwargs={self.optimizer_kwargs!r}"):
             return self.optimizer_class(groups, **kwargs)
 

@@ -130,6 +130,11 @@ class InternalSignals:
         """What stored signals pay when they are replayed."""
         return self.paid if self.normalization == "sampled" else STORED
 
+    @property
+    def rescored(self) -> tuple[Normalize, Normalize]:
+        """What is stored of signals that are computed anew."""
+        return STORED if self.normalization == "sampled" else self.paid
+
     def checkpoint_state(self) -> list[dict[str, Any]]:
         """What the normalisers have seen."""
         return [dict(vars(self.epistemic)), dict(vars(self.instrumental))]

@@ -220,12 +220,15 @@ class SelfImitationMemory:
         if self.episodes is not None:
             names = [field.name for field in fields(self.episodes) if field.name != "distances"]  # they are measured anew
             episodes = {name: getattr(self.episodes, name) for name in names}
-        return {"returns": list(self.returns), "lengths": list(self.lengths), "episodes": episodes}
+        ended = [self._n_ended, None if self._n_ended == 0 else self._best_ended]
+        return {"returns": list(self.returns), "lengths": list(self.lengths), "episodes": episodes, "ended": ended}
 
     def restore_checkpoint_state(self, state: dict[str, Any]) -> None:
         """:param state: what :meth:`checkpoint_state` returned"""
         self.returns, self.lengths = list(state["returns"]), list(state["lengths"])
         self.episodes = None if state["episodes"] is None else Episodes(**state["episodes"])
+        self._n_ended, best = state["ended"]
+        self._best_ended = -np.inf if best is None else best
 
 
 def is_by_return(parts: list[Episodes], weighting: Weighting) -> bool:

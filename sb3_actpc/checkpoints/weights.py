@@ -21,7 +21,7 @@ from sb3_actpc.utils.files import atomic_write
 SelfAlgorithm = TypeVar("SelfAlgorithm", bound=OffPolicyAlgorithm)
 
 FORMAT = "sb3_actpc weights"
-VERSION = 4
+VERSION = 5
 _SUFFIX = ".safetensors"
 
 

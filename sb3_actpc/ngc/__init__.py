@@ -2,7 +2,7 @@
 
 from sb3_actpc.ngc.activations import ACTIVATIONS
 from sb3_actpc.ngc.circuit import NGCCircuit
-from sb3_actpc.ngc.coupled import CoupledState, policy_gradient, settle_coupled
+from sb3_actpc.ngc.coupled import CoupledState, check_agreement, policy_gradient, settle_coupled
 from sb3_actpc.ngc.dynamics import SettledState
 from sb3_actpc.ngc.memory import WorkingMemory
 from sb3_actpc.ngc.plasticity import HebbianChanges
@@ -14,6 +14,7 @@ __all__ = [
     "NGCCircuit",
     "SettledState",
     "WorkingMemory",
+    "check_agreement",
     "policy_gradient",
     "settle_coupled",
 ]

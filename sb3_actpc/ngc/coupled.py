@@ -22,6 +22,13 @@ class CoupledState:
     action_values: th.Tensor
 
 
+def check_agreement(actor: NGCCircuit, critic: NGCCircuit) -> None:
+    """:raises ValueError: for two circuits that cannot settle as one, as their schedules differ"""
+    for name in ("settling", "n_settling_steps", "dynamics"):
+        if getattr(actor, name) != getattr(critic, name):
+            raise ValueError(f"actor {name}={getattr(actor, name)!r} and critic {name}={getattr(critic, name)!r} must agree")
+
+
 def settle_coupled(
     actor: NGCCircuit, critic: NGCCircuit, x: th.Tensor, memory: th.Tensor | None = None, nudge: float | None = None
 ) -> CoupledState:
@@ -50,9 +57,7 @@ def settle_coupled(
             f"the critic has n_inputs={critic.sizes[0]} and n_feedback_inputs={critic.n_feedback_inputs}; under this actor it "
             f"needs {x.shape[1] + n_actions} and {n_actions}"
         )
-    for name in ("settling", "n_settling_steps", "dynamics"):
-        if getattr(actor, name) != getattr(critic, name):
-            raise ValueError(f"actor {name}={getattr(actor, name)!r} and critic {name}={getattr(critic, name)!r} must agree")
+    check_agreement(actor, critic)
     motor = actor.chain(x, memory)
     value = critic.chain(th.cat([x, motor.output], dim=1))
     scale = 1.0 if nudge is None or actor.settling == "scheduled" else nudge

@@ -142,12 +142,86 @@ def test_signals_normalised_when_sampled_follow_the_maximum_that_was_seen_last()
 
 @pytest.mark.parametrize("form", ["penalty", "unit"])
 def test_demonstrated_transitions_are_paid_in_the_same_form(form):
-    signals = {"instrumental_form": form, "normalizer": "max"}
+    signals = {"instrumental_form": form, "normalizer": "max", "normalization": "stored"}
     model = make(demonstrations=demonstrations(), demonstration_fraction=0.5, signal_kwargs=signals, alpha_ep=0.0)
     model.learn(30)
     paid = model.expert.instrumental
     assert (0 <= paid.min() and paid.max() <= 1) if form == "unit" else (-1 <= paid.min() and paid.max() <= 0)
     assert paid.std() > 0
+
+
+def test_demonstrated_transitions_are_normalised_when_they_are_sampled_as_replayed_ones_are():
+    """One batch, one normaliser: the maximum doubles, and both halves are paid half."""
+    keywords = {"demonstration_fraction": 0.5, "alpha_in": 0.0, "alpha_ext": 0.0}
+    model = make(demonstrations=demonstrations(), signal_kwargs={"normalizer": "max"}, **keywords)
+    model.learn(30)
+    paid = []
+    for maximum in (100.0, 200.0):
+        model.signals.epistemic.maximum = maximum
+        np.random.seed(1)
+        paid.append(model._sample_batch(32).rewards[:, 0])
+    assert (paid[0] > 0.0).all() and th.allclose(paid[1], paid[0] / 2.0)
+
+
+def test_an_instrumental_signal_without_a_prior_is_named():
+    with pytest.warns(UserWarning, match="alpha_in=1 pays nothing without demonstrations="):
+        make(alpha_in=1.0).learn(5)
+
+
+def test_a_prior_is_trained_when_it_gets_a_role():
+    """Not where it has none, and not twice."""
+    model = make(demonstrations=demonstrations(), alpha_in=0.0)
+    model.learn(5)
+    before = [weight.clone() for weight in model.prior.state_dict().values()]
+    actor = [weight.clone() for weight in model.actor.circuit.state_dict().values()]
+    model.alpha_in = 1.0
+    for n_updates in (5, 5):  # prior_updates
+        model.pretrain()
+        assert int(model.policy.n_prior_updates) == n_updates
+    assert any(not th.equal(old, new) for old, new in zip(before, model.prior.state_dict().values(), strict=True))
+    assert all(th.equal(old, new) for old, new in zip(actor, model.actor.circuit.state_dict().values(), strict=True))
+
+
+def test_replayed_and_demonstrated_returns_have_one_discount_and_one_length():
+    model = make(demonstrations=demonstrations(), demonstration_fraction=0.5, n_steps=3)
+    model.learn(40)
+    model.gamma = 0.5
+    model.learn(40, reset_num_timesteps=False)
+    discounts = set(model._sample_batch(64).discounts[:, 0].tolist())
+    assert discounts <= {0.5, 0.25, 0.125} and 0.125 in discounts
+    with pytest.raises(ValueError, match="replay_buffer_kwargs has 'n_steps'"):
+        make(replay_buffer_kwargs={"n_steps": 2})
+
+
+def test_the_literal_bootstrap_has_returns_of_one_step():
+    """Its action is the one taken now, which says nothing of n steps on."""
+    assert ActPC("MlpPolicy", CountingEnv(), demonstrations=demonstrations(), bootstrap="literal").n_steps == 1
+    assert ActPC("MlpPolicy", CountingEnv(), demonstrations=demonstrations()).n_steps == 5
+
+
+def test_a_critic_of_demonstrations_alone_logs_no_means_of_nothing():
+    model = make(demonstrations=demonstrations(), demonstration_fraction=1.0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", RuntimeWarning)
+        model.learn(30)
+    assert np.isfinite(list(model.diagnostics.summary().values())).all()
+
+
+def test_an_own_learning_rate_beside_a_schedule_from_zero_is_refused():
+    with pytest.raises(ValueError, match=r"critic_kwargs has learning_rate=0\.001"):
+        make(learning_rate=lambda left: 1e-3 * (1.0 - left), policy_kwargs={"critic_kwargs": {"learning_rate": 1e-3}})
+
+
+def test_circuits_that_cannot_settle_as_one_are_refused_before_anything_is_learned():
+    with pytest.raises(ValueError, match="actor settling='iterative' and critic settling='scheduled' must agree"):
+        make(policy_kwargs={"actor_kwargs": {"settling": "iterative"}})
+
+
+def test_hindsight_pays_by_the_environment_that_was_set():
+    env = BitFlippingEnv(n_bits=3, continuous=True)
+    model = ActPC("MultiInputPolicy", env, replay_buffer_class="HerReplayBuffer", learning_starts=1)
+    model.set_env(DummyVecEnv([lambda: BitFlippingEnv(n_bits=3, continuous=True)]))
+    assert model.replay_buffer.env is model.env
 
 
 def test_an_actor_with_a_memory_weight_of_zero_acts_on_the_present_alone():
@@ -658,6 +732,8 @@ def test_observations_are_normalised_by_the_demonstrations_and_do_not_drift():
     features = model.inputs.features(th.as_tensor(data.observations))
     assert th.allclose(features.mean(0), th.zeros(3), atol=1e-5)
     assert th.allclose(features.std(0, correction=0), th.ones(3), atol=1e-4)
+    model.set_env(model.env)  # fits again, to what is not normalised
+    assert th.equal(features, model.inputs.features(th.as_tensor(data.observations)))
     model.learn(60)
     assert th.equal(features, model.inputs.features(th.as_tensor(data.observations)))
 
@@ -666,7 +742,9 @@ def test_observations_are_normalised_by_their_bounds():
     """Position in [-1.2, 0.6], velocity in [-0.07, 0.07]."""
     model = ActPC("MlpPolicy", "MountainCarContinuous-v0", **plain(observation_normalization="bounds"))
     seen = th.tensor([[-1.2, 0.07], [-0.3, 0.0], [0.15, -0.035]])
-    assert th.allclose(model.inputs.features(seen), th.tensor([[-1.0, 1.0], [0.0, 0.0], [0.5, -0.5]]), atol=1e-6)
+    for _ in range(2):
+        assert th.allclose(model.inputs.features(seen), th.tensor([[-1.0, 1.0], [0.0, 0.0], [0.5, -0.5]]), atol=1e-6)
+        model.set_env(model.env)
 
 
 def test_bounds_that_are_not_there_cannot_normalise():
@@ -929,18 +1007,24 @@ def test_a_loaded_agents_signals_are_those_asked_for(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("keywords", "warns"), [({}, True), ({"gradient_steps": -1}, False), ({"actor_pressure": 0.0}, False)]
+    ("keywords", "n_envs", "warns"),
+    [
+        ({}, 4, True),
+        ({"train_freq": 4}, 1, True),
+        ({}, 1, False),
+        ({"gradient_steps": -1}, 4, False),
+        ({"actor_pressure": 0.0}, 4, False),
+    ],
 )
-def test_a_run_of_several_environments_that_is_too_short_to_prove_anything_says_so(keywords, warns, monkeypatch):
+def test_a_run_with_too_few_updates_to_prove_anything_says_so(keywords, n_envs, warns, monkeypatch):
     monkeypatch.setattr(actpc_module, "CANDIDATE_AGE", 20)
-    model = imitating(DummyVecEnv([CountingEnv] * 4), **keywords)
+    model = imitating(DummyVecEnv([CountingEnv] * n_envs), **keywords)
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         model.learn(100)
     said = [str(one.message) for one in said if "gradient_steps" in str(one.message)]
-    assert bool(said) == warns and all(
-        "100 steps of 4 environments with gradient_steps=1 are 25 updates" in one for one in said
-    )
+    how = f"100 steps of n_envs={n_envs} with gradient_steps=1 and train_freq={keywords.get('train_freq', 1)} are 25 updates"
+    assert bool(said) == warns and all(how in one for one in said)
 
 
 def test_an_action_that_cannot_vary_is_named_with_its_dimension():

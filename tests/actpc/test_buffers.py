@@ -174,6 +174,17 @@ def test_signals_come_from_what_was_added_and_are_stored_with_it():
     assert (seen[1][1] == 0.25).all() and seen[1][4].tolist() == [[0, 1], [0, 1]] and np.array_equal(seen[1][3][:, 1], obs)
 
 
+def test_a_restored_memory_remembers_what_was_paid():
+    """Else twenty bad episodes after a stop would be taken for all there were."""
+    memory, restored = SelfImitationMemory(100), SelfImitationMemory(100)
+    memory.takes(3, 1.0)
+    restored.restore_checkpoint_state(memory.checkpoint_state())
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for _ in range(30):
+            assert not restored.takes(3, -1.0)
+
+
 def test_a_task_that_pays_negative_rewards_alone_is_warned_of_once():
     memory = SelfImitationMemory(100)
     with pytest.warns(UserWarning, match="all of the first 20 episodes had a negative return") as caught:

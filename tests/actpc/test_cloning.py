@@ -191,7 +191,7 @@ def stopped_after(n_updates: int) -> ActPC:
     with pytest.MonkeyPatch.context() as patch, pytest.raises(Stop):
         patch.setattr(Cloning, "update", update)
         model.learn(9)
-    assert model.n_pretraining_updates == n_updates and not model.pretrained
+    assert model.n_cloning_updates == n_updates and not model.pretrained
     return model
 
 
@@ -204,7 +204,7 @@ def test_an_agent_saved_within_the_warm_start_begins_it_again(n_done, tmp_path):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Cloning, "update", lambda self, index: (seen.append(index), update(self, index)))
         again.pretrain()
-    assert seen == list(range(20)) and again.pretrained and again.n_pretraining_updates == 20
+    assert seen == list(range(20)) and again.pretrained and again.n_cloning_updates == 20
 
 
 @pytest.mark.parametrize("n_done", [2, 7, 12, 17])
@@ -216,7 +216,7 @@ def test_a_clone_in_the_making_keeps_the_sizes_that_it_was_begun_with(n_done, ot
     other.restore_checkpoint_state(model.checkpoint_state())
     assert len(other.cloning) == 20 and len(other.cloning.teachers) == len(model.cloning.teachers)
     other.pretrain()
-    assert other.n_pretraining_updates == 20
+    assert other.n_cloning_updates == 20
 
 
 def test_parameters_that_have_imitated_are_not_trained_over():
@@ -228,6 +228,9 @@ def test_parameters_that_have_imitated_are_not_trained_over():
     other.pretrain()
     for mine, theirs in zip(model.actor.circuit.state_dict().values(), other.actor.circuit.state_dict().values(), strict=True):
         assert th.equal(mine, theirs)
+    other.trials.habit_returns = [500.0]
+    other.set_parameters(model.get_parameters())
+    assert not other.trials.habit_returns  # of another habit
     untrained = imitating()
     untrained.set_parameters(imitating(seed=1).get_parameters())
     assert not untrained.pretrained

@@ -207,7 +207,7 @@ def test_a_stop_in_the_pretraining_loses_no_update(tmp_path: Path, monkeypatch: 
     resumed = learn_in_two(make, tmp_path / "resumed", 60, stop_at=0)
     stopped = make()
     restore(stopped, list_bundles(tmp_path / "resumed" / "checkpoints")[0])
-    assert stopped.n_pretraining_updates == stop_after
+    assert stopped.n_cloning_updates + int(stopped.policy.n_prior_updates) == stop_after
     assert_same(straight, resumed)
     assert log_rows(tmp_path / "straight" / "progress.csv") == log_rows(tmp_path / "resumed" / "progress.csv")
 

@@ -72,6 +72,18 @@ def test_weights_are_loaded_without_running_code(tmp_path: Path, request: pytest
     loaded.learn(150)
 
 
+def test_weights_that_have_not_imitated_yet_are_taught(tmp_path: Path) -> None:
+    untaught = make_actpc(CountingEnv, demonstrations=demonstrations(), actor_warm_start=3)
+    path = untaught.save_weights(tmp_path / "untaught")
+    loaded = ActPC.from_weights(path, make_vec_env(CountingEnv), demonstrations=demonstrations())
+    assert not loaded.pretrained
+    loaded.pretrain()
+    again = ActPC.from_weights(
+        loaded.save_weights(tmp_path / "taught"), make_vec_env(CountingEnv), demonstrations=demonstrations()
+    )
+    assert again.pretrained
+
+
 def test_weights_with_demonstrations_go_on_learning_from_new_ones(tmp_path: Path) -> None:
     few = {"n_demonstrations": 2, "n_demonstration_transitions": 30}
     model = make_actpc(CountingEnv, demonstrations=demonstrations(), observation_normalization="demonstrations", **few)

@@ -33,7 +33,7 @@ def plot_learning_curve(progress: Path, output: Path, title: str, demonstrators_
     from matplotlib.figure import Figure
 
     rows = pd.read_csv(progress)
-    steps, dense, spread = rows["timesteps"], rows["dense_return"], rows["dense_return_std"]
+    steps, dense, spread = (rows[name].to_numpy() for name in ("timesteps", "dense_return", "dense_return_std"))
     figure = Figure(figsize=(6.4, 6.4), layout="constrained")
     dense_axes, sparse_axes = figure.subplots(2, 1, sharex=True)
     dense_axes.plot(steps, dense, marker="o", label="policy")
