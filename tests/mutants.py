@@ -54,6 +54,7 @@ CIRCUIT, DYNAMICS, PLASTICITY = "ngc/circuit.py", "ngc/dynamics.py", "ngc/plasti
 AGENT, POLICIES, FEATURES = (f"actpc/{name}.py" for name in ("actpc", "policies", "features"))
 SIGNALS, SHOWN = "actpc/reward_signals.py", "actpc/demonstration_replay.py"
 BUFFERS, IMITATION = "actpc/buffers.py", "actpc/self_imitation.py"
+SIMULATORS, RESUMES = "checkpoints/simulators.py", "tests/checkpoints/test_exact_resume.py"
 CLONING, CLONES = "actpc/cloning.py", "tests/actpc/test_cloning.py"
 LEARNS, STORES = "tests/actpc/test_agent.py", "tests/actpc/test_buffers.py"
 COUPLED, SPARSE = "ngc/coupled.py", "envs/sparse_mujoco.py"
@@ -588,6 +589,28 @@ MUTANTS = [
         'self.cloning.restore_checkpoint_state(state["cloning"])',
         "pass",
         "tests/checkpoints/test_exact_resume.py -k pretraining",
+    ),
+    Mutant(
+        "a simulator under the name env is no part of it",
+        SIMULATORS,
+        "else _SKIPPED_WITHIN",
+        "else _SKIPPED",
+        f"{RESUMES} -k cannot",
+    ),
+    Mutant(
+        "the simulator in use is forgotten",
+        SIMULATORS,
+        'setattr(layer, name, layers[node["layer"]][1])',
+        "pass",
+        f"{RESUMES} -k held",
+    ),
+    Mutant("any simulator for any other", SIMULATORS, "if kind != stored_kind:", "if False:", f"{RESUMES} -k cannot"),
+    Mutant(
+        "examined in another simulator",
+        SIMULATORS,
+        "if mismatch and not generators_only:",
+        "if False:",
+        "tests/experiments/test_examination.py -k held",
     ),
     Mutant("noise where there is no room", AGENT, "float(self.expert.leaves_room)", "1.0", f"{LEARNS} -k room"),
     Mutant("room in any unit", IMITATION, "> np.median(lengths)", "> 0.5", f"{LEARNS} -k room"),

@@ -9,7 +9,6 @@ from contextlib import suppress
 from enum import Enum
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import torch as th
 from gymnasium import spaces
@@ -23,7 +22,7 @@ _NOT_NUMBERS = {"nan": math.nan, "inf": math.inf, "-inf": -math.inf}
 _ARRAY_KINDS = "biuf"
 _BIT_GENERATORS = ("MT19937", "PCG64", "Philox")
 # what a value of these types holds is made anew by the constructors, or never changes
-_LEFT_ALONE: tuple[type, ...] = (type, np.dtype, th.device, Enum, EnvSpec, ResultsWriter, gym.Env)
+_LEFT_ALONE: tuple[type, ...] = (type, np.dtype, th.device, Enum, EnvSpec, ResultsWriter)
 _LEFT_ALONE += (types.FunctionType, types.MethodType, types.BuiltinFunctionType, types.ModuleType)
 _LEFT_ALONE_NAMES = ("mujoco._structs.MjModel", "gymnasium.envs.mujoco.mujoco_rendering.MujocoRenderer")
 # objects whose attributes are written one by one into an object of the same class that is there already

@@ -12,6 +12,7 @@ from sb3_actpc.checkpoints.encoding import Decoder, Encoder, OpaqueValue
 # what the constructors make anew, and the time of the clock
 _SKIPPED = {"venv", "env", "class_attributes", "results_writer", "obs_spaces", "metadata", "_metadata", "spec", "_cached_spec"}
 _SKIPPED |= {"t_start"}
+_SKIPPED_WITHIN = {"metadata", "spec"}  # of an environment that is no wrapper, which may keep its state under the other names
 # under this name, what an environment's own checkpoint_state() returned
 _OWN_STATE = "checkpoint_state()"
 _GENERATORS = {"generator", "random_state", "random", "space"}  # kinds of stored values
@@ -25,8 +26,28 @@ def vec_env_layers(env: VecEnv) -> list[VecEnv]:
 
 
 def env_layers(env: gym.Env[Any, Any]) -> list[gym.Env[Any, Any]]:
-    """The wrappers of one environment, outermost first, and the environment itself."""
-    return [env, *env_layers(env.env)] if isinstance(env, gym.Wrapper) else [env]
+    """The wrappers of one environment, outermost first, the environment itself, and those that are attributes of these, with
+    their own wrappers; each of them once. What is in ``checkpoint_skipped`` is left out."""
+    return [layer for _, layer in _named_layers(env)]
+
+
+def _named_layers(env: gym.Env[Any, Any]) -> list[tuple[str, gym.Env[Any, Any]]]:
+    """The layers, each with its class, and before it the attribute that holds it where that is not a wrapper's ``env``."""
+    found: list[tuple[str, gym.Env[Any, Any]]] = []
+
+    def add(layer: gym.Env[Any, Any], held_as: str) -> None:
+        if any(layer is other for _, other in found):
+            return
+        found.append((held_as + type(layer).__qualname__, layer))
+        skipped = getattr(layer, "checkpoint_skipped", ())
+        held = {name: one for name, one in vars(layer).items() if isinstance(one, gym.Env) and name not in skipped}
+        if isinstance(layer, gym.Wrapper):
+            add(layer.env, "")
+        for name in sorted(held):
+            add(held[name], f"{name}: ")
+
+    add(env, "")
+    return found
 
 
 def env_name(env: VecEnv) -> str:
@@ -83,16 +104,19 @@ def restore_vec_env(env: VecEnv, record: dict[str, Any], decoder: Decoder) -> li
 
 
 def capture_env(env: gym.Env[Any, Any], encoder: Encoder, where: str) -> dict[str, Any]:
-    """The state of one environment and its wrappers as JSON, ``where`` being its path in the checkpoint; with a "reason"
-    where it cannot be stored."""
+    """The state of one environment, its wrappers and the environments that it holds as JSON, ``where`` being its path in the
+    checkpoint; with a "reason" where it cannot be stored."""
     layers = env_layers(env)
-    record: dict[str, Any] = {"classes": [type(layer).__qualname__ for layer in layers], "layers": []}
+    places = {id(layer): depth for depth, layer in enumerate(layers)}
+    record: dict[str, Any] = {"classes": [name for name, _ in _named_layers(env)], "layers": []}
     for depth, layer in enumerate(layers):
         attributes: dict[str, Any] = {}
         for name, value in _layer_values(layer).items():
             path = f"{where}.{depth}.{name}"
             try:
-                if type(value).__name__ == "MjData" and type(value).__module__.startswith("mujoco"):
+                if id(value) in places:
+                    attributes[name] = {"layer": places[id(value)]}
+                elif type(value).__name__ == "MjData" and type(value).__module__.startswith("mujoco"):
                     attributes[name] = {"physics": encoder.encode(capture_physics(value.model, value), path)}
                 else:
                     attributes[name] = encoder.encode(value, path)
@@ -104,27 +128,36 @@ def capture_env(env: gym.Env[Any, Any], encoder: Encoder, where: str) -> dict[st
 
 def _layer_values(layer: gym.Env[Any, Any]) -> dict[str, Any]:
     """Attributes but those in ``checkpoint_skipped``, and first what the layer says of the objects that these hold."""
-    skipped = {*_SKIPPED, *getattr(layer, "checkpoint_skipped", ())}
+    made_anew = _SKIPPED if isinstance(layer, gym.Wrapper) else _SKIPPED_WITHIN
+    skipped = {*made_anew, *getattr(layer, "checkpoint_skipped", ())}
     own = {_OWN_STATE: layer.checkpoint_state()} if hasattr(layer, "checkpoint_state") else {}
     return own | {name: value for name, value in vars(layer).items() if name not in skipped}
 
 
 def _layers_mismatch(env: gym.Env[Any, Any] | None, entry: dict[str, Any]) -> str | None:
-    classes = None if env is None else [type(layer).__qualname__ for layer in env_layers(env)]
+    classes = None if env is None else [name for name, _ in _named_layers(env)]
     if classes == entry.get("classes"):
         return None
-    return f"it is wrapped as {classes}, the checkpoint's as {entry.get('classes')}"
+    return f"it is made of {classes}, the checkpoint's of {entry.get('classes')}"
 
 
 def restore_env(env: gym.Env[Any, Any], entry: dict[str, Any], decoder: Decoder, generators_only: bool = False) -> None:
     """Put back what :func:`capture_env` returned into an environment made as the captured one was, or the random generators
-    alone."""
-    for layer, attributes in zip(env_layers(env), entry.get("layers", []), strict=False):
+    alone, where it has the same layer in the same place. ValueError when all of it is wanted and the layers differ."""
+    mismatch = _layers_mismatch(env, entry)
+    if mismatch and not generators_only:
+        raise ValueError(f"the environment cannot be set into the middle of an episode: {mismatch}")
+    layers, stored = _named_layers(env), zip(entry.get("classes", []), entry.get("layers", []), strict=True)
+    for (kind, layer), (stored_kind, attributes) in zip(layers, stored, strict=False):
+        if kind != stored_kind:
+            continue
         for name, node in attributes.items():
             if generators_only and not (isinstance(node, dict) and _GENERATORS & node.keys()):
                 continue
             if name == _OWN_STATE:
                 layer.restore_checkpoint_state(decoder.decode(node))  # type: ignore[attr-defined]
+            elif isinstance(node, dict) and "layer" in node:
+                setattr(layer, name, layers[node["layer"]][1])
             elif isinstance(node, dict) and "physics" in node:
                 data = getattr(layer, name)
                 restore_physics(data.model, data, decoder.decode(node["physics"]))

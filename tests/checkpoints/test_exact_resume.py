@@ -10,6 +10,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
+from gymnasium.envs.classic_control import PendulumEnv
 from stable_baselines3 import DDPG, SAC, TD3
 from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
@@ -148,20 +149,112 @@ def test_only_memory_that_belongs_to_the_simulator_is_stored(env_id: str) -> Non
     env.close()
 
 
-class OpaqueEnv(CountingEnv):
-    """Holds something that nobody can store."""
+class HoldingEnv(gym.Env):
+    """Episodes of 25 steps in a simulator that is itself an environment, and an attribute of the given name."""
+
+    def __init__(self, name: str = "sim", simulator: Any = PendulumEnv) -> None:
+        self.name, self.count = name, 0
+        setattr(self, name, simulator())
+        self.observation_space, self.action_space = self.simulator.observation_space, self.simulator.action_space
+
+    @property
+    def simulator(self) -> Any:
+        return vars(self)[self.name]
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        super().reset(seed=seed)
+        self.count = 0
+        return self.simulator.reset(seed=seed)
+
+    def step(self, action: np.ndarray) -> Any:
+        self.count += 1
+        observation, reward, terminated, _, info = self.simulator.step(action)
+        return observation, reward, terminated, self.count >= 25, info
+
+
+class TwoSimulatorsEnv(HoldingEnv):
+    """The first episode is in one, the others in another."""
 
     def __init__(self) -> None:
-        super().__init__()
-        self.handle = iter([1, 2, 3])
+        self.easy, self.hard = PendulumEnv(g=1.0), PendulumEnv(g=20.0)
+        super().__init__("now", lambda: self.easy)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        if seed is None:
+            self.now = self.hard
+        else:
+            self.hard.reset(seed=seed)
+        return super().reset(seed=seed)
+
+
+HELD = {
+    "env": lambda: HoldingEnv("env"),
+    "sim": HoldingEnv,
+    "venv": lambda: HoldingEnv("venv"),  # a name that has a meaning elsewhere
+    "wrapped": lambda: HoldingEnv("env", lambda: gym.make("Pendulum-v1")),
+    "in a wrapper": lambda: gym.wrappers.TimeLimit(HoldingEnv("env"), 20),
+    "in one that is held": lambda: HoldingEnv("env", HoldingEnv),
+    "a state from the constructor": lambda: HoldingEnv("env", lambda: CountingEnv(lengths=(30,))),
+    "physics": lambda: HoldingEnv("env", lambda: gym.make("SparseReacher-v5")),
+    "two": TwoSimulatorsEnv,
+}
 
 
 @pytest.mark.parametrize("algorithm", [ActPC, TD3])
-def test_an_episode_that_cannot_be_restored_starts_again_and_the_log_says_so(tmp_path: Path, algorithm: Any) -> None:
-    def make() -> Any:
-        return algorithm("MlpPolicy", make_vec_env(OpaqueEnv), **deepcopy(ACTPC if algorithm is ActPC else SMALL))
+@pytest.mark.parametrize("kind", HELD)
+def test_an_environment_that_is_held_goes_on_too(tmp_path: Path, kind: str, algorithm: Any) -> None:
+    """Stopped in the second episode."""
 
-    with pytest.warns(UserWarning, match="environment 0 cannot be restored within its episode.*list_iterator"):
+    def make() -> Any:
+        keywords = ACTPC if algorithm is ActPC else {**SMALL, "buffer_size": 200}
+        return algorithm("MlpPolicy", make_vec_env(HELD[kind]), **deepcopy(keywords))
+
+    check(make, tmp_path, 80, 41)
+
+
+class OpaqueEnv(CountingEnv):
+    """Holds something that nobody can store."""
+
+    def __init__(self, name: str = "handle", thing: Any = None) -> None:
+        super().__init__()
+        setattr(self, name, thing or iter([1, 2, 3]))
+
+
+class LateEnv(CountingEnv):
+    """Makes its simulator, or another one, in each reset."""
+
+    def __init__(self, **simulators: Any) -> None:
+        super().__init__()
+        vars(self).update(simulators)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        self.sim = CountingEnv()
+        return super().reset(seed=seed, options=options)
+
+
+@pytest.mark.parametrize(
+    ("env", "reason"),
+    [
+        (OpaqueEnv, "list_iterator"),
+        (lambda: OpaqueEnv("env"), "env: a .*list_iterator"),
+        (lambda: OpaqueEnv("simulators", [CountingEnv()]), "simulators.0: a .*CountingEnv"),
+        (lambda: OpaqueEnv("sim", OpaqueEnv()), "handle: a .*list_iterator"),
+        (LateEnv, r"it is made of \['Monitor', 'LateEnv'\], the checkpoint's of .*'LateEnv', 'sim: CountingEnv'\]"),
+        (
+            lambda: LateEnv(sim=ContinuousBitFlipping()),
+            r"it is made of .*'sim: ContinuousBitFlipping'\], .*'sim: CountingEnv'\]",
+        ),
+    ],
+    ids=["opaque", "opaque under the name env", "in a list", "opaque in a simulator", "late", "another"],
+)
+@pytest.mark.parametrize("algorithm", [ActPC, TD3])
+def test_an_episode_that_cannot_be_restored_starts_again_and_the_log_says_so(
+    tmp_path: Path, algorithm: Any, env: Any, reason: str
+) -> None:
+    def make() -> Any:
+        return algorithm("MlpPolicy", make_vec_env(env), **deepcopy(ACTPC if algorithm is ActPC else SMALL))
+
+    with pytest.warns(UserWarning, match=f"environment 0 cannot be restored within its episode.*{reason}"):
         resumed = learn_in_two(make, tmp_path, 60, 33)
     assert resumed.num_timesteps == 60
     buffer = resumed.replay_buffer

@@ -42,8 +42,35 @@ class RotationEnv(gym.Env[np.ndarray, np.ndarray]):
         return self.place, reward, False, False, {"dense_reward": -reward}
 
 
-if ENV_ID not in gym.registry:
-    gym.register(ENV_ID, f"{__name__}:RotationEnv", max_episode_steps=10)
+for env_id, kind in ((ENV_ID, "RotationEnv"), ("HeldRotation-v0", "HeldRotationEnv"), ("ChangingRotation-v0", "ChangingEnv")):
+    if env_id not in gym.registry:
+        gym.register(env_id, f"{__name__}:{kind}", max_episode_steps=10)
+
+
+class HeldRotationEnv(gym.Env[np.ndarray, np.ndarray]):
+    """The same in an attribute."""
+
+    def __init__(self) -> None:
+        self.env: gym.Env[np.ndarray, np.ndarray] = RotationEnv()
+        self.observation_space, self.action_space = self.env.observation_space, self.env.action_space
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
+        return self.env.reset(seed=seed)
+
+    def step(self, action: np.ndarray) -> Any:
+        return self.env.step(action)
+
+
+class ChangingEnv(HeldRotationEnv):
+    """It holds another one from the third reset on: the second episode's states cannot be put into it."""
+
+    n_resets = 0
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
+        self.n_resets += 1
+        if self.n_resets > 2:
+            self.env = gym.wrappers.TimeLimit(RotationEnv(), 50)
+        return super().reset(seed=seed)
 
 
 class RotationAgent:
@@ -97,6 +124,14 @@ def test_a_critic_without_a_slope_moves_nothing() -> None:
     assert measures["along_gain_paid"] == 0.0
     assert np.isnan(measures["rank_correlation_paid"])
     assert measures["random_gain_paid"] != 0.0
+
+
+def test_an_environment_that_is_held_is_set_into_its_episode_too() -> None:
+    options: dict[str, Any] = {"values": true_values, **QUICK}
+    plain, held = (examine(RotationAgent(), name, **options).rows for name in (ENV_ID, "HeldRotation-v0"))
+    pd.testing.assert_frame_equal(plain, held)
+    with pytest.raises(ValueError, match=r"middle of an episode: .*'env: TimeLimit', 'RotationEnv'\], .*'env: RotationEnv'\]"):
+        examine(RotationAgent(), "ChangingRotation-v0", **options)
 
 
 @pytest.mark.parametrize("hold", [1, 3])
