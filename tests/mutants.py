@@ -681,7 +681,7 @@ MUTANTS = [
     Mutant(
         "the noise forgets the spread",
         AGENT,
-        "self.policy.spread.clamp_max(self.exploration_noise)",
+        "self.policy.spread.clamp_max(float(self.exploration_noise))",
         "th.full_like(self.policy.spread, self.exploration_noise)",
         f"{HABIT} -k noise",
     ),
