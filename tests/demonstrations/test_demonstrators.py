@@ -105,6 +105,17 @@ def test_a_folder_of_another_run_is_refused(tmp_path: Path) -> None:
         train_demonstrator(short_run(seed=2), tmp_path)
 
 
+@pytest.mark.parametrize("is_finished", [True, False])
+def test_a_folder_of_another_target_is_refused(is_finished: bool, tmp_path: Path) -> None:
+    """The demonstrator there is better, or worse, than the one asked for."""
+    train_demonstrator(short_run(target_return=-1e9), tmp_path)
+    if not is_finished:
+        (tmp_path / "result.json").unlink()
+    for target in (-1e8, None):
+        with pytest.raises(ValueError, match=rf"another run, with target_return=-1000000000.0 and not {target}: .*--work-dir"):
+            train_demonstrator(short_run(target_return=target), tmp_path)
+
+
 def test_a_mixed_set_is_by_a_demonstrator_and_itself_at_half_the_return(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

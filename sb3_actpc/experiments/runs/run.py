@@ -107,6 +107,11 @@ def finish_run(run: Run, report: Report = silent, callbacks: Sequence[BaseCallba
         (folder / CONFIG).unlink()
     if stored is not None and _content(stored) != _content(run):
         raise ValueError(f"{folder} holds another run, of other settings: choose another folder")
+    if stored is not None and stored.target_return != run.target_return:
+        raise ValueError(
+            f"{folder} holds another run, with target_return={stored.target_return} and not {run.target_return}: remove it, "
+            "choose another folder (--output; of `demos collect` --work-dir), or give the old target"
+        )
     if stored is not None and (folder / RESULT).is_file():
         more = (run.n_timesteps or 0) - (stored.n_timesteps or 0)
         result = read_result(folder)
