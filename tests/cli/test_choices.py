@@ -142,6 +142,15 @@ def test_a_finished_run_without_a_checkpoint_says_so(capsys: pytest.CaptureFixtu
     assert "kept no checkpoint to go on from" in capsys.readouterr().err
 
 
+def test_a_finished_run_whose_checkpoint_is_damaged_stays_finished(capsys: pytest.CaptureFixture[str]) -> None:
+    assert train("--demonstrations", "none", "--steps", "20", "--output", "mine") == 0
+    kept = {name: Path("mine", name).read_bytes() for name in ("config.json", "result.json")}
+    next(Path("mine/checkpoints").glob("*/state.json")).write_bytes(b"{")
+    assert main(["train", "--resume", "mine", "--steps", "20", "--no-progress"]) == 2
+    assert "all of its 1 checkpoints are damaged" in capsys.readouterr().err
+    assert {name: Path("mine", name).read_bytes() for name in kept} == kept
+
+
 def test_bringing_a_run_to_its_end_begins_goes_on_or_does_nothing() -> None:
     lines: list[str] = []
     run = Run(env=ENV_ID, algo="td3", preset="small.yml", demonstrations="none", steps=20, output="mine", progress=False)

@@ -86,8 +86,6 @@ def resume_run(
         )
     if more_steps:
         run = run.model_copy(update={"n_timesteps": (run.n_timesteps or 0) + more_steps})
-        write_config(run)
-        (folder / RESULT).unlink(missing_ok=True)
     return _run(run, report, callbacks, resumes=True)
 
 
@@ -162,7 +160,8 @@ def _train(
         reference = demonstrators_return(find_demonstrations(run.env, run.demonstrations))
         filled = {"policy": policy, "demonstrators_return": reference, "versions": package_versions()}
         run = run.model_copy(update={**filled, "git_commit": commit, "dirty": dirty})
-        write_config(run)
+    (folder / RESULT).unlink(missing_ok=True)  # of a finished run that gets more steps, as the settings then say
+    write_config(run)
     model.set_logger(_logger(model, folder))
     seed = run.seed + EVALUATION_SEED_OFFSET
     evaluation = EvaluationCallback(
