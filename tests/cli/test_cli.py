@@ -18,8 +18,8 @@ from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 
 from sb3_actpc.cli import main
 from sb3_actpc.demonstrations.dataset import DATA_FOLDER, Demonstrations
-from sb3_actpc.experiments.runs import Run, load_preset, play_episodes, train_run
-from sb3_actpc.experiments.runs.evaluation import EpisodeStatistics
+from sb3_actpc.experiments.runs import Run, load_preset, load_run, play_episodes, train_run
+from sb3_actpc.experiments.runs.evaluation import EpisodeStatistics, NormalizedPredictor
 from sb3_actpc.experiments.runs.presets import find_demonstrations, parse_assignments, parse_schedule
 from sb3_actpc.experiments.runs.video import RenderingUnavailable, choose_gl_backend
 from tests.cli.line import ENV_ID, RESULTS, RUN, TRAIN, SilentTD3, rows_of, train
@@ -199,6 +199,15 @@ def test_a_finished_run_is_not_overwritten_and_an_unfinished_one_is() -> None:
     assert train(*arguments) == 0
     assert (second / "result.json").exists()
     assert not RUN.with_name(f"{RUN.name}_3").exists()
+
+
+def test_a_run_that_begins_anew_in_a_folder_takes_no_normalisation_over() -> None:
+    arguments = ["--demonstrations", "none", "--steps", "20", "--checkpoint-freq", "0", "--output", "mine"]
+    assert train(*arguments, "--set", "normalize=true") == 0
+    assert isinstance(load_run(Path("mine"))[1], NormalizedPredictor)
+    Path("mine/result.json").unlink()  # it was stopped
+    assert train(*arguments) == 0
+    assert not isinstance(load_run(Path("mine"))[1], NormalizedPredictor)
 
 
 def test_an_explicit_folder_that_holds_a_finished_run_is_refused(capsys: pytest.CaptureFixture[str]) -> None:

@@ -171,6 +171,7 @@ def _train(
     since = f" from step {model.num_timesteps}" if goes_on else ""
     report(f"{run.env}: {run.algo}, {run.n_timesteps} steps{since}, into {folder}")
     if not goes_on:
+        (folder / NormalizedPredictor.FILE).unlink(missing_ok=True)  # of another run, which began here and was not finished
         episodes.begin_file()
         evaluation.begin(model)
     saver = None
