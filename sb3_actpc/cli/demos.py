@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sb3_actpc.envs import ROBOSUITE_IDS
+from sb3_actpc.utils.files import folder_name
 
 if TYPE_CHECKING:
     from sb3_actpc.demonstrations import Demonstrations
@@ -156,7 +157,7 @@ def _collect_trained(args: argparse.Namespace) -> "Demonstrations":
         raise ValueError("--stochastic: the policy of td3 has nothing to sample: choose ppo, sac or trpo")
     options = {"seed": args.seed, "n_envs": args.n_envs, "eval_freq": args.save_every, "progress": False}
     run = demonstrators.demonstrator_run(args.env, args.algo, args.steps, target, args.gym_packages, **options)
-    folder = args.work_dir or Path("demonstrators") / f"{run.env.replace('/', '_')}_{args.algo}_{args.seed}"
+    folder = args.work_dir or Path("demonstrators") / f"{folder_name(run.env)}_{args.algo}_{args.seed}"
     _report(f"demonstrator: {args.algo} on {run.env} for {run.n_timesteps} steps at most, in {folder}")
     if args.mixed:
         trained = demonstrators.train_mixed(run, folder, _report)

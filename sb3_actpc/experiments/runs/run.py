@@ -31,6 +31,7 @@ from sb3_actpc.experiments.runs.provenance import git_state, package_versions
 from sb3_actpc.experiments.runs.record import CONFIG, RESULT, read_result, read_run, write_config, write_result
 from sb3_actpc.experiments.runs.schema import Run, content_id
 from sb3_actpc.experiments.runs.summary import plot_learning_curve
+from sb3_actpc.utils.files import folder_name
 
 # the evaluation's episodes start from other states than the training's
 EVALUATION_SEED_OFFSET = 1_000_000
@@ -256,7 +257,7 @@ def run_folder(run: Run) -> Path:
         if list_bundles(run.folder / CHECKPOINTS):
             raise ValueError(f"{run.output} holds a stopped run: go on with --resume {run.output}, or choose another folder")
         return run.folder
-    base = Path("runs") / run.env.replace(":", "_") / f"{run.algo}_{run.preset_name}_seed{run.seed}"
+    base = Path("runs") / folder_name(run.env) / f"{run.algo}_{run.preset_name}_seed{run.seed}"
     folder, number = base, 1
     while (folder / RESULT).exists() or list_bundles(folder / CHECKPOINTS):
         number += 1
