@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sb3_actpc.envs import ROBOSUITE_IDS
+from sb3_actpc.envs import ROBOSUITE_IDS, sparse_env_id
 from sb3_actpc.utils.files import folder_name
 
 if TYPE_CHECKING:
@@ -38,7 +38,12 @@ def _add_collect(commands: Subparsers) -> None:
         "tasks: record scripted demonstrators.",
     )
     add = collect.add_argument
-    add("--env", required=True, metavar="ID", help="Gymnasium id, such as SparseHopper-v5")
+    add(
+        "--env",
+        required=True,
+        metavar="ID",
+        help="Gymnasium id, such as SparseHopper-v5 (of a goal task: its sparse one)",
+    )
     who = "who demonstrates (default: scripted for robosuite tasks, else trained)"
     add("--demonstrator", choices=["trained", "scripted"], help=who)
     add("--episodes", type=int, help="episodes to record (default: 20; scripted 50, or 300 when mixed)")
@@ -98,6 +103,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _collect(args: argparse.Namespace) -> int:
+    args.env = sparse_env_id(args.env)  # what is recorded in it serves the goal task
     demonstrator = args.demonstrator or ("scripted" if args.env in ROBOSUITE_IDS else "trained")
     if demonstrator == "trained" and (args.proficiency is not None or args.obs is not None):
         raise ValueError("--proficiency and --obs are for scripted demonstrators of robosuite tasks: leave them out")

@@ -192,6 +192,16 @@ class TestCommand:
             assert line in printed
         assert f"sparse return: mean {shown.episode_returns.mean():.1f}" in printed
 
+    def test_a_goal_task_is_demonstrated_in_its_sparse_task(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.setattr(demonstrators, "train_demonstrator", lambda *_: Demonstrator(Reaching(), 7, -3.0))
+        assert run_demos("collect", "--env", "GoalReacher-v5", "--episodes", "1") == 0
+        shown = Demonstrations.load("sparse_reacher.npz")
+        assert shown.env_id == "SparseReacher-v5" and len(shown) == 50
+        env = gym.make("GoalReacher-v5")
+        assert env.get_wrapper_attr("goal_demonstrations")(shown).env_id == "GoalReacher-v5"
+        env.close()
+
     @pytest.mark.parametrize(
         ("words", "target"),
         [([], None), (["--target-return", "5"], 5.0), (["--quality", "0.5"], reference_return("SparseHopper-v5") / 2)],
