@@ -24,6 +24,8 @@ from sb3_actpc.experiments.runs.presets import find_demonstrations, parse_assign
 from sb3_actpc.experiments.runs.video import RenderingUnavailable, choose_gl_backend
 from tests.cli.line import ENV_ID, RESULTS, RUN, TRAIN, SilentTD3, rows_of, train
 
+PLAIN = [*TRAIN, "--demonstrations", "none"]
+
 
 class StatefulPolicy:
     """Counts the steps of each episode in its recurrent state and remembers what it was given."""
@@ -337,6 +339,10 @@ def test_a_graphics_backend_that_does_not_work_is_set_aside(monkeypatch: pytest.
         (["train", "--env", ENV_ID, "--steps", "0"], "steps=0 must be at least 1"),
         (["train", "--env", ENV_ID, "--device", "abacus"], "'abacus'"),
         ([*TRAIN, "--demonstrations", "none", "--env-kwarg", "colour=red"], "colour"),
+        ([*PLAIN, "--set", "policy_kwargs=[64,64]"], "policy_kwargs=[64, 64] must be a dictionary"),
+        ([*PLAIN, "--set", "normalize={norm_ob: false}"], "no keyword 'norm_ob' (did you mean 'norm_obs'?): choose from"),
+        ([*PLAIN, "--set", "noise_std=0.3"], "noise_std=0.3 is of no noise: give noise_type=normal too"),
+        (["bench", "--device", "foo"], "device='foo' must be"),
         (["train", "--env", "CartPole-v1", "--algo", "td3", "--preset", "small.yml"], "only supports"),
         (["evaluate", "nowhere"], "no run in nowhere: config.json is missing"),
         (["evaluate", "nowhere", "--video", "film.avi"], "must end in .mp4, .gif or .png"),
