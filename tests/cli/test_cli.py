@@ -380,7 +380,8 @@ def test_presets_are_plain_and_an_entry_replaces_the_default() -> None:
     text = "default: {gamma: 0.9, tau: 1e-2}\nSparseLine-v0: {policy_kwargs: {optimizer_kwargs: {eps: 1e-5}}}"
     Path("p.yml").write_text(text, encoding="utf-8")
     assert load_preset("p.yml", "Other-v0") == {"gamma": 0.9, "tau": 0.01}
-    assert load_preset("p.yml", ENV_ID) == {"policy_kwargs": {"optimizer_kwargs": {"eps": 1e-5}}}
+    for env_id in (ENV_ID, f"module.of.mine:{ENV_ID}"):
+        assert load_preset("p.yml", env_id) == {"policy_kwargs": {"optimizer_kwargs": {"eps": 1e-5}}}
     Path("p.yml").write_text("default: !!python/object/apply:os.getcwd []", encoding="utf-8")
     with pytest.raises(ValueError, match="not YAML of plain values"):
         load_preset("p.yml", ENV_ID)

@@ -53,13 +53,14 @@ def read_yaml(text: str | bytes, source: str) -> Any:
 
 def load_preset(preset: str, env_id: str) -> dict[str, Any]:
     """Settings of one environment in a preset file (a name in ``hyperparams/``, or a path ending in ``.yml`` or ``.yaml``), a
-    new dictionary of plain values: its own entry, else ``default`` (never both). FileNotFoundError when there is no such
-    preset, ValueError when the file is not a YAML mapping, or has neither entry."""
+    new dictionary of plain values: its own entry, under the id with its module or without, else ``default`` (never both).
+    FileNotFoundError when there is no such preset, ValueError when the file is not a YAML mapping, or has no such entry."""
     path = preset_path(preset)
     entries = read_yaml(path.read_bytes(), str(path))
     if not isinstance(entries, Mapping):
         raise ValueError(f"{path}: expected a mapping from environment ids to settings")
-    settings = entries.get(env_id, entries.get("default"))
+    names = (env_id, env_id.rpartition(":")[2], "default")
+    settings = next((entries[name] for name in names if name in entries), None)
     if not isinstance(settings, Mapping):
         raise ValueError(f"{path}: expected a mapping under {env_id!r} or 'default', found {settings!r}")
     return {str(key): value for key, value in settings.items()}
