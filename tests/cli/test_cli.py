@@ -5,6 +5,7 @@ import json
 import os
 import subprocess
 import sys
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 
 from sb3_actpc.cli import main
 from sb3_actpc.demonstrations.dataset import DATA_FOLDER, Demonstrations
+from sb3_actpc.envs import SPARSE_MUJOCO_IDS
 from sb3_actpc.experiments.runs import Run, load_preset, load_run, play_episodes, train_run
 from sb3_actpc.experiments.runs.evaluation import EpisodeStatistics, NormalizedPredictor
 from sb3_actpc.experiments.runs.presets import find_demonstrations, parse_assignments, parse_schedule
@@ -407,6 +409,18 @@ def test_every_task_ships_good_successful_demonstrations_and_the_command_that_ma
     demonstrations.check(env.observation_space, env.action_space, f"Sparse{task}-v5")
     assert np.array_equal(demonstrations.rewarded_by(env).rewards, demonstrations.rewards)
     env.close()
+
+
+@pytest.mark.parametrize("env_id", ["SparseReacher-v4", "GoalReacher-v4"])
+def test_a_version_of_other_observations_than_the_shipped_files_says_how_to_get_its_own(env_id: str) -> None:
+    with pytest.raises(FileNotFoundError, match=r"no demonstrations of SparseReacher-v4 are shipped: collect .*--demonstr"):
+        find_demonstrations(env_id, "shipped")
+
+
+@pytest.mark.parametrize("env_id", sorted({*SPARSE_MUJOCO_IDS} - {"SparseReacher-v4"}))
+def test_the_shipped_file_fits_both_versions_of_the_other_tasks(env_id: str) -> None:
+    with closing(gym.make(env_id)) as env:
+        Demonstrations.load(find_demonstrations(env_id, "shipped")).check(env.observation_space, env.action_space, env_id)
 
 
 def test_the_weak_demonstrators_reach_about_half() -> None:
