@@ -34,7 +34,7 @@ def _add_collect(commands: Subparsers) -> None:
         "collect",
         help="record a demonstrator's episodes",
         description="Train a demonstrator (a sparse MuJoCo task by its dense base task, any other by its own rewards) and "
-        "record its successful episodes. A finished training is not repeated, a stopped one of sac or td3 goes on. Robosuite "
+        "record its successful episodes. A finished training is not repeated, a stopped one goes on. Robosuite "
         "tasks: record scripted demonstrators.",
     )
     add = collect.add_argument
