@@ -205,6 +205,25 @@ def test_a_finished_run_is_not_overwritten_and_an_unfinished_one_is() -> None:
     assert not RUN.with_name(f"{RUN.name}_3").exists()
 
 
+def test_a_folder_in_which_another_process_trains_is_not_taken() -> None:
+    """The other has written nothing that tells it from a stopped one; its folder is free again when it is killed."""
+    code = """if True:
+        from sb3_actpc.experiments.runs import Run
+        from sb3_actpc.experiments.runs.run import default_folder
+        with default_folder(Run(env="SparseLine-v0", algo="td3", preset="small.yml")):
+            print("holds it", flush=True)
+            input()
+    """
+    with subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as other:
+        assert other.stdout is not None and other.stdout.readline() == "holds it\n"
+        assert train("--demonstrations", "none", "--steps", "20") == 0
+        assert sorted(path.name for path in RUN.parent.iterdir()) == [RUN.name, f"{RUN.name}_2"]
+        assert not (RUN / "result.json").exists()
+        other.kill()
+    assert train("--demonstrations", "none", "--steps", "20") == 0
+    assert (RUN / "result.json").exists() and not (RUN / ".lock").exists()
+
+
 def test_a_run_that_begins_anew_in_a_folder_takes_no_normalisation_over() -> None:
     arguments = ["--demonstrations", "none", "--steps", "20", "--checkpoint-freq", "0", "--output", "mine"]
     assert train(*arguments, "--set", "normalize=true") == 0
@@ -417,6 +436,7 @@ def test_a_version_of_other_observations_than_the_shipped_files_says_how_to_get_
         find_demonstrations(env_id, "shipped")
 
 
+@pytest.mark.filterwarnings("ignore:.*out of date:DeprecationWarning")
 @pytest.mark.parametrize("env_id", sorted({*SPARSE_MUJOCO_IDS} - {"SparseReacher-v4"}))
 def test_the_shipped_file_fits_both_versions_of_the_other_tasks(env_id: str) -> None:
     with closing(gym.make(env_id)) as env:

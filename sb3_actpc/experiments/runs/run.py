@@ -1,13 +1,15 @@
 """One training run and its folder, and the replay of a finished one."""
 
 import shutil
-from collections.abc import Sequence
-from contextlib import ExitStack
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from itertools import count
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import torch as th
+from filelock import FileLock, Timeout
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, ProgressBarCallback
 from stable_baselines3.common.logger import CSVOutputFormat, KVWriter, Logger, TensorBoardOutputFormat
@@ -56,7 +58,9 @@ def train_run(run: Run, report: Report = silent, callbacks: Sequence[BaseCallbac
     """
     check_env_id(run.env, run.gym_packages)
     run = resolve(run)
-    return _run(run.model_copy(update={"output": str(run_folder(run))}), report, callbacks, resumes=False)
+    if run.output is not None:
+        _check_folder(run.folder)
+    return _run(run, report, callbacks, resumes=False)
 
 
 def resume_run(
@@ -139,6 +143,8 @@ def _run(run: Run, report: Report, callbacks: Sequence[BaseCallback], resumes: b
         stack.callback(train_env.close)
         model = build_model(run, train_env)
         stack.callback(close_model, model)
+        if run.output is None:
+            run = run.model_copy(update={"output": str(stack.enter_context(default_folder(run)))})
         result = _train(run, model, eval_envs, report, callbacks, resumes)
     return {**result, "folder": str(run.folder)}
 
@@ -248,21 +254,40 @@ def load_run(folder: Path) -> tuple[Run, Predictor]:
     return run, NormalizedPredictor.wrap_saved(model, folder)
 
 
-def run_folder(run: Run) -> Path:
-    """``run.output``, or ``runs/<env>/<algo>_<preset>_seed<seed>`` with ``_2``, ``_3``, … when it holds a result or
-    checkpoints. ValueError when ``run.output`` holds a finished run, or one that can be resumed."""
-    if run.output is not None:
-        if (run.folder / RESULT).exists():
-            raise ValueError(f"{run.output} already holds a finished run: choose another folder")
-        if list_bundles(run.folder / CHECKPOINTS):
-            raise ValueError(f"{run.output} holds a stopped run: go on with --resume {run.output}, or choose another folder")
-        return run.folder
+def _is_taken(folder: Path) -> bool:
+    return (folder / RESULT).exists() or bool(list_bundles(folder / CHECKPOINTS))
+
+
+def _check_folder(folder: Path) -> None:
+    if (folder / RESULT).exists():
+        raise ValueError(f"{folder} already holds a finished run: choose another folder")
+    if list_bundles(folder / CHECKPOINTS):
+        raise ValueError(f"{folder} holds a stopped run: go on with --resume {folder}, or choose another folder")
+
+
+@contextmanager
+def default_folder(run: Run) -> Iterator[Path]:
+    """``runs/<env>/<algo>_<preset>_seed<seed>``, made when it does not exist, or with ``_2``, ``_3``, … where that holds a
+    result or checkpoints, or another process trains in it. Until the block ends no other process is given it."""
     base = Path("runs") / folder_name(run.env) / f"{run.algo}_{run.preset_name}_seed{run.seed}"
-    folder, number = base, 1
-    while (folder / RESULT).exists() or list_bundles(folder / CHECKPOINTS):
-        number += 1
-        folder = base.with_name(f"{base.name}_{number}")
-    return folder
+    for number in count(1):
+        folder = base if number == 1 else base.with_name(f"{base.name}_{number}")
+        if _is_taken(folder):
+            continue
+        folder.mkdir(parents=True, exist_ok=True)
+        lock = FileLock(folder / ".lock", timeout=0)
+        try:
+            lock.acquire()
+        except Timeout:
+            continue
+        try:
+            if not _is_taken(folder):  # by a process that has just ended
+                yield folder
+                return
+        finally:
+            with suppress(OSError):  # Windows removes no file that is open
+                (folder / ".lock").unlink()
+            lock.release()
 
 
 def demonstrators_return(source: Path | str | None) -> float | None:
