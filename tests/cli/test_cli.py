@@ -357,7 +357,7 @@ def test_a_graphics_backend_that_does_not_work_is_set_aside(monkeypatch: pytest.
         ([*TRAIN, "--set", "gamma"], "expected key=value"),
         ([*TRAIN, "--set", "seed=1"], "use --seed"),
         (["train", "--env", ENV_ID, "--algo", "td3", "--preset", "none.yml"], "no preset file at none.yml"),
-        (["train", "--env", ENV_ID, "--steps", "0"], "steps=0 must be at least 1"),
+        (["train", "--env", ENV_ID, "--steps", "0"], "steps='0' must be at least 1"),
         (["train", "--env", ENV_ID, "--device", "abacus"], "'abacus'"),
         ([*TRAIN, "--demonstrations", "none", "--env-kwarg", "colour=red"], "colour"),
         ([*PLAIN, "--set", "policy_kwargs=[64,64]"], "policy_kwargs=[64, 64] must be a dictionary"),

@@ -137,7 +137,7 @@ def test_a_variant_on_another_version_of_the_task_stands_beside_the_others() -> 
         (["--algos", "actpc"], "no task to compare on"),
         (["--envs", "SparseReacher-v5", "--algos", "actpc", "actpc"], "'actpc' is given twice"),
         (["--envs", "SparseReacher-v5", "--algos", "actpc", "--demonstrations", "no.npz"], "no.npz"),
-        (["--envs", "SparseReacher-v5", "--algos", "actpc", "--steps", "0"], "steps=0 must be at least 1"),
+        (["--envs", "SparseReacher-v5", "--algos", "actpc", "--steps", "0"], "steps='0' must be at least 1"),
         (["--envs", "SparseReacher-v5", "--algos", "actpc", "--engine", "slurm"], "choose one of local, ray"),
         (["--envs", "SparseReacher-v5", "--algos", "actpc", "--workers", "0"], "workers=0 must be at least 1"),
         (["--envs", "SparseReacher-v5", "--algos", "actpc", "--address", "auto"], "add --engine ray"),
