@@ -41,15 +41,15 @@ def build_parser() -> argparse.ArgumentParser:
 def add_run_options(parser: argparse.ArgumentParser, eval_episodes: int) -> None:
     """Options that ``train`` and ``compare`` share, keys of a run and ``--no-progress``; what is not given is None."""
     add = parser.add_argument
-    add("--steps", type=steps, metavar="N", help="environment steps of a run, such as 1e5 (default: the preset's)")
+    add("--steps", metavar="N", help="environment steps of a run, such as 1e5 (default: the preset's)")
     demonstrations = "file, id of a Minari dataset, 'weak' (the package's weaker) or 'none' (default: the package's)"
     add("--demonstrations", metavar="FILE", help=demonstrations)
     modules = "import these, which register environments; also from this folder"
     add("--gym-packages", nargs="+", metavar="MODULE", help=modules)
-    add("--eval-freq", type=steps, metavar="N", help="steps between evaluations (default: a tenth of all)")
+    add("--eval-freq", metavar="N", help="steps between evaluations (default: a tenth of all)")
     add("--eval-episodes", type=int, metavar="N", help=f"episodes in each (default: {eval_episodes})")
     checkpoints = "steps between checkpoints, 0 for none (default: as --eval-freq)"
-    add("--checkpoint-freq", type=steps, metavar="N", help=checkpoints)
+    add("--checkpoint-freq", metavar="N", help=checkpoints)
     add("--device", help="torch device (default: cpu)")
     add("--threads", type=int, metavar="N", help="torch threads of a run (default: 1)")
     add("--no-progress", action="store_true", help="no progress bars")
@@ -58,17 +58,6 @@ def add_run_options(parser: argparse.ArgumentParser, eval_episodes: int) -> None
 def given(args: argparse.Namespace, keys: Iterable[str]) -> dict[str, Any]:
     """Those of the keys that are options here and that the user gave."""
     return {name: getattr(args, name) for name in keys if getattr(args, name, None) is not None}
-
-
-def steps(text: str) -> int:
-    """A whole number, such as ``100000`` or ``1e5``, for argparse."""
-    try:
-        number = float(text)
-        if number == int(number):
-            return int(number)
-    except (ValueError, OverflowError):
-        pass
-    raise argparse.ArgumentTypeError(f"{text!r} is not a whole number, such as 100000 or 1e5")
 
 
 def user_errors() -> tuple[type[Exception], ...]:

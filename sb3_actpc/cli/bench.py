@@ -25,12 +25,14 @@ def run(args: argparse.Namespace) -> int:
     import torch as th
 
     from sb3_actpc.experiments import timing
+    from sb3_actpc.utils.checks import check_device
 
     if args.rounds < 1 or (args.threads is not None and args.threads < 1):
         raise ValueError(f"--rounds {args.rounds} and --threads {args.threads} must be at least 1")
     if args.table:
         print(timing.table(args.table))
         return 0
+    check_device(args.device)
     if args.threads is not None:
         th.set_num_threads(args.threads)
     if args.robosuite:

@@ -17,7 +17,8 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
         "`sb3-actpc report` shows what has come of it.",
     )
     add = parser.add_argument
-    add("file", nargs="?", metavar="FILE", help="YAML file with these options as keys; options replace its values")
+    file = "YAML file with these options as keys; options replace its values, but not those of a task's or variant's own entry"
+    add("file", nargs="?", metavar="FILE", help=file)
     add("--envs", nargs="+", metavar="ID", help="tasks, such as SparseHopper-v5")
     add("--algos", nargs="+", metavar="NAME", help="algorithms or named variants, such as actpc refresh_alone td3")
     add("--ablate", action="store_true", default=None, help="ActPC with every part, and without each in turn")

@@ -7,7 +7,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sb3_actpc.envs import ROBOSUITE_IDS
+from sb3_actpc.envs import ROBOSUITE_IDS, sparse_env_id
+from sb3_actpc.utils.files import folder_name
 
 if TYPE_CHECKING:
     from sb3_actpc.demonstrations import Demonstrations
@@ -33,11 +34,16 @@ def _add_collect(commands: Subparsers) -> None:
         "collect",
         help="record a demonstrator's episodes",
         description="Train a demonstrator (a sparse MuJoCo task by its dense base task, any other by its own rewards) and "
-        "record its successful episodes. A finished training is not repeated, a stopped one of sac or td3 goes on. Robosuite "
+        "record its successful episodes. A finished training is not repeated, a stopped one goes on. Robosuite "
         "tasks: record scripted demonstrators.",
     )
     add = collect.add_argument
-    add("--env", required=True, metavar="ID", help="Gymnasium id, such as SparseHopper-v5")
+    add(
+        "--env",
+        required=True,
+        metavar="ID",
+        help="Gymnasium id, such as SparseHopper-v5 (of a goal task: its sparse one)",
+    )
     who = "who demonstrates (default: scripted for robosuite tasks, else trained)"
     add("--demonstrator", choices=["trained", "scripted"], help=who)
     add("--episodes", type=int, help="episodes to record (default: 20; scripted 50, or 300 when mixed)")
@@ -97,6 +103,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _collect(args: argparse.Namespace) -> int:
+    args.env = sparse_env_id(args.env)  # what is recorded in it serves the goal task
     demonstrator = args.demonstrator or ("scripted" if args.env in ROBOSUITE_IDS else "trained")
     if demonstrator == "trained" and (args.proficiency is not None or args.obs is not None):
         raise ValueError("--proficiency and --obs are for scripted demonstrators of robosuite tasks: leave them out")
@@ -156,7 +163,7 @@ def _collect_trained(args: argparse.Namespace) -> "Demonstrations":
         raise ValueError("--stochastic: the policy of td3 has nothing to sample: choose ppo, sac or trpo")
     options = {"seed": args.seed, "n_envs": args.n_envs, "eval_freq": args.save_every, "progress": False}
     run = demonstrators.demonstrator_run(args.env, args.algo, args.steps, target, args.gym_packages, **options)
-    folder = args.work_dir or Path("demonstrators") / f"{run.env.replace('/', '_')}_{args.algo}_{args.seed}"
+    folder = args.work_dir or Path("demonstrators") / f"{folder_name(run.env)}_{args.algo}_{args.seed}"
     _report(f"demonstrator: {args.algo} on {run.env} for {run.n_timesteps} steps at most, in {folder}")
     if args.mixed:
         trained = demonstrators.train_mixed(run, folder, _report)

@@ -52,7 +52,8 @@ def run(args: argparse.Namespace) -> int:
                 raise ValueError(
                     f"{option} cannot be given with --resume: the run goes on with its own settings, leave it out"
                 )
-            result = resume_run(Path(args.resume), report, not args.no_progress, more_steps=args.steps or 0)
+            more_steps = Run(**given(args, ["steps"])).n_timesteps or 0
+            result = resume_run(Path(args.resume), report, not args.no_progress, more_steps=more_steps)
     except TrainingStopped as stop:
         run_folder = Path(stop.checkpoint).parents[1]
         print(f"sb3-actpc: {stop}; go on with: sb3-actpc train --resume {shlex.quote(str(run_folder))}", file=sys.stderr)

@@ -188,7 +188,7 @@ def _training_arguments(arguments: Sequence[str], folder: Path, optimize: bool) 
     parser = _parser()
     parser.add_argument("--preset")
     parser.add_argument("--gym-packages", nargs="+", default=[])
-    parser.add_argument("--demonstrations", default="shipped")
+    parser.add_argument("--demonstrations")
     parser.add_argument("-conf", "--conf-file", dest="conf_file")
     parser.add_argument("-i", "--trained-agent", default="")
     parser.add_argument("-f", "--log-folder", default=LOG_FOLDER)
@@ -198,6 +198,12 @@ def _training_arguments(arguments: Sequence[str], folder: Path, optimize: bool) 
     if ours.env is None:
         raise ValueError("--env is missing: give a Gymnasium id, such as --env SparseHalfCheetah-v5")
     check_env_id(ours.env, ours.gym_packages)
+    for option in ("preset", "demonstrations"):
+        if ours.conf_file is not None and getattr(ours, option) is not None:
+            raise ValueError(
+                f"--{option} {getattr(ours, option)} is for presets, and --conf-file {ours.conf_file} takes the place of one: "
+                "leave one of the two out; such a file can hold demonstrations: FILE"
+            )
     if ours.conf_file is None:
         conf_file = folder / f"{ours.algo}.yml"
         conf_file.write_text(yaml.safe_dump({ours.env: _zoo_settings(ours)}, sort_keys=False), encoding="utf-8")
@@ -249,14 +255,14 @@ def _zoo_settings(ours: argparse.Namespace) -> dict[str, Any]:
     from sb3_actpc.experiments.runs.presets import RUN_KEYS, find_demonstrations, fitting_policy
     from sb3_actpc.utils.constructors import constructor_keywords
 
-    choices = Run(env=ours.env, algo=ours.algo, preset=ours.preset, demonstrations=ours.demonstrations)
+    choices = Run(env=ours.env, algo=ours.algo, preset=ours.preset, demonstrations=ours.demonstrations or "shipped")
     resolved, known = resolve(choices), constructor_keywords(load_algorithm(ours.algo))
     entries = {name: getattr(resolved, name) for name in RUN_KEYS}
     settings = {**{name: value for name, value in entries.items() if value}, **resolved.settings}
     if resolved.normalize is not None:
         settings["normalize"] = resolved.normalize or True
     if "demonstrations" in known:
-        demonstrations = find_demonstrations(ours.env, ours.demonstrations)
+        demonstrations = find_demonstrations(ours.env, choices.demonstrations)
         settings["demonstrations"] = str(demonstrations.absolute()) if isinstance(demonstrations, Path) else demonstrations
     with closing(make_env(ours.env, resolved.env_kwargs)) as env:
         settings["policy"] = fitting_policy(settings["policy"], env.observation_space)

@@ -2,6 +2,7 @@
 
 import hashlib
 import os
+import re
 import shutil
 import uuid
 from collections.abc import Iterator
@@ -20,6 +21,11 @@ def file_hash(*paths: Path) -> str:
             while piece := file.read(PIECE):
                 digest.update(piece)
     return digest.hexdigest()
+
+
+def folder_name(env_id: str) -> str:
+    """An environment's id as a part of a path: one level, also with a module or a namespace."""
+    return re.sub("[:/]", "_", env_id)
 
 
 @contextmanager

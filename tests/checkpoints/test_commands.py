@@ -153,7 +153,7 @@ def test_a_run_with_checkpoints_is_left_alone_and_the_next_gets_another_folder(m
     [
         (["--resume", "nowhere"], "no run in nowhere"),
         (["--resume", "nowhere", "--seed", "9"], "--seed cannot be given with --resume"),
-        (["--env", "SparseReacher-v5", "--checkpoint-freq", "-1"], "checkpoint_freq=-1 must be at least 0"),
+        (["--env", "SparseReacher-v5", "--checkpoint-freq", "-1"], "checkpoint_freq='-1' must be at least 0"),
     ],
 )
 def test_mistakes_are_named(arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:

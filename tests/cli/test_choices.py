@@ -101,11 +101,17 @@ def test_steps_and_settings_as_people_write_them() -> None:
     assert [layer.out_features for layer in model.actor.mu if hasattr(layer, "out_features")] == [5, 6, 1]
 
 
-@pytest.mark.parametrize("steps", ["1.5", "many", "inf", "nan"])
-def test_steps_that_are_no_whole_number_are_refused(steps: str, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        train("--steps", steps)
-    assert f"'{steps}' is not a whole number, such as 100000 or 1e5" in capsys.readouterr().err
+@pytest.mark.parametrize("option", ["steps", "eval-freq", "checkpoint-freq"])
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [("1.5", "=1.5 must be a whole number"), ("many", "='many' must be a number"), ("inf", "must be a finite number"),
+     ("nan", "must be a finite number"), ("-1", "='-1' must be at least")],
+)  # fmt: skip
+def test_steps_that_are_no_whole_number_are_refused(
+    option: str, text: str, message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert train(f"--{option}", text) == 2
+    assert message in (line := capsys.readouterr().err) and option.replace("-", "_") in line
 
 
 def test_an_environment_of_the_working_folder_with_observations_of_two_parts(
@@ -127,6 +133,8 @@ def test_a_finished_run_is_given_more_steps(capsys: pytest.CaptureFixture[str]) 
     assert train(*[{"60": "40", "straight": "more"}.get(word, word) for word in straight]) == 0
     assert main(["train", "--resume", "more", "--no-progress"]) == 2
     assert "is finished: say with --steps how many more it shall have" in capsys.readouterr().err
+    assert main(["train", "--resume", "more", "--steps", "many"]) == 2
+    assert "steps='many' must be a number" in capsys.readouterr().err
     assert main(["train", "--resume", "more", "--steps", "2e1", "--no-progress"]) == 0
     assert "60 steps from step 40" in capsys.readouterr().out
     assert [int(row["timesteps"]) for row in rows_of("more")] == [0, 20, 40, 60]
@@ -140,6 +148,15 @@ def test_a_finished_run_without_a_checkpoint_says_so(capsys: pytest.CaptureFixtu
     assert train("--demonstrations", "none", "--steps", "20", "--checkpoint-freq", "0", "--output", "mine") == 0
     assert main(["train", "--resume", "mine", "--steps", "20"]) == 2
     assert "kept no checkpoint to go on from" in capsys.readouterr().err
+
+
+def test_a_finished_run_whose_checkpoint_is_damaged_stays_finished(capsys: pytest.CaptureFixture[str]) -> None:
+    assert train("--demonstrations", "none", "--steps", "20", "--output", "mine") == 0
+    kept = {name: Path("mine", name).read_bytes() for name in ("config.json", "result.json")}
+    next(Path("mine/checkpoints").glob("*/state.json")).write_bytes(b"{")
+    assert main(["train", "--resume", "mine", "--steps", "20", "--no-progress"]) == 2
+    assert "all of its 1 checkpoints are damaged" in capsys.readouterr().err
+    assert {name: Path("mine", name).read_bytes() for name in kept} == kept
 
 
 def test_bringing_a_run_to_its_end_begins_goes_on_or_does_nothing() -> None:

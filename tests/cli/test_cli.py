@@ -5,6 +5,7 @@ import json
 import os
 import subprocess
 import sys
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +19,14 @@ from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 
 from sb3_actpc.cli import main
 from sb3_actpc.demonstrations.dataset import DATA_FOLDER, Demonstrations
-from sb3_actpc.experiments.runs import Run, load_preset, play_episodes, train_run
-from sb3_actpc.experiments.runs.evaluation import EpisodeStatistics
+from sb3_actpc.envs import SPARSE_MUJOCO_IDS
+from sb3_actpc.experiments.runs import Run, load_preset, load_run, play_episodes, train_run
+from sb3_actpc.experiments.runs.evaluation import EpisodeStatistics, NormalizedPredictor
 from sb3_actpc.experiments.runs.presets import find_demonstrations, parse_assignments, parse_schedule
 from sb3_actpc.experiments.runs.video import RenderingUnavailable, choose_gl_backend
 from tests.cli.line import ENV_ID, RESULTS, RUN, TRAIN, SilentTD3, rows_of, train
+
+PLAIN = [*TRAIN, "--demonstrations", "none"]
 
 
 class StatefulPolicy:
@@ -201,6 +205,34 @@ def test_a_finished_run_is_not_overwritten_and_an_unfinished_one_is() -> None:
     assert not RUN.with_name(f"{RUN.name}_3").exists()
 
 
+def test_a_folder_in_which_another_process_trains_is_not_taken() -> None:
+    """The other has written nothing that tells it from a stopped one; its folder is free again when it is killed."""
+    code = """if True:
+        from sb3_actpc.experiments.runs import Run
+        from sb3_actpc.experiments.runs.run import default_folder
+        with default_folder(Run(env="SparseLine-v0", algo="td3", preset="small.yml")):
+            print("holds it", flush=True)
+            input()
+    """
+    with subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as other:
+        assert other.stdout is not None and other.stdout.readline() == "holds it\n"
+        assert train("--demonstrations", "none", "--steps", "20") == 0
+        assert sorted(path.name for path in RUN.parent.iterdir()) == [RUN.name, f"{RUN.name}_2"]
+        assert not (RUN / "result.json").exists()
+        other.kill()
+    assert train("--demonstrations", "none", "--steps", "20") == 0
+    assert (RUN / "result.json").exists() and not (RUN / ".lock").exists()
+
+
+def test_a_run_that_begins_anew_in_a_folder_takes_no_normalisation_over() -> None:
+    arguments = ["--demonstrations", "none", "--steps", "20", "--checkpoint-freq", "0", "--output", "mine"]
+    assert train(*arguments, "--set", "normalize=true") == 0
+    assert isinstance(load_run(Path("mine"))[1], NormalizedPredictor)
+    Path("mine/result.json").unlink()  # it was stopped
+    assert train(*arguments) == 0
+    assert not isinstance(load_run(Path("mine"))[1], NormalizedPredictor)
+
+
 def test_an_explicit_folder_that_holds_a_finished_run_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
     arguments = ["--demonstrations", "none", "--steps", "20", "--output", "mine"]
     assert train(*arguments) == 0
@@ -325,9 +357,13 @@ def test_a_graphics_backend_that_does_not_work_is_set_aside(monkeypatch: pytest.
         ([*TRAIN, "--set", "gamma"], "expected key=value"),
         ([*TRAIN, "--set", "seed=1"], "use --seed"),
         (["train", "--env", ENV_ID, "--algo", "td3", "--preset", "none.yml"], "no preset file at none.yml"),
-        (["train", "--env", ENV_ID, "--steps", "0"], "steps=0 must be at least 1"),
+        (["train", "--env", ENV_ID, "--steps", "0"], "steps='0' must be at least 1"),
         (["train", "--env", ENV_ID, "--device", "abacus"], "'abacus'"),
         ([*TRAIN, "--demonstrations", "none", "--env-kwarg", "colour=red"], "colour"),
+        ([*PLAIN, "--set", "policy_kwargs=[64,64]"], "policy_kwargs=[64, 64] must be a dictionary"),
+        ([*PLAIN, "--set", "normalize={norm_ob: false}"], "no keyword 'norm_ob' (did you mean 'norm_obs'?): choose from"),
+        ([*PLAIN, "--set", "noise_std=0.3"], "noise_std=0.3 is of no noise: give noise_type=normal too"),
+        (["bench", "--device", "foo"], "device='foo' must be"),
         (["train", "--env", "CartPole-v1", "--algo", "td3", "--preset", "small.yml"], "only supports"),
         (["evaluate", "nowhere"], "no run in nowhere: config.json is missing"),
         (["evaluate", "nowhere", "--video", "film.avi"], "must end in .mp4, .gif or .png"),
@@ -365,7 +401,8 @@ def test_presets_are_plain_and_an_entry_replaces_the_default() -> None:
     text = "default: {gamma: 0.9, tau: 1e-2}\nSparseLine-v0: {policy_kwargs: {optimizer_kwargs: {eps: 1e-5}}}"
     Path("p.yml").write_text(text, encoding="utf-8")
     assert load_preset("p.yml", "Other-v0") == {"gamma": 0.9, "tau": 0.01}
-    assert load_preset("p.yml", ENV_ID) == {"policy_kwargs": {"optimizer_kwargs": {"eps": 1e-5}}}
+    for env_id in (ENV_ID, f"module.of.mine:{ENV_ID}"):
+        assert load_preset("p.yml", env_id) == {"policy_kwargs": {"optimizer_kwargs": {"eps": 1e-5}}}
     Path("p.yml").write_text("default: !!python/object/apply:os.getcwd []", encoding="utf-8")
     with pytest.raises(ValueError, match="not YAML of plain values"):
         load_preset("p.yml", ENV_ID)
@@ -391,6 +428,19 @@ def test_every_task_ships_good_successful_demonstrations_and_the_command_that_ma
     demonstrations.check(env.observation_space, env.action_space, f"Sparse{task}-v5")
     assert np.array_equal(demonstrations.rewarded_by(env).rewards, demonstrations.rewards)
     env.close()
+
+
+@pytest.mark.parametrize("env_id", ["SparseReacher-v4", "GoalReacher-v4"])
+def test_a_version_of_other_observations_than_the_shipped_files_says_how_to_get_its_own(env_id: str) -> None:
+    with pytest.raises(FileNotFoundError, match=r"no demonstrations of SparseReacher-v4 are shipped: collect .*--demonstr"):
+        find_demonstrations(env_id, "shipped")
+
+
+@pytest.mark.filterwarnings("ignore:.*out of date:DeprecationWarning")
+@pytest.mark.parametrize("env_id", sorted({*SPARSE_MUJOCO_IDS} - {"SparseReacher-v4"}))
+def test_the_shipped_file_fits_both_versions_of_the_other_tasks(env_id: str) -> None:
+    with closing(gym.make(env_id)) as env:
+        Demonstrations.load(find_demonstrations(env_id, "shipped")).check(env.observation_space, env.action_space, env_id)
 
 
 def test_the_weak_demonstrators_reach_about_half() -> None:

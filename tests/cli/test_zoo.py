@@ -189,6 +189,8 @@ def test_sampled_parameters_become_keywords() -> None:
         (["optimize", "--algo", "bc", "--env", "SparseReacher-v5"], "zoo optimize does not know what to vary for 'bc'"),
         (["enjoy", "--env", "SparseReacher-v5", "--folder", "nowhere"], "no runs of actpc in nowhere"),
         (["train", "--env", "SparseReacher-v5", "--demonstrations", "no.npz"], "no demonstrations file at no.npz"),
+        (["train", "--env", "SparseReacher-v5", "-conf", "c.yml", "--demonstrations", "none"], "--demonstrations none is for"),
+        (["optimize", "--env", "SparseReacher-v5", "-conf", "c.yml", "--preset", "td3"], "--preset td3 is for presets, and"),
     ],
 )
 def test_mistakes_give_one_line_and_exit_code_2(

@@ -105,6 +105,17 @@ def test_a_folder_of_another_run_is_refused(tmp_path: Path) -> None:
         train_demonstrator(short_run(seed=2), tmp_path)
 
 
+@pytest.mark.parametrize("is_finished", [True, False])
+def test_a_folder_of_another_target_is_refused(is_finished: bool, tmp_path: Path) -> None:
+    """The demonstrator there is better, or worse, than the one asked for."""
+    train_demonstrator(short_run(target_return=-1e9), tmp_path)
+    if not is_finished:
+        (tmp_path / "result.json").unlink()
+    for target in (-1e8, None):
+        with pytest.raises(ValueError, match=rf"another run, with target_return=-1000000000.0 and not {target}: .*--work-dir"):
+            train_demonstrator(short_run(target_return=target), tmp_path)
+
+
 def test_a_mixed_set_is_by_a_demonstrator_and_itself_at_half_the_return(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -180,6 +191,16 @@ class TestCommand:
         ):
             assert line in printed
         assert f"sparse return: mean {shown.episode_returns.mean():.1f}" in printed
+
+    def test_a_goal_task_is_demonstrated_in_its_sparse_task(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.setattr(demonstrators, "train_demonstrator", lambda *_: Demonstrator(Reaching(), 7, -3.0))
+        assert run_demos("collect", "--env", "GoalReacher-v5", "--episodes", "1") == 0
+        shown = Demonstrations.load("sparse_reacher.npz")
+        assert shown.env_id == "SparseReacher-v5" and len(shown) == 50
+        env = gym.make("GoalReacher-v5")
+        assert env.get_wrapper_attr("goal_demonstrations")(shown).env_id == "GoalReacher-v5"
+        env.close()
 
     @pytest.mark.parametrize(
         ("words", "target"),

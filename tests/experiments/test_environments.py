@@ -148,3 +148,22 @@ def test_a_policy_on_normalised_observations_is_evaluated_and_replayed_on_them(t
     bare = [make_env("Pendulum-v1", {})]
     live, replayed = (play_episodes(one, bare, 1, seed=0) for one in (NormalizedPredictor.wrap(model), saved))
     assert live.dense_returns == pytest.approx(replayed.dense_returns, rel=1e-3)
+
+
+@pytest.mark.parametrize("keys", [None, ["observation"]])
+def test_normalised_observations_of_several_parts_are_replayed_too(keys: list[str] | None, tmp_path: Path) -> None:
+    settings = {"n_steps": 64, "batch_size": 32, "n_epochs": 1, "normalize": {"norm_obs_keys": keys}}
+    run = resolve(Run(env="GoalReacher-v5", algo="ppo", demonstrations="none", settings=settings))
+    env = make_train_env(run.env, {}, 1, 0, run.normalize)
+    assert isinstance(env, VecNormalize)
+    model = build_model(run, env)
+    model.learn(64)
+    NormalizedPredictor.save(model, tmp_path)
+    saved = NormalizedPredictor.wrap_saved(model, tmp_path)
+    assert isinstance(saved, NormalizedPredictor)
+    observation: Any = env.get_original_obs()
+    expected, replayed = env.normalize_obs(observation), saved.normalize(observation)
+    for key in ("achieved_goal", "desired_goal", "observation"):
+        assert replayed[key] == pytest.approx(expected[key], abs=1e-5), key
+    assert np.array_equal(replayed["desired_goal"], observation["desired_goal"]) is (keys is not None)
+    env.close()

@@ -9,6 +9,7 @@ from sb3_actpc.experiments.runs import Run, resolve
 from sb3_actpc.experiments.runs.environments import check_env_id
 from sb3_actpc.experiments.runs.presets import read_yaml
 from sb3_actpc.experiments.runs.schema import Count, Schema, Seed, merged
+from sb3_actpc.utils.files import folder_name
 
 OWN_KEYS = ("envs", "algos", "ablate", "seeds", "first_seed", "output")
 
@@ -73,7 +74,7 @@ def plan_runs(comparison: Comparison, folder: Path | None = None) -> list[Run]:
             raise ValueError(f"{run.task}: {other!r} and {run.name!r} have the same settings: leave one out")
     seeds = range(comparison.first_seed, comparison.first_seed + comparison.seeds)
     seeded = [run.model_copy(update={"seed": seed}) for seed in seeds for run in filled]
-    own = [folder / str(run.task).replace(":", "_") / str(run.name) / f"seed{run.seed}_{run.id}" for run in seeded]
+    own = [folder / folder_name(str(run.task)) / str(run.name) / f"seed{run.seed}_{run.id}" for run in seeded]
     return [run.model_copy(update={"output": str(place)}) for run, place in zip(seeded, own, strict=True)]
 
 

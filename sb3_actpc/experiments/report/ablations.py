@@ -11,6 +11,7 @@ from sb3_actpc.experiments.report.page import Section, interval, mean_and_deviat
 from sb3_actpc.experiments.report.references import measure_of
 from sb3_actpc.experiments.report.results import Results
 from sb3_actpc.experiments.report.statistics import mean_interval
+from sb3_actpc.utils.files import folder_name
 
 NO_EFFECT = "NO: the part did nothing"
 
@@ -42,7 +43,7 @@ def ablation_sections(results: Results, task: str, folder: Path) -> list[Section
     found = ablation_groups(results, task)
     if not found:
         return []
-    picture, measure = f"ablations_{task}.png", measure_of(task)
+    picture, measure = f"ablations_{folder_name(task)}.png", measure_of(task)
     draw_ablation({name: runs[measure].to_numpy() for name, runs in found.items()}, measure, task, folder / picture)
     form = ".2f" if measure == "success_rate" else ".1f"
     about = {variant.name: variant.about for variant in ablation_variants()}

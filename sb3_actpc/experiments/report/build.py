@@ -14,6 +14,7 @@ from sb3_actpc.experiments.report.page import UNDEFINED, Section, interval, mean
 from sb3_actpc.experiments.report.r_stability import N_EPISODES, WINDOW
 from sb3_actpc.experiments.report.references import measure_of, paper_results, reference_score
 from sb3_actpc.experiments.report.results import Results, load_results, write_runs
+from sb3_actpc.utils.files import folder_name
 
 REFRESH_ALONE = "refresh_alone"
 LAST, TRAINING, STABILITY, PAPER = "last evaluation", f"last {WINDOW} training episodes", "R-stability", "paper"
@@ -75,7 +76,7 @@ def _overview(runs: pd.DataFrame) -> str:
 
 
 def _task_section(results: Results, task: str, folder: Path) -> Section:
-    picture = f"curves_{task}.png"
+    picture = f"curves_{folder_name(task)}.png"
     figures.draw_curves(results, task, folder / picture)
     text, groups = "", results.groups(task).values()
     variants = {name for runs in groups for name in runs["variant"]}
@@ -169,7 +170,7 @@ def _aggregate_sections(results: Results, folder: Path) -> list[Section]:
 
 def _diagnostic_section(results: Results, task: str, folder: Path) -> list[Section]:
     own = {label: runs for label, runs in results.groups(task).items() if (runs["algorithm"] == "actpc").all()}
-    picture = f"diagnostics_{task}.png"
+    picture = f"diagnostics_{folder_name(task)}.png"
     if not own or not figures.draw_diagnostics(results, own, task, folder / picture):
         return []
     caption = f"{task}: signals, energies, action-values, self-imitation memory"

@@ -9,7 +9,7 @@ from sb3_actpc.experiments.report.figures import draw_curves
 from sb3_actpc.experiments.report.results import CURVES, SETTINGS, load_results, write_runs
 from sb3_actpc.experiments.runs.record import CONFIG, read_config
 from sb3_actpc.experiments.runs.schema import CONTENT, content_id
-from sb3_actpc.utils.files import atomic_write
+from sb3_actpc.utils.files import atomic_write, folder_name
 
 
 def export(folder: Path, target: Path) -> list[Path]:
@@ -30,6 +30,6 @@ def export(folder: Path, target: Path) -> list[Path]:
     files = [write_runs(results, target), target / CURVES, target / SETTINGS]
     kept = load_results(target)
     for task in kept.finished["task"].unique():
-        files.append(target / f"curves_{task}.png")
+        files.append(target / f"curves_{folder_name(task)}.png")
         draw_curves(kept, task, files[-1])
     return files

@@ -124,7 +124,7 @@ def _run_row(folder: Path, evaluations: pd.DataFrame, episodes: pd.DataFrame) ->
         config, error = read_config(folder), read_error(folder)
     except (FileNotFoundError, ValueError) as problem:
         config, error = {}, read_error(folder) or str(problem)
-    task, variant = folder.parent.parent.name, folder.parent.name
+    task, variant = config.get("task") or folder.parent.parent.name, folder.parent.name
     steps = evaluations["timesteps"].iloc[-1] if len(evaluations) else 0
     versions = dict(config.get("versions", {}))
     return {

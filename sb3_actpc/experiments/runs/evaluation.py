@@ -42,11 +42,11 @@ class Predictor(Protocol):
 
 class NormalizedPredictor:
     """A policy that learned from the observations of SB3's ``VecNormalize``, for those of the bare environment: ``normalize``
-    is a function of n of them, (n, obs_dim)."""
+    is a function of n of them, (n, obs_dim), or of a dictionary of such."""
 
     FILE = "normalization.npz"  # in a run's folder
 
-    def __init__(self, model: Predictor, normalize: Callable[[np.ndarray], np.ndarray]) -> None:
+    def __init__(self, model: Predictor, normalize: Callable[[Any], Any]) -> None:
         self.model, self.normalize = model, normalize
 
     def predict(self, observation: Any, *further: Any, **options: Any) -> tuple[Any, Any]:
@@ -57,7 +57,7 @@ class NormalizedPredictor:
     def wrap(cls, model: BaseAlgorithm) -> Predictor:
         """The agent itself, or with the present statistics of its environment where that normalises observations."""
         wrapper = model.get_vec_normalize_env()
-        return cls(model, wrapper.normalize_obs) if wrapper is not None and wrapper.norm_obs else model  # type: ignore[arg-type]
+        return cls(model, wrapper.normalize_obs) if wrapper is not None and wrapper.norm_obs else model
 
     @classmethod
     def save(cls, model: BaseAlgorithm, folder: Path) -> None:
@@ -65,19 +65,30 @@ class NormalizedPredictor:
         wrapper = model.get_vec_normalize_env()
         if wrapper is None or not wrapper.norm_obs:
             return
-        statistics: Any = wrapper.obs_rms
-        spread = np.sqrt(statistics.var + wrapper.epsilon)
+        found: Any = wrapper.obs_rms
+        arrays = {"limit": np.array(wrapper.clip_obs)}
+        for key, statistics in (found if isinstance(found, dict) else {"": found}).items():
+            arrays |= {f"mean{key}": statistics.mean, f"spread{key}": np.sqrt(statistics.var + wrapper.epsilon)}
         with atomic_write(folder / cls.FILE) as file:
-            np.savez(file, mean=statistics.mean, spread=spread, limit=np.array(wrapper.clip_obs))
+            np.savez(file, **arrays)
 
     @classmethod
     def wrap_saved(cls, model: Predictor, folder: Path) -> Predictor:
         """The agent itself, or with the statistics that :meth:`save` wrote into the run's folder."""
         if not (folder / cls.FILE).is_file():
             return model
-        with np.load(folder / cls.FILE, allow_pickle=False) as stored:
-            mean, spread, limit = stored["mean"], stored["spread"], float(stored["limit"])
-        return cls(model, lambda rows: np.clip((rows - mean) / spread, -limit, limit).astype(np.float32))
+        with np.load(folder / cls.FILE, allow_pickle=False) as file:
+            stored = dict(file)
+
+        def normalize(rows: Any, key: str = "") -> Any:
+            if isinstance(rows, dict):
+                return {name: normalize(part, name) for name, part in rows.items()}
+            if f"mean{key}" not in stored:  # VecNormalize was given some of the parts alone
+                return rows
+            limit = stored["limit"]
+            return np.clip((rows - stored[f"mean{key}"]) / stored[f"spread{key}"], -limit, limit).astype(np.float32)
+
+        return cls(model, normalize)
 
 
 @dataclass(frozen=True)

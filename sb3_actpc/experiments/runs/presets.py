@@ -12,6 +12,7 @@ import numpy as np
 import yaml
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.utils import LinearSchedule
+from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 
 from sb3_actpc.checkpoints import why_no_checkpoints
@@ -21,6 +22,7 @@ from sb3_actpc.envs import sparse_env_id
 from sb3_actpc.experiments.runs.algorithms import check_keywords, load_algorithm
 from sb3_actpc.experiments.runs.environments import make_env
 from sb3_actpc.experiments.runs.schema import Run, merged
+from sb3_actpc.utils.checks import check_kinds, nearest
 from sb3_actpc.utils.constructors import constructor_keywords
 from sb3_actpc.utils.files import file_hash
 
@@ -51,13 +53,14 @@ def read_yaml(text: str | bytes, source: str) -> Any:
 
 def load_preset(preset: str, env_id: str) -> dict[str, Any]:
     """Settings of one environment in a preset file (a name in ``hyperparams/``, or a path ending in ``.yml`` or ``.yaml``), a
-    new dictionary of plain values: its own entry, else ``default`` (never both). FileNotFoundError when there is no such
-    preset, ValueError when the file is not a YAML mapping, or has neither entry."""
+    new dictionary of plain values: its own entry, under the id with its module or without, else ``default`` (never both).
+    FileNotFoundError when there is no such preset, ValueError when the file is not a YAML mapping, or has no such entry."""
     path = preset_path(preset)
     entries = read_yaml(path.read_bytes(), str(path))
     if not isinstance(entries, Mapping):
         raise ValueError(f"{path}: expected a mapping from environment ids to settings")
-    settings = entries.get(env_id, entries.get("default"))
+    names = (env_id, env_id.rpartition(":")[2], "default")
+    settings = next((entries[name] for name in names if name in entries), None)
     if not isinstance(settings, Mapping):
         raise ValueError(f"{path}: expected a mapping under {env_id!r} or 'default', found {settings!r}")
     return {str(key): value for key, value in settings.items()}
@@ -73,6 +76,7 @@ def resolve(run: Run) -> Run:
     if not run.env:
         raise ValueError("env is missing: give a Gymnasium id, such as SparseHopper-v5")
     algorithm = load_algorithm(run.algo)
+    is_noise_chosen = "noise_type" in run.settings  # None leaves the preset's out
     settings = with_changes(load_preset(run.preset or run.algo, run.env), run.settings)
     entries = {name: settings.pop(name, None) for name in RUN_KEYS}
     preset = Run(**{name: value for name, value in entries.items() if value is not None})
@@ -82,12 +86,18 @@ def resolve(run: Run) -> Run:
         raise ValueError(f"n_timesteps is neither in the preset {run.preset_name!r} nor given: give --steps")
     check_keywords(algorithm, settings)
     getattr(algorithm, "check_installed", lambda: None)()
+    if run.noise_std is not None and run.noise_type is None and not is_noise_chosen:
+        raise ValueError(f"noise_std={run.noise_std} is of no noise: give noise_type=normal too, or leave it out")
     _check_noise(run, constructor_keywords(algorithm))
     eval_freq = run.eval_freq or max(1, run.n_timesteps // 10)
     without = why_no_checkpoints(algorithm)
     if without and run.checkpoint_freq:
         raise ValueError(f"{run.algo} {without}: leave --checkpoint-freq out, or give 0")
     normalize = run.normalize
+    known = [name for name in constructor_keywords(VecNormalize) if name != "venv"]
+    if wrong := sorted(set(normalize or ()) - set(known)):
+        hint = f"{nearest(wrong[0], known)}: choose from {', '.join(known)}"
+        raise ValueError(f"normalize={normalize!r}: VecNormalize has no keyword {wrong[0]!r}{hint}")
     if normalize is not None and "gamma" in settings:
         normalize = {"gamma": settings["gamma"], **normalize}
     filled = {
@@ -130,6 +140,7 @@ def agent_keywords(run: Run, observation_space: gym.Space[Any], action_space: gy
         keywords["learning_rate"] = parse_schedule(keywords["learning_rate"])
     if isinstance(keywords.get("train_freq"), list):
         keywords["train_freq"] = tuple(keywords["train_freq"])
+    check_kinds({"policy_kwargs": keywords.get("policy_kwargs")}, mappings="policy_kwargs")
     activation = (keywords.get("policy_kwargs") or {}).get("activation_fn")
     if isinstance(activation, str):
         if activation not in _ACTIVATIONS:

@@ -1,13 +1,15 @@
 """One training run and its folder, and the replay of a finished one."""
 
 import shutil
-from collections.abc import Sequence
-from contextlib import ExitStack
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from itertools import count
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import torch as th
+from filelock import FileLock, Timeout
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, ProgressBarCallback
 from stable_baselines3.common.logger import CSVOutputFormat, KVWriter, Logger, TensorBoardOutputFormat
@@ -31,6 +33,7 @@ from sb3_actpc.experiments.runs.provenance import git_state, package_versions
 from sb3_actpc.experiments.runs.record import CONFIG, RESULT, read_result, read_run, write_config, write_result
 from sb3_actpc.experiments.runs.schema import Run, content_id
 from sb3_actpc.experiments.runs.summary import plot_learning_curve
+from sb3_actpc.utils.files import folder_name
 
 # the evaluation's episodes start from other states than the training's
 EVALUATION_SEED_OFFSET = 1_000_000
@@ -55,7 +58,9 @@ def train_run(run: Run, report: Report = silent, callbacks: Sequence[BaseCallbac
     """
     check_env_id(run.env, run.gym_packages)
     run = resolve(run)
-    return _run(run.model_copy(update={"output": str(run_folder(run))}), report, callbacks, resumes=False)
+    if run.output is not None:
+        _check_folder(run.folder)
+    return _run(run, report, callbacks, resumes=False)
 
 
 def resume_run(
@@ -86,8 +91,6 @@ def resume_run(
         )
     if more_steps:
         run = run.model_copy(update={"n_timesteps": (run.n_timesteps or 0) + more_steps})
-        write_config(run)
-        (folder / RESULT).unlink(missing_ok=True)
     return _run(run, report, callbacks, resumes=True)
 
 
@@ -107,6 +110,11 @@ def finish_run(run: Run, report: Report = silent, callbacks: Sequence[BaseCallba
         (folder / CONFIG).unlink()
     if stored is not None and _content(stored) != _content(run):
         raise ValueError(f"{folder} holds another run, of other settings: choose another folder")
+    if stored is not None and stored.target_return != run.target_return:
+        raise ValueError(
+            f"{folder} holds another run, with target_return={stored.target_return} and not {run.target_return}: remove it, "
+            "choose another folder (--output; of `demos collect` --work-dir), or give the old target"
+        )
     if stored is not None and (folder / RESULT).is_file():
         more = (run.n_timesteps or 0) - (stored.n_timesteps or 0)
         result = read_result(folder)
@@ -135,6 +143,8 @@ def _run(run: Run, report: Report, callbacks: Sequence[BaseCallback], resumes: b
         stack.callback(train_env.close)
         model = build_model(run, train_env)
         stack.callback(close_model, model)
+        if run.output is None:
+            run = run.model_copy(update={"output": str(stack.enter_context(default_folder(run)))})
         result = _train(run, model, eval_envs, report, callbacks, resumes)
     return {**result, "folder": str(run.folder)}
 
@@ -157,7 +167,8 @@ def _train(
         reference = demonstrators_return(find_demonstrations(run.env, run.demonstrations))
         filled = {"policy": policy, "demonstrators_return": reference, "versions": package_versions()}
         run = run.model_copy(update={**filled, "git_commit": commit, "dirty": dirty})
-        write_config(run)
+    (folder / RESULT).unlink(missing_ok=True)  # of a finished run that gets more steps, as the settings then say
+    write_config(run)
     model.set_logger(_logger(model, folder))
     seed = run.seed + EVALUATION_SEED_OFFSET
     evaluation = EvaluationCallback(
@@ -167,6 +178,7 @@ def _train(
     since = f" from step {model.num_timesteps}" if goes_on else ""
     report(f"{run.env}: {run.algo}, {run.n_timesteps} steps{since}, into {folder}")
     if not goes_on:
+        (folder / NormalizedPredictor.FILE).unlink(missing_ok=True)  # of another run, which began here and was not finished
         episodes.begin_file()
         evaluation.begin(model)
     saver = None
@@ -242,21 +254,40 @@ def load_run(folder: Path) -> tuple[Run, Predictor]:
     return run, NormalizedPredictor.wrap_saved(model, folder)
 
 
-def run_folder(run: Run) -> Path:
-    """``run.output``, or ``runs/<env>/<algo>_<preset>_seed<seed>`` with ``_2``, ``_3``, … when it holds a result or
-    checkpoints. ValueError when ``run.output`` holds a finished run, or one that can be resumed."""
-    if run.output is not None:
-        if (run.folder / RESULT).exists():
-            raise ValueError(f"{run.output} already holds a finished run: choose another folder")
-        if list_bundles(run.folder / CHECKPOINTS):
-            raise ValueError(f"{run.output} holds a stopped run: go on with --resume {run.output}, or choose another folder")
-        return run.folder
-    base = Path("runs") / run.env.replace(":", "_") / f"{run.algo}_{run.preset_name}_seed{run.seed}"
-    folder, number = base, 1
-    while (folder / RESULT).exists() or list_bundles(folder / CHECKPOINTS):
-        number += 1
-        folder = base.with_name(f"{base.name}_{number}")
-    return folder
+def _is_taken(folder: Path) -> bool:
+    return (folder / RESULT).exists() or bool(list_bundles(folder / CHECKPOINTS))
+
+
+def _check_folder(folder: Path) -> None:
+    if (folder / RESULT).exists():
+        raise ValueError(f"{folder} already holds a finished run: choose another folder")
+    if list_bundles(folder / CHECKPOINTS):
+        raise ValueError(f"{folder} holds a stopped run: go on with --resume {folder}, or choose another folder")
+
+
+@contextmanager
+def default_folder(run: Run) -> Iterator[Path]:
+    """``runs/<env>/<algo>_<preset>_seed<seed>``, made when it does not exist, or with ``_2``, ``_3``, … where that holds a
+    result or checkpoints, or another process trains in it. Until the block ends no other process is given it."""
+    base = Path("runs") / folder_name(run.env) / f"{run.algo}_{run.preset_name}_seed{run.seed}"
+    for number in count(1):
+        folder = base if number == 1 else base.with_name(f"{base.name}_{number}")
+        if _is_taken(folder):
+            continue
+        folder.mkdir(parents=True, exist_ok=True)
+        lock = FileLock(folder / ".lock", timeout=0)
+        try:
+            lock.acquire()
+        except Timeout:
+            continue
+        try:
+            if not _is_taken(folder):  # by a process that has just ended
+                yield folder
+                return
+        finally:
+            with suppress(OSError):  # Windows removes no file that is open
+                (folder / ".lock").unlink()
+            lock.release()
 
 
 def demonstrators_return(source: Path | str | None) -> float | None:

@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import pytest
 import yaml
 
@@ -34,6 +35,13 @@ def test_every_algorithm_meets_every_task_with_every_seed_and_the_first_seeds_co
         ("SparseHopper-v5", "refresh_alone", 0),
     ]
     assert len(runs) == 8 and len({run.id for run in runs}) == 8 and len({run.folder for run in runs}) == 8
+
+
+def test_runs_of_a_task_with_a_namespace_lie_as_deep_as_others() -> None:
+    gym.register("mylab/Pend-v0", "gymnasium.envs.classic_control:PendulumEnv", max_episode_steps=20)
+    [run] = plan(envs=["mylab/Pend-v0"])
+    assert run.task == "mylab/Pend-v0" and run.folder.parts[:3] == ("out", "mylab_Pend-v0", "actpc")
+    del gym.registry["mylab/Pend-v0"]
 
 
 def test_seeds_that_nothing_was_chosen_on_can_be_asked_for() -> None:
@@ -129,7 +137,7 @@ def test_a_variant_on_another_version_of_the_task_stands_beside_the_others() -> 
         (["--algos", "actpc"], "no task to compare on"),
         (["--envs", "SparseReacher-v5", "--algos", "actpc", "actpc"], "'actpc' is given twice"),
         (["--envs", "SparseReacher-v5", "--algos", "actpc", "--demonstrations", "no.npz"], "no.npz"),
-        (["--envs", "SparseReacher-v5", "--algos", "actpc", "--steps", "0"], "steps=0 must be at least 1"),
+        (["--envs", "SparseReacher-v5", "--algos", "actpc", "--steps", "0"], "steps='0' must be at least 1"),
         (["--envs", "SparseReacher-v5", "--algos", "actpc", "--engine", "slurm"], "choose one of local, ray"),
         (["--envs", "SparseReacher-v5", "--algos", "actpc", "--workers", "0"], "workers=0 must be at least 1"),
         (["--envs", "SparseReacher-v5", "--algos", "actpc", "--address", "auto"], "add --engine ray"),

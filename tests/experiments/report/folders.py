@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from sb3_actpc.utils.files import folder_name
+
 HOPPER, REACHER = "SparseHopper-v5", "SparseReacher-v5"
 
 
@@ -31,11 +33,12 @@ def write_run(
     **settings: Any,
 ) -> Path:
     """A run of 1000 steps, with the given dense returns of its training episodes and of its last evaluation."""
-    folder = out / task / variant / f"seed{seed}_{abs(hash((variant, seed, str(settings)))):010x}"
+    folder = out / folder_name(task) / variant / f"seed{seed}_{abs(hash((variant, seed, str(settings)))):010x}"
     folder.mkdir(parents=True)
     config = {
         "algo": algo,
         "env": task,
+        "task": task,
         "env_kwargs": {},
         "seed": seed,
         "n_timesteps": 1000,

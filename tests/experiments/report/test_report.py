@@ -189,6 +189,19 @@ def test_a_row_that_was_not_written_to_its_end_is_left_out(tmp_path: Path) -> No
     assert read_rows(tmp_path / "empty.csv").empty
 
 
+def test_a_task_with_a_namespace_is_reported_by_its_own_name(tmp_path: Path) -> None:
+    for seed in range(2):
+        write_run(tmp_path / "runs", "mylab/Pend-v0", seed=seed, final=7.0)
+        write_run(tmp_path / "runs", "mylab/Pend-v0", "no_refresh", seed=seed, final=5.0)
+    folder = tmp_path / "runs"
+    assert main(["report", str(folder), "--export", str(tmp_path / "kept")]) == 0
+    assert load_results(folder).runs["task"].unique() == load_results(tmp_path / "kept").runs["task"].unique()
+    assert main(["report", str(folder)]) == 0
+    assert "## mylab/Pend-v0\n" in (folder / "report.md").read_text(encoding="utf-8")
+    assert (tmp_path / "kept" / "curves_mylab_Pend-v0.png").is_file()
+    assert {"curves_mylab_Pend-v0.png", "diagnostics_mylab_Pend-v0.png"} < {path.name for path in folder.iterdir()}
+
+
 def test_a_folder_without_runs_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["report", str(tmp_path)]) == 2
     errors = capsys.readouterr().err
