@@ -600,7 +600,7 @@ class ActPC(OffPolicyAlgorithm):
         self._start_from(self.actor.circuit)
         if self.actor_warm_start and self.trials is not None:
             self.trials.n_clones = self.refresh.n_clones - 1
-        self.policy.has_imitated.fill_(True)
+        self.policy.has_imitated.fill_(1.0)
 
     def _clone_into(self, circuit: NGCCircuit) -> Cloning:
         """What makes an actor's circuit a clone of whatever is imitated by now."""

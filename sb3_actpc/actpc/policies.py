@@ -360,9 +360,9 @@ class ActPCPolicy(BasePolicy):
         self.critic_target = copy.deepcopy(self.critic)
         # of the demonstrated actions around their clone; unknown before there is one
         self.register_buffer("spread", th.full((n_actions,), th.inf))
-        # what the demonstrations have taught so far: it goes where the synapses go
-        self.register_buffer("has_imitated", th.tensor(False))
-        self.register_buffer("n_prior_updates", th.tensor(0))
+        # what the demonstrations have taught, which goes where the synapses go; floats, as SB3 expects of parameters
+        self.register_buffer("has_imitated", th.tensor(0.0))
+        self.register_buffer("n_prior_updates", th.tensor(0.0))
         # the slow average of the learning actor, and a frozen copy of it that has to prove itself
         self.actor_average = copy.deepcopy(self.actor.circuit) if self.habit else None
         self.candidate = copy.deepcopy(self.actor.circuit) if self.habit else None
