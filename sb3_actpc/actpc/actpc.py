@@ -501,7 +501,7 @@ class ActPC(OffPolicyAlgorithm):
             memory.takes_all = is_weighted and self.refresh.own_episodes == "paid"
             if memory.episodes is not None:
                 memory.episodes.distances = None  # the demonstrations may be others by now
-        self._check_length()
+        self._warn_of_idle_settings()
         if self.verbose:
             print(self.describe())
         self.pretrain(between_updates(result[1]), progress_bar)
@@ -509,7 +509,7 @@ class ActPC(OffPolicyAlgorithm):
         self._compiled = self._compiled or compiled_update(self, self._total_timesteps)  # resumed, as straight
         return result
 
-    def _check_length(self) -> None:
+    def _warn_of_idle_settings(self) -> None:
         """Warns of a run with too few updates for a learner to prove itself, and of a signal that nobody makes."""
         if self.alpha_in and self.demonstrations is None:
             warnings.warn(

@@ -106,10 +106,10 @@ def restore_vec_env(env: VecEnv, record: dict[str, Any], decoder: Decoder) -> li
 def capture_env(env: gym.Env[Any, Any], encoder: Encoder, where: str) -> dict[str, Any]:
     """The state of one environment, its wrappers and the environments that it holds as JSON, ``where`` being its path in the
     checkpoint; with a "reason" where it cannot be stored."""
-    layers = env_layers(env)
-    places = {id(layer): depth for depth, layer in enumerate(layers)}
-    record: dict[str, Any] = {"classes": [name for name, _ in _named_layers(env)], "layers": []}
-    for depth, layer in enumerate(layers):
+    layers = _named_layers(env)
+    places = {id(layer): depth for depth, (_, layer) in enumerate(layers)}
+    record: dict[str, Any] = {"classes": [name for name, _ in layers], "layers": []}
+    for depth, (_, layer) in enumerate(layers):
         attributes: dict[str, Any] = {}
         for name, value in _layer_values(layer).items():
             path = f"{where}.{depth}.{name}"
