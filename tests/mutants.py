@@ -918,8 +918,8 @@ MUTANTS = [
     Mutant(
         "a fifth is trimmed, not a quarter",
         STATISTICS,
-        "np.concatenate(scores), 0.25)",
-        "np.concatenate(scores), 0.2)",
+        "trim_mean(joined, 0.25,",
+        "trim_mean(joined, 0.2,",
         SCORES,
     ),
     Mutant("ties lose", STATISTICS, "0.5 * (difference == 0)", "0.0 * (difference == 0)", SCORES),
@@ -934,8 +934,8 @@ MUTANTS = [
     Mutant(
         "profiles count runs below",
         STATISTICS,
-        "(np.concatenate(scores)[None, :] > thr",
-        "(np.concatenate(scores)[None, :] < thr",
+        "(joined > threshold)",
+        "(joined < threshold)",
         SCORES,
     ),
 ]

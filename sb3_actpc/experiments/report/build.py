@@ -142,8 +142,7 @@ def _aggregate_sections(results: Results, folder: Path) -> list[Section]:
     whole = {label: [parts[task].to_numpy() for task in tasks] for label, parts in on_all.items()}
     if not whole:
         return []
-    mean, mean_interval = statistics.interquartile_mean, statistics.interquartile_mean_interval
-    means = {name: (mean(scores), mean_interval(scores)) for name, scores in whole.items()}
+    means = {name: statistics.interquartile_mean(scores) for name, scores in whole.items()}
     figures.draw_aggregates(means, whole, folder / "aggregates.png")
     left_out = sorted(set(map(str, by_label)) - set(whole))
     missing = f" Left out, because not run on every one: {', '.join(left_out)}." if left_out else ""
@@ -154,14 +153,13 @@ def _aggregate_sections(results: Results, folder: Path) -> list[Section]:
     )
     rows = [
         (name, str(sum(map(len, whole[name]))), number(value, ".3f"), interval(bounds, ".3f"))
-        for name, (value, bounds) in means.items()
+        for name, (value, *bounds) in means.items()
     ]
     table = pd.DataFrame(rows, columns=["variant", "runs", "interquartile mean", "95 % interval"])
     caption = "interquartile means and performance profiles"
     pairs = []
     for name, other in combinations(whole, 2):
-        value = statistics.probability_of_improvement(whole[name], whole[other])
-        bounds = statistics.probability_of_improvement_interval(whole[name], whole[other])
+        value, *bounds = statistics.probability_of_improvement(whole[name], whole[other])
         pairs.append((f"{name} over {other}", number(value, ".2f"), interval(bounds, ".2f")))
     improvement = pd.DataFrame(pairs, columns=["pair", "probability", "95 % interval"])
     sections = [Section("Across tasks", text, table, "aggregates.png", caption)]

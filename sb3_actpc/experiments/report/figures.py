@@ -11,7 +11,7 @@ from sb3_actpc.experiments.report import statistics
 from sb3_actpc.experiments.report.r_stability import WINDOW, smooth
 from sb3_actpc.experiments.report.references import measure_of, reference_score
 from sb3_actpc.experiments.report.results import MEASURES, Results, side_by_side
-from sb3_actpc.experiments.report.statistics import Interval, Scores, mean_interval
+from sb3_actpc.experiments.report.statistics import Estimate, Scores, mean_interval
 from sb3_actpc.utils.files import atomic_write
 
 _COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#999999", "#7f3c8d", "#a5aa99")
@@ -103,18 +103,18 @@ def demonstrators_returns(results: Results, task: str) -> list[float]:
     return sorted(finished.loc[finished["task"] == task, "demonstrators_return"].dropna().round(1).unique())
 
 
-def draw_aggregates(intervals: Mapping[str, tuple[float, Interval]], scores: Mapping[str, Scores], path: Path) -> None:
+def draw_aggregates(means: Mapping[str, Estimate], scores: Mapping[str, Scores], path: Path) -> None:
     """Interquartile means with their intervals, and performance profiles of the normalised scores of each task, by variant."""
     figure = _figure(12.0, max(4.0, 1.0 + 0.35 * len(scores)))
     bars, profiles = figure.subplots(1, 2)
-    _bars(bars, {name: (value, *interval) for name, (value, interval) in intervals.items()})
+    _bars(bars, means)
     bars.set(xlabel="interquartile mean of the normalised score")
     everything = np.concatenate([part for parts in scores.values() for part in parts])
     thresholds = np.linspace(min(0.0, everything.min()) - 0.05, max(1.0, everything.max()) + 0.05, 60)
     for index, (name, parts) in enumerate(scores.items()):
         look = _look(index)
-        profiles.plot(thresholds, statistics.performance_profile(parts, thresholds), label=name, **look)
-        low, high = statistics.performance_profile_interval(parts, thresholds)
+        profile, low, high = statistics.performance_profile(parts, thresholds)
+        profiles.plot(thresholds, profile, label=name, **look)
         profiles.fill_between(thresholds, low, high, color=look["color"], alpha=0.15, linewidth=0)
     profiles.set(xlabel="normalised score τ", ylabel="share of runs with a score above τ", ylim=(-0.02, 1.02))
     _legend(figure)
@@ -182,7 +182,7 @@ def _band(axes: Any, x: np.ndarray, values: np.ndarray, label: str, index: int) 
         axes.fill_between(x, low, high, color=_look(index)["color"], alpha=0.15, linewidth=0)
 
 
-def _bars(axes: Any, bars: Mapping[str, tuple[float, float, float]]) -> None:
+def _bars(axes: Any, bars: Mapping[str, Estimate]) -> None:
     """Horizontal bars, the first at the top: value, lower and upper bound (NaN for none)."""
     for index, (value, low, high) in enumerate(bars.values()):
         axes.barh(index, value, height=0.6, color=_COLORS[index % len(_COLORS)], alpha=0.7)

@@ -11,7 +11,6 @@ import pandas as pd
 from jinja2 import Environment, FileSystemLoader, select_autoescape
 from markupsafe import Markup
 
-from sb3_actpc.experiments.report.statistics import Interval
 from sb3_actpc.utils.files import atomic_write
 
 UNDEFINED = "n/a"
@@ -33,7 +32,7 @@ def mean_and_deviation(values: np.ndarray, form: str) -> str:
     return f"{format(known.mean(), form)}{spread}{share}"
 
 
-def interval(bounds: Interval, form: str) -> str:
+def interval(bounds: Sequence[float], form: str) -> str:
     """A cell of lower and upper bound; empty where they are NaN."""
     return "" if math.isnan(bounds[0]) else f"{format(bounds[0], form)} to {format(bounds[1], form)}"
 

@@ -102,7 +102,7 @@ def every_figure(results: Results, path: Path) -> None:
     """Draw one of each kind, with a line or bar for two variants."""
     draw_curves(results, HOPPER, path)
     scores = {"actpc": [np.array([1.0, 0.9])], "td3": [np.array([0.1, 0.3])]}
-    draw_aggregates({"actpc": (0.9, (0.8, 1.0)), "td3": (0.2, (0.1, 0.3))}, scores, path)
+    draw_aggregates({"actpc": (0.9, 0.8, 1.0), "td3": (0.2, 0.1, 0.3)}, scores, path)
     draw_ablation({name: np.concatenate(parts) for name, parts in scores.items()}, "dense_return", HOPPER, path)
     assert draw_diagnostics(results, results.groups(HOPPER), HOPPER, path)
 

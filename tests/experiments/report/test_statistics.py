@@ -15,17 +15,17 @@ OTHERS = [np.array([0.2, 0.4, 0.5, 0.1]), np.array([0.9, 0.3, 0.8, 0.7])]
 
 def test_the_interquartile_mean_leaves_out_a_quarter_at_either_end() -> None:
     """Sorted: 0.1 0.2 | 0.3 0.5 0.6 0.7 | 0.9 1.1."""
-    assert statistics.interquartile_mean(SCORES) == pytest.approx((0.3 + 0.5 + 0.6 + 0.7) / 4)
+    assert statistics.interquartile_mean(SCORES)[0] == pytest.approx((0.3 + 0.5 + 0.6 + 0.7) / 4)
 
 
 def test_the_profile_is_the_share_of_runs_above_each_threshold() -> None:
-    shares = statistics.performance_profile(SCORES, np.array([0.0, 0.5, 2.0]))
+    shares, *_ = statistics.performance_profile(SCORES, np.array([0.0, 0.5, 2.0]))
     assert shares.tolist() == [1.0, 4 / 8, 0.0]
 
 
 def test_probability_of_improvement_counts_pairs_within_a_task_and_ties_by_half() -> None:
     """[1, 2] against [0, 2]: wins 1>0, 2>0, tie 2=2, loss 1<2: 2.5 of 4. [5] against [1, 2]: 2 of 2. Mean of both."""
-    value = statistics.probability_of_improvement(
+    value, *_ = statistics.probability_of_improvement(
         [np.array([1.0, 2.0]), np.array([5.0])], [np.array([0.0, 2.0]), np.array([1.0, 2.0])]
     )
     assert value == pytest.approx((2.5 / 4 + 1.0) / 2)
@@ -41,24 +41,24 @@ def test_the_interval_is_that_of_scipys_bootstrap_of_several_samples() -> None:
     theirs = stats.bootstrap(
         scores, statistic, method="percentile", n_resamples=20_000, axis=-1, random_state=np.random.default_rng(1)
     ).confidence_interval
-    assert statistics.interquartile_mean_interval(scores) == pytest.approx((theirs.low, theirs.high), abs=0.01)
+    assert statistics.interquartile_mean(scores)[1:] == pytest.approx((theirs.low, theirs.high), abs=0.01)
 
 
 def test_the_resampling_keeps_to_each_task() -> None:
     """Tasks whose runs are all alike leave nothing to resample, however different the tasks."""
-    low, high = statistics.interquartile_mean_interval([np.full(4, 0.0), np.full(4, 1.0)])
+    _, low, high = statistics.interquartile_mean([np.full(4, 0.0), np.full(4, 1.0)])
     assert low == high == 0.5
 
 
 def test_intervals_are_the_same_every_time_and_follow_the_seed() -> None:
-    assert statistics.interquartile_mean_interval(SCORES) == statistics.interquartile_mean_interval(SCORES)
-    assert statistics.interquartile_mean_interval(SCORES) != statistics.interquartile_mean_interval(SCORES, seed=1)
+    assert statistics.interquartile_mean(SCORES) == statistics.interquartile_mean(SCORES)
+    assert statistics.interquartile_mean(SCORES) != statistics.interquartile_mean(SCORES, seed=1)
 
 
 def test_single_runs_have_no_interval() -> None:
     alone = [np.array([0.3])]
-    assert math.isnan(statistics.interquartile_mean_interval(alone)[0])
-    assert math.isnan(statistics.probability_of_improvement_interval(alone, alone)[0])
+    assert math.isnan(statistics.interquartile_mean(alone)[1])
+    assert math.isnan(statistics.probability_of_improvement(alone, alone)[1])
     assert np.isnan(statistics.mean_interval(np.ones((1, 3)))[1]).all()
 
 
@@ -73,18 +73,18 @@ def test_against_rliable() -> None:
     from rliable import library, metrics
 
     joined, others = np.stack(SCORES, axis=1), np.stack(OTHERS, axis=1)  # (n_runs, n_tasks)
-    assert statistics.interquartile_mean(SCORES) == pytest.approx(metrics.aggregate_iqm(joined))
-    assert statistics.probability_of_improvement(SCORES, OTHERS) == pytest.approx(
+    assert statistics.interquartile_mean(SCORES)[0] == pytest.approx(metrics.aggregate_iqm(joined))
+    assert statistics.probability_of_improvement(SCORES, OTHERS)[0] == pytest.approx(
         metrics.probability_of_improvement(joined, others)
     )
     thresholds = np.linspace(-0.1, 1.2, 14)
     theirs = [library.run_score_deviation(joined, threshold) for threshold in thresholds]
-    assert statistics.performance_profile(SCORES, thresholds) == pytest.approx(theirs)
+    assert statistics.performance_profile(SCORES, thresholds)[0] == pytest.approx(theirs)
     many = np.random.default_rng(3).normal(0.5, 0.2, (12, 3))
     _, bounds = library.get_interval_estimates(
         {"a": many}, lambda scores: np.array([metrics.aggregate_iqm(scores)]), reps=4000, random_state=np.random.RandomState(0)
     )
-    assert statistics.interquartile_mean_interval(list(many.T)) == pytest.approx(bounds["a"].ravel(), abs=0.015)
+    assert statistics.interquartile_mean(list(many.T))[1:] == pytest.approx(bounds["a"].ravel(), abs=0.015)
 
 
 def test_random_actions_score_nothing_and_the_demonstrators_one() -> None:
