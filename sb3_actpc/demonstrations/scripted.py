@@ -13,7 +13,7 @@ import numpy as np
 
 from sb3_actpc.demonstrations.dataset import Demonstrations
 from sb3_actpc.envs import robosuite_layouts
-from sb3_actpc.envs.robosuite_layouts import ACTION_DIM, RobosuiteTask, quaternion_product, robosuite_task
+from sb3_actpc.envs.robosuite_layouts import ACTION_DIM, RobosuiteTask, robosuite_task
 
 METRES_PER_ACTION = 0.05
 RADIANS_PER_ACTION = 0.5
@@ -21,8 +21,6 @@ RADIANS_PER_ACTION = 0.5
 GAIN = 3.0
 LONGEST_DETOUR = 30
 OPEN, CLOSE = -1.0, 1.0
-POINTING_DOWN = np.array([1.0, 0.0, 0.0, 0.0])
-CONJUGATE = np.array([-1.0, -1.0, -1.0, 1.0])
 # the can's centre above the bins' walls; where it stands on the bin's floor
 CARRYING_HEIGHT = 1.05
 CAN_STANDING_HEIGHT = 0.86
@@ -177,12 +175,12 @@ class ScriptedDemonstrator:
 
     def _turn(self, view: View) -> np.ndarray:
         """Rotation vector (3,) that is left until the gripper points straight down, along the object's edges."""
-        return rotation_between(view.eef_quat, multiply(about_z(self._target_yaw(view)), POINTING_DOWN))
+        return turn_to_point_down(view.eef_quat, self._target_yaw(view))
 
     def _target_yaw(self, view: View) -> float:
         """The cube's angle modulo a quarter turn, nearest to the gripper's first one; for the round can, the gripper's own."""
         if self.task.name == "PickPlaceCan":
-            return yaw_of(multiply(view.eef_quat, POINTING_DOWN * CONJUGATE))
+            return yaw_of(view.eef_quat)
         if self._yaw is None or self.stage == "reach":
             start, quarter = self._yaw or 0.0, np.pi / 2.0
             self._yaw = start + (yaw_of(view.object_quat) - start + quarter / 2.0) % quarter - quarter / 2.0
@@ -249,27 +247,15 @@ def collect_scripted(
         return Demonstrations.record(demonstrators, env, n_episodes, True, seed=seed, metadata=kept, **options)
 
 
-def multiply(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Product of two quaternions (x, y, z, w), (4,): the rotation ``second``, then ``first``."""
-    return quaternion_product(first[None], second[None])[0]
-
-
-def about_z(angle: float) -> np.ndarray:
-    """Quaternion (x, y, z, w) of a rotation about the vertical."""
-    return np.array([0.0, 0.0, np.sin(angle / 2.0), np.cos(angle / 2.0)])
-
-
 def yaw_of(quat: np.ndarray) -> float:
-    """Angle about the vertical of a quaternion (x, y, z, w)."""
+    """Angle about the vertical of the x axis that a quaternion (x, y, z, w) has turned."""
     x, y, z, w = quat
     return float(np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)))
 
 
-def rotation_between(start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Rotation vector (3,), in radians, that turns one orientation into another, both (x, y, z, w)."""
-    difference = multiply(end, start * CONJUGATE)
-    difference = difference if difference[3] >= 0.0 else -difference
-    sine = float(np.linalg.norm(difference[:3]))
-    if sine < 1e-12:
-        return np.zeros(3)
-    return 2.0 * np.arctan2(sine, difference[3]) / sine * difference[:3]
+def turn_to_point_down(quat: np.ndarray, yaw: float) -> np.ndarray:
+    """Rotation vector (3,), in radians, from an orientation (x, y, z, w) to that of a gripper which points straight down, its
+    x axis at an angle about the vertical."""
+    from scipy.spatial.transform import Rotation
+
+    return (Rotation.from_euler("ZX", [yaw, np.pi]) * Rotation.from_quat(quat).inv()).as_rotvec()

@@ -76,10 +76,11 @@ class RobosuiteTask:
         offsets = positions - eef_positions
         if self.name == "Lift":
             return np.concatenate([positions, quats, offsets], axis=1)
-        inverse = eef_quats * [-1.0, -1.0, -1.0, 1.0]
-        turned = quaternion_product(inverse, np.concatenate([offsets, np.zeros_like(offsets[:, :1])], axis=1))
-        relative_positions = quaternion_product(turned, eef_quats)[:, :3]
-        relative_quats = quaternion_product(inverse, quats)
+        from scipy.spatial.transform import Rotation
+
+        to_gripper = Rotation.from_quat(eef_quats).inv()
+        relative_positions = to_gripper.apply(offsets)
+        relative_quats = (to_gripper * Rotation.from_quat(quats)).as_quat()
         relative_quats = np.where(relative_quats[:, 3:] < 0.0, -relative_quats, relative_quats)
         return np.concatenate([relative_positions, relative_quats, positions, quats], axis=1)
 
@@ -108,12 +109,6 @@ ROBOSUITE_TASKS: dict[str, RobosuiteTask] = {
         RobosuiteTask("SparsePickPlaceCan-v0", "PickPlaceCan", {"to_eef_pos": 3, "to_eef_quat": 4, "pos": 3, "quat": 4}),
     )
 }
-
-
-def quaternion_product(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Products of quaternions (x, y, z, w), (N, 4): the rotation ``second``, then ``first``."""
-    (v, a), (w, b) = (first[:, :3], first[:, 3:]), (second[:, :3], second[:, 3:])
-    return np.concatenate([a * w + b * v + np.cross(v, w), a * b - (v * w).sum(axis=1, keepdims=True)], axis=1)
 
 
 def robosuite_task(env_id: str) -> RobosuiteTask:

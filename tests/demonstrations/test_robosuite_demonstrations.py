@@ -18,7 +18,7 @@ from sb3_actpc.cli import main
 from sb3_actpc.demonstrations import ScriptedDemonstrator, collect_scripted, read_robomimic, read_robosuite, write_robomimic
 from sb3_actpc.demonstrations.dataset import Demonstrations, shipped_demonstrations
 from sb3_actpc.demonstrations.robomimic import robomimic_url
-from sb3_actpc.demonstrations.scripted import MIXED_DEMONSTRATORS, about_z, multiply, rotation_between, yaw_of
+from sb3_actpc.demonstrations.scripted import MIXED_DEMONSTRATORS, turn_to_point_down, yaw_of
 from sb3_actpc.envs import ROBOSUITE_IDS
 from sb3_actpc.envs.robosuite_layouts import ROBOSUITE_TASKS, RobosuiteTask
 from tests.demonstrations.made_up import made_up
@@ -56,16 +56,18 @@ def test_observations_have_the_published_sizes(env_id: str, obs: str, size: int)
 
 def test_the_can_is_seen_from_the_gripper() -> None:
     """The gripper at (1, 0, 0), turned a quarter about z: what lies ahead of it along y is at its x."""
-    quarter = about_z(np.pi / 2)[None]
+    quarter = np.array([[0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)]])
     state = ROBOSUITE_TASKS[CAN].object_states(np.array([[1.0, 2.0, 0.5]]), quarter, np.array([[1.0, 0.0, 0.0]]), quarter)
     np.testing.assert_allclose(state[0, :7], [2.0, 0.0, 0.5, 0.0, 0.0, 0.0, 1.0], atol=1e-12)
     np.testing.assert_allclose(state[0, 7:10], [1.0, 2.0, 0.5])
 
 
-def test_rotations_between_orientations_are_the_shortest() -> None:
-    np.testing.assert_allclose(rotation_between(about_z(0.3), about_z(1.0)), [0.0, 0.0, 0.7], atol=1e-12)
-    np.testing.assert_allclose(rotation_between(about_z(0.3), -about_z(1.0)), [0.0, 0.0, 0.7], atol=1e-12)
-    assert yaw_of(multiply(about_z(0.4), about_z(0.5))) == pytest.approx(0.9)
+def test_the_gripper_turns_the_shortest_way() -> None:
+    """Turned by half about x it points down; a quaternion and its negative are the same orientation."""
+    pointing_down = np.array([np.cos(0.15), np.sin(0.15), 0.0, 0.0])  # then by 0.3 about the vertical
+    for quat in (pointing_down, -pointing_down):
+        np.testing.assert_allclose(turn_to_point_down(quat, 1.0), [0.0, 0.0, 0.7], atol=1e-12)
+        assert yaw_of(quat) == pytest.approx(0.3)
 
 
 # ------------------------------------------------------------------ robomimic's files
