@@ -1,9 +1,11 @@
 """The two JSON files of a run folder: ``config.json``, the run itself, and ``result.json``, written last."""
 
-import csv
 import json
+import math
 from pathlib import Path
 from typing import Any
+
+import pandas as pd
 
 from sb3_actpc.experiments.runs.evaluation import PROGRESS
 from sb3_actpc.experiments.runs.schema import VERSION, Run
@@ -89,21 +91,15 @@ def read_result(folder: Path) -> dict[str, Any]:
     return result
 
 
-def _read_evaluations(path: Path) -> list[dict[str, Any]]:
-    with open(path, newline="", encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
-    if not rows:
-        raise ValueError(f"{path}: holds no evaluation")
+def _read_evaluations(path: Path) -> Any:
+    """A dictionary for each row of a ``progress.csv``; the success rate is None where it is not reported."""
     try:
-        return [{name: _value(name, text) for name, text in row.items()} for row in rows]
-    except (TypeError, ValueError) as error:  # a row that was not written to its end
-        raise ValueError(f"{path}: a row is damaged") from error
-
-
-def _value(name: str, text: str) -> float | int | None:
-    if name == "success_rate" and not text:  # the environment does not report it
-        return None
-    return int(text) if name in ("timesteps", "updates") else float(text)
+        rows = pd.read_csv(path, dtype=float, float_precision="round_trip").astype({"timesteps": int, "updates": int})
+        if rows.empty or rows.drop(columns="success_rate").isna().any(axis=None):
+            raise ValueError("values are missing")
+    except (ValueError, KeyError) as error:  # a row that was not written to its end
+        raise ValueError(f"{path}: holds no evaluation, or a row is damaged") from error
+    return rows.astype(object).replace({math.nan: None}).to_dict("records")
 
 
 def _read_json(path: Path) -> Any:
