@@ -26,7 +26,7 @@ from tests.recordings import record
 
 # Its action is the number of its gradient steps in hundredths, plus the age of the episode in tenths.
 FAKE_SERVER = """
-import os, sys, time
+import os, sys, time, types
 sys.path.insert(0, {folder!r})
 import numpy as np
 from frames import serve
@@ -70,7 +70,7 @@ def load(values, arrays):
     n = int(arrays["parameters"][0])
     return {{}}, {{}}
 
-sys.exit(serve(dict(build=build, show=show, train=train, predict=predict, save=save, load=load)))
+sys.exit(serve(types.SimpleNamespace(build=build, show=show, train=train, predict=predict, save=save, load=load)))
 """
 
 

@@ -68,6 +68,4 @@ class Server:
 
 
 if __name__ == "__main__":
-    server = Server()
-    names = ("build", "show", "train", "predict", "save", "load")
-    sys.exit(serve({name: getattr(server, name) for name in names}))
+    sys.exit(serve(Server()))

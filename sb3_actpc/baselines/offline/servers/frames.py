@@ -7,7 +7,6 @@ import io
 import json
 import sys
 import traceback
-from collections.abc import Callable
 from contextlib import suppress
 from multiprocessing.connection import Connection
 from typing import Any
@@ -15,10 +14,10 @@ from typing import Any
 import numpy as np
 
 VALUES = "values"  # the entry that holds them
+QUESTIONS = ("build", "show", "train", "predict", "save", "load")
 
 Values = dict[str, Any]
 Arrays = dict[str, np.ndarray]
-Handler = Callable[[Values, Arrays], tuple[Values, Arrays] | None]
 
 
 def pack(values: Values, arrays: Arrays) -> bytes:
@@ -41,16 +40,17 @@ def unpack(message: bytes) -> tuple[Values, Arrays]:
         raise ValueError(f"expected values and arrays, found {message[:16]!r} ({error})") from None
 
 
-def serve(handlers: dict[str, Handler]) -> int:
+def serve(server: Any) -> int:
     """Answer the questions of the pipe whose number is the last argument of this program, until it is closed: the exit
-    code. A handler, by the ``ask`` of a question, is given its values and arrays and returns those of the answer, if any. An
-    exception is the answer ``{"error": ...}`` and ends the program."""
+    code. The server's method, by the ``ask`` of a question, one of ``QUESTIONS``, is given its values and arrays and returns
+    those of the answer, if any. An exception is the answer ``{"error": ...}`` and ends the program."""
+    methods = {name: getattr(server, name) for name in QUESTIONS}
     channel = Connection(int(sys.argv[-1]))
     with suppress(EOFError, ConnectionError):  # the other side has ended
         while True:
             values, arrays = unpack(channel.recv_bytes())
             try:
-                answer = pack(*(handlers[values.pop("ask")](values, arrays) or ({}, {})))
+                answer = pack(*(methods[values.pop("ask")](values, arrays) or ({}, {})))
             except Exception as error:
                 traceback.print_exc()
                 channel.send_bytes(pack({"error": f"{type(error).__name__}: {error}"}, {}))

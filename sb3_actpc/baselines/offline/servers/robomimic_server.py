@@ -178,6 +178,4 @@ def stand_in_for_torchvision() -> None:
 
 
 if __name__ == "__main__":
-    server = Server()
-    names = ("build", "show", "train", "predict", "save", "load")
-    sys.exit(serve({name: getattr(server, name) for name in names}))
+    sys.exit(serve(Server()))
