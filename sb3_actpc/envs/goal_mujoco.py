@@ -26,7 +26,7 @@ _REACHER_TARGET = slice(4, 6)
 _REACHER_DIFFERENCE = slice(8, 10)  # fingertip minus target; -v4 has its height too, always 0
 
 
-class GoalTask(gym.Wrapper[Any, np.ndarray, Any, np.ndarray]):
+class GoalTask(gym.ObservationWrapper[Any, np.ndarray, Any]):
     """A sparse task as a goal task: the same physics, time limits and ``info``; ``n_own`` is the size of ``observation``,
     ``n_goal`` that of a goal."""
 
@@ -38,15 +38,9 @@ class GoalTask(gym.Wrapper[Any, np.ndarray, Any, np.ndarray]):
         }
         self.observation_space = spaces.Dict(boxes)
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, dict[str, Any]]:
-        """As the sparse task's, with the dictionary."""
-        observation, info = self.env.reset(seed=seed, options=options)
-        return self._goal_observation(observation), info
-
     def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """As the sparse task's, with the dictionary and the reward of :meth:`compute_reward`."""
-        observation, _, terminated, truncated, info = self.env.step(action)
-        row = self._goal_observation(observation)
+        row, _, terminated, truncated, info = super().step(action)
         reward = self.compute_reward(row["achieved_goal"], row["desired_goal"], info)
         return row, float(reward), terminated, truncated, info
 
@@ -77,12 +71,9 @@ class GoalTask(gym.Wrapper[Any, np.ndarray, Any, np.ndarray]):
             env_id=env_id,
         )
 
-    def _goal_observation(self, observation: np.ndarray) -> Observation:
-        raise NotImplementedError
-
     def _demonstrated_rows(self, demonstrations: Demonstrations) -> tuple[Observation, Observation]:
         """Observations and next observations of N transitions, (N, size) each."""
-        return self._goal_observation(demonstrations.observations), self._goal_observation(demonstrations.next_observations)
+        return self.observation(demonstrations.observations), self.observation(demonstrations.next_observations)
 
 
 class GoalReacher(GoalTask):
@@ -98,7 +89,8 @@ class GoalReacher(GoalTask):
         distances = np.linalg.norm(achieved_goal - desired_goal, axis=-1)
         return np.where(distances <= task.threshold, 1.0, task.miss_reward)
 
-    def _goal_observation(self, observation: np.ndarray) -> Observation:
+    def observation(self, observation: np.ndarray) -> Observation:
+        """The dictionary of the sparse task's observation, or of n of them, (..., obs_dim)."""
         target = observation[..., _REACHER_TARGET]
         return {
             "observation": observation[..., _REACHER_OWN],
@@ -121,7 +113,8 @@ class GoalLocomotion(GoalTask):
         """1 at or beyond the desired distance, else 0; see :meth:`GoalTask.compute_reward`."""
         return np.where((achieved_goal >= desired_goal)[..., 0], 1.0, 0.0)
 
-    def _goal_observation(self, observation: np.ndarray) -> Observation:
+    def observation(self, observation: np.ndarray) -> Observation:
+        """The dictionary of the sparse task's present observation."""
         task: Any = self.unwrapped
         travelled = np.array([task.data.qpos[0] - task._start_x])
         return {"observation": observation, "achieved_goal": travelled, "desired_goal": np.array([task.distance])}

@@ -54,7 +54,7 @@ def test_a_goal_task_is_its_sparse_task_with_goals(env_id: str) -> None:
 def test_what_the_reacher_observes_of_its_target_is_in_the_goal_alone() -> None:
     """Or a relabelled transition would show two targets."""
     env = gym.make("GoalReacher-v5")
-    observe = env.get_wrapper_attr("_goal_observation")
+    observe = env.get_wrapper_attr("observation")
     env.reset(seed=0)
     task = env.unwrapped
     before = observe(task._get_obs())
