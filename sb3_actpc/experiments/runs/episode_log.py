@@ -12,16 +12,6 @@ from stable_baselines3.common.callbacks import BaseCallback
 from sb3_actpc.utils.files import atomic_write
 
 EPISODES = "episodes.csv"
-EPISODE_COLUMNS = (
-    "episode",
-    "timesteps",
-    "seconds",
-    "length",
-    "sparse_return",
-    "dense_return",
-    "success",
-    "actions_crc32",
-)
 
 
 class CsvCallback(BaseCallback):
@@ -66,7 +56,16 @@ class EpisodeLog(CsvCallback):
     that the training has taken so far.
     """
 
-    columns = EPISODE_COLUMNS
+    columns = (
+        "episode",
+        "timesteps",
+        "seconds",
+        "length",
+        "sparse_return",
+        "dense_return",
+        "success",
+        "actions_crc32",
+    )
     kept = ("n_episodes", "dense_returns", "actions")
 
     def __init__(self, folder: Path, clock: Callable[[], float]) -> None:

@@ -17,18 +17,6 @@ from sb3_actpc.utils.files import atomic_write
 
 UNTRAINED_EPISODES = 5
 PROGRESS = "progress.csv"
-PROGRESS_COLUMNS = (
-    "timesteps",
-    "updates",
-    "seconds",
-    "evaluation_seconds",
-    "dense_return",
-    "dense_return_std",
-    "sparse_return",
-    "sparse_return_std",
-    "success_rate",
-    "episode_length",
-)
 
 
 class Predictor(Protocol):
@@ -176,7 +164,18 @@ class EvaluationCallback(CsvCallback):
     :param target_return: end the training at the first evaluation whose mean dense return reaches it; None for never
     """
 
-    columns = PROGRESS_COLUMNS
+    columns = (
+        "timesteps",
+        "updates",
+        "seconds",
+        "evaluation_seconds",
+        "dense_return",
+        "dense_return_std",
+        "sparse_return",
+        "sparse_return_std",
+        "success_rate",
+        "episode_length",
+    )
     kept = ("evaluation_seconds", "best_return", "last_summary", "last_timesteps")
 
     def __init__(
