@@ -407,11 +407,9 @@ def _wins(first: pd.Series, second: pd.Series) -> np.ndarray:
 
 def _correlation(blocks: list[np.ndarray], column: int, rng: np.random.Generator) -> tuple[float, float]:
     """Spearman's, of columns 0 and another of all blocks (one a state), and its standard error over states; or NaN."""
-    from scipy.stats import spearmanr
 
     def correlation(parts: list[np.ndarray]) -> float:
-        pairs = np.concatenate(parts)[:, [0, column]]
-        return float("nan") if len(pairs) < 3 or np.any(np.ptp(pairs, axis=0) == 0) else float(spearmanr(pairs).statistic)
+        return float(pd.DataFrame(np.concatenate(parts)[:, [0, column]]).corr("spearman", min_periods=3).iloc[0, 1])
 
     n = len(blocks)
     resampled = [correlation([blocks[i] for i in rng.integers(n, size=n)]) for _ in range(N_RESAMPLES)]

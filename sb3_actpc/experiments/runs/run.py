@@ -58,8 +58,8 @@ def train_run(run: Run, report: Report = silent, callbacks: Sequence[BaseCallbac
     """
     check_env_id(run.env, run.gym_packages)
     run = resolve(run)
-    if run.output is not None:
-        _check_folder(run.folder)
+    if run.output is not None and (taken := _taken(run.folder)):
+        raise ValueError(taken)
     return _run(run, report, callbacks, resumes=False)
 
 
@@ -254,15 +254,13 @@ def load_run(folder: Path) -> tuple[Run, Predictor]:
     return run, NormalizedPredictor.wrap_saved(model, folder)
 
 
-def _is_taken(folder: Path) -> bool:
-    return (folder / RESULT).exists() or bool(list_bundles(folder / CHECKPOINTS))
-
-
-def _check_folder(folder: Path) -> None:
+def _taken(folder: Path) -> str:
+    """What a folder holds that another run must not touch; empty where that is nothing."""
     if (folder / RESULT).exists():
-        raise ValueError(f"{folder} already holds a finished run: choose another folder")
+        return f"{folder} already holds a finished run: choose another folder"
     if list_bundles(folder / CHECKPOINTS):
-        raise ValueError(f"{folder} holds a stopped run: go on with --resume {folder}, or choose another folder")
+        return f"{folder} holds a stopped run: go on with --resume {folder}, or choose another folder"
+    return ""
 
 
 @contextmanager
@@ -272,7 +270,7 @@ def default_folder(run: Run) -> Iterator[Path]:
     base = Path("runs") / folder_name(run.env) / f"{run.algo}_{run.preset_name}_seed{run.seed}"
     for number in count(1):
         folder = base if number == 1 else base.with_name(f"{base.name}_{number}")
-        if _is_taken(folder):
+        if _taken(folder):
             continue
         folder.mkdir(parents=True, exist_ok=True)
         lock = FileLock(folder / ".lock", timeout=0)
@@ -281,7 +279,7 @@ def default_folder(run: Run) -> Iterator[Path]:
         except Timeout:
             continue
         try:
-            if not _is_taken(folder):  # by a process that has just ended
+            if not _taken(folder):  # by a process that has just ended
                 yield folder
                 return
         finally:
