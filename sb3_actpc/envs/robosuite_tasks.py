@@ -171,7 +171,7 @@ class SparseRobosuiteEnv(gym.Env[np.ndarray, np.ndarray], utils.EzPickle):
         eef_quat = np.roll(self.data.body(robot.robot_model.eef_name["right"]).xquat, -1)  # (w, x, y, z) to (x, y, z, w)
         eef_position = self.data.site_xpos[robot.eef_site_id["right"]]
         body = self._object_body()
-        position, quat = self.data.xpos[body], np.roll(self.data.xquat[body], -1)
+        position, quat = body.xpos, np.roll(body.xquat, -1)
         return {
             "robot0_joint_pos_cos": np.cos(joints),
             "robot0_joint_pos_sin": np.sin(joints),
@@ -188,15 +188,15 @@ class SparseRobosuiteEnv(gym.Env[np.ndarray, np.ndarray], utils.EzPickle):
         gripper = self.data.site_xpos[self._simulation.robots[0].eef_site_id["right"]]
         if self._simulation._check_grasp(gripper=self._simulation.robots[0].gripper, object_geoms=self._graspable()):
             return self.stages.index("grasp")
-        return int(np.linalg.norm(self.data.xpos[self._object_body()] - gripper) < REACH)
+        return int(np.linalg.norm(self._object_body().xpos - gripper) < REACH)
 
     def _graspable(self) -> Any:
         """robosuite's model of the object."""
         raise NotImplementedError
 
-    def _object_body(self) -> int:
-        """Index of the object's body in the model."""
-        raise NotImplementedError
+    def _object_body(self) -> Any:
+        """The object's body in the simulation."""
+        return self.data.body(self._graspable().root_body)
 
 
 class SparseLiftEnv(SparseRobosuiteEnv):
@@ -213,9 +213,6 @@ class SparseLiftEnv(SparseRobosuiteEnv):
 
     def _graspable(self) -> Any:
         return self._simulation.cube
-
-    def _object_body(self) -> int:
-        return self._simulation.cube_body_id
 
     def checkpoint_state(self) -> dict[str, Any]:
         """As above, and the cube's half edges in metres, (3,)."""
@@ -239,15 +236,12 @@ class SparsePickPlaceCanEnv(SparseRobosuiteEnv):
 
     def _present_stage(self) -> int:
         stage = super()._present_stage()
-        height = self.data.xpos[self._object_body()][2] - self._simulation.bin1_pos[2]
+        height = self._object_body().xpos[2] - self._simulation.bin1_pos[2]
         is_lifted = self.stages[stage] == "grasp" and height > LIFTED
         return self.stages.index("lift") if is_lifted else stage
 
     def _graspable(self) -> Any:
         return self._simulation.objects[self._simulation.object_id]
-
-    def _object_body(self) -> int:
-        return self._simulation.obj_body_id[self._simulation.obj_to_use]
 
 
 def make_simulation(name: str, **kwargs: Any) -> Any:
