@@ -53,7 +53,6 @@ class WithDemonstrations(ReplayBuffer):
     :raises ValueError: for a share out of range
     """
 
-    _demonstrated_class: ClassVar[type[ReplayBuffer]]
     _own_keywords: ClassVar[tuple[str, ...]] = ()  # of a subclass, not for the demonstrations' buffer
 
     @checked
@@ -66,7 +65,7 @@ class WithDemonstrations(ReplayBuffer):
         if demonstrations is not None:
             skipped = {"n_envs", "optimize_memory_usage", *self._own_keywords}
             kwargs = {key: value for key, value in kwargs.items() if key not in skipped}
-            kind: Any = self._demonstrated_class
+            kind: Any = next(base for base in type(self).__mro__ if base.__module__.startswith("stable_baselines3."))
             self.demonstrated = kind(len(demonstrations), *args[1:], n_envs=1, **kwargs)
             assert isinstance(self.action_space, spaces.Box)
             fill_with_demonstrations(self.demonstrated, demonstrations, self.observation_space, self.action_space)
@@ -90,25 +89,17 @@ class WithDemonstrations(ReplayBuffer):
 class DemonstrationReplayBuffer(WithDemonstrations):
     """SB3's replay buffer with demonstrations; see :class:`WithDemonstrations`."""
 
-    _demonstrated_class = ReplayBuffer
-
 
 class DemonstrationNStepReplayBuffer(WithDemonstrations, NStepReplayBuffer):
     """SB3's n-step replay buffer with demonstrations, whose returns are n-step too."""
-
-    _demonstrated_class = NStepReplayBuffer
 
 
 class DemonstrationDictReplayBuffer(WithDemonstrations, DictReplayBuffer):
     """SB3's replay buffer for Dict observations with demonstrations."""
 
-    _demonstrated_class = DictReplayBuffer
-
 
 class DemonstrationHerReplayBuffer(WithDemonstrations, HerReplayBuffer):
     """SB3's hindsight replay buffer with demonstrations, which are relabelled as the agent's own transitions are."""
-
-    _demonstrated_class = HerReplayBuffer
 
     def set_env(self, env: VecEnv) -> None:
         """:param env: the environment whose ``compute_reward`` relabels"""
