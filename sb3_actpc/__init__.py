@@ -1,10 +1,10 @@
 """ActPC (active predictive coding) for Stable-Baselines3: a backprop-free agent for sparse-reward robot control."""
 
 from importlib import import_module
-from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
 from sb3_actpc.envs import register_envs
+from sb3_actpc.utils.extras import installed_version
 
 if TYPE_CHECKING:
     from sb3_actpc.actpc import ActPC, CnnPolicy, MlpPolicy, MultiInputPolicy
@@ -12,10 +12,7 @@ if TYPE_CHECKING:
     from sb3_actpc.experiments.runs import preset
     from sb3_actpc.ngc import NGCCircuit
 
-try:
-    __version__ = version("sb3-actpc")
-except PackageNotFoundError:  # a checkout that is not installed
-    __version__ = "0+unknown"
+__version__ = installed_version("sb3-actpc")
 
 __all__ = [
     "ActPC",

@@ -24,7 +24,7 @@ from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 from sb3_actpc.checkpoints.bundle import Bundle, BundleWriter, Report
 from sb3_actpc.checkpoints.encoding import Decoder, Encoder
 from sb3_actpc.checkpoints.simulators import capture_vec_env, env_name, restore_vec_env, set_attribute, vec_env_layers
-from sb3_actpc.utils.versions import installed_version
+from sb3_actpc.utils.extras import installed_version
 
 _COUNTERS = (
     "num_timesteps",

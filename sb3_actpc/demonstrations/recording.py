@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium import spaces
 
 from sb3_actpc.demonstrations.rows import box_paths, join_observations, transition_columns
-from sb3_actpc.utils.versions import installed_version
+from sb3_actpc.utils.extras import installed_version
 
 Columns = dict[str, np.ndarray]
 Report = Callable[[str], None]

@@ -1,7 +1,8 @@
-"""Packages that only a part of the users needs."""
+"""Packages that may not be installed, and the versions of those that are."""
 
 import importlib
 import sys
+from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
 NUMPY_1_PYTHON = (3, 12)  # the newest with wheels of NumPy 1, which robosuite, d3rlpy and robomimic need
@@ -17,3 +18,11 @@ def import_extra(module: str, extra: str) -> Any:
         if module == "robosuite" and sys.version_info[:2] > NUMPY_1_PYTHON:  # where the extra leaves it out
             where = f" from Python 3.{NUMPY_1_PYTHON[1]} or older, which has wheels of the NumPy 1 that robosuite needs"
         raise ImportError(f'{error}: install what is needed with pip install "sb3-actpc[{extra}]"{where}') from error
+
+
+def installed_version(package: str) -> str:
+    """Of a distribution; ``"unknown"`` for a source checkout, or an extra, that is not installed."""
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "unknown"

@@ -4,7 +4,7 @@ import platform
 import subprocess
 from pathlib import Path
 
-from sb3_actpc.utils.versions import installed_version
+from sb3_actpc.utils.extras import installed_version
 
 _PACKAGES = ("sb3-actpc", "stable-baselines3", "torch", "gymnasium", "mujoco", "robosuite", "numpy")
 CHECKOUT = Path(__file__).resolve().parents[3]
