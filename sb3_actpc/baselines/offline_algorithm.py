@@ -112,7 +112,6 @@ class OfflineAlgorithm(LearnsFromDemonstrations):
         if self.get_vec_normalize_env() is not None:
             raise ValueError(f"{type(self).__name__} normalises observations itself: leave VecNormalize out")
         self._take(self._fitted_demonstrations())
-        self._is_shown = True
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         """As SB3's; an agent that was loaded without an environment gets its demonstrations now."""
@@ -130,7 +129,7 @@ class OfflineAlgorithm(LearnsFromDemonstrations):
     ) -> SelfOffline:
         """As SB3's: ``total_timesteps`` are gradient steps, callbacks are called after each, and ``log_interval`` of them
         lie between two lines of the log."""
-        if not getattr(self, "_is_shown", False):
+        if self.env is None:
             raise ValueError(f"{type(self).__name__} was loaded without an environment: set_env() first")
         name = tb_log_name or type(self).__name__
         total, callback = self._setup_learn(total_timesteps, callback, reset_num_timesteps, name, progress_bar)
@@ -148,6 +147,3 @@ class OfflineAlgorithm(LearnsFromDemonstrations):
                 break
         callback.on_training_end()
         return self
-
-    def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_is_shown"]

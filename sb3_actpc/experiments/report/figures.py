@@ -137,10 +137,9 @@ def draw_ablation(values: Mapping[str, np.ndarray], measure: str, title: str, pa
 def draw_diagnostics(results: Results, groups: Mapping[str, pd.DataFrame], task: str, path: Path) -> bool:
     """What ActPC logged about itself: a panel for each kind of quantity, a colour for each variant (label -> runs of one
     task), a line for every run. Without anything to draw no file is written, and the answer is False."""
-    logged = {title: [one for one in columns if one in results.diagnostics] for title, columns in DIAGNOSTIC_PANELS.items()}
-    everyone = pd.concat(groups.values()).index
-    rows = results.diagnostics[results.diagnostics["run"].isin(everyone)]
-    panels = {title: [one for one in columns if rows[one].notna().any()] for title, columns in logged.items()}
+    rows = results.diagnostics[results.diagnostics["run"].isin(pd.concat(groups.values()).index)]
+    logged = set(rows.columns[rows.notna().any()])
+    panels = {title: [one for one in columns if one in logged] for title, columns in DIAGNOSTIC_PANELS.items()}
     panels = {title: columns for title, columns in panels.items() if columns}
     if not panels:
         return False
