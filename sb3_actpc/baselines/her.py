@@ -9,7 +9,7 @@ from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_actpc.actpc.arguments import Share, checked
 from sb3_actpc.baselines.demonstration_buffers import DemonstrationHerReplayBuffer, WithDemonstrations
-from sb3_actpc.baselines.prioritized import DemonstrationPrioritizedHerReplayBuffer, PrioritizedHerReplayBuffer
+from sb3_actpc.baselines.prioritized import DemonstrationPrioritizedHerReplayBuffer
 from sb3_actpc.baselines.td3 import DDPGDemo
 
 
@@ -96,11 +96,9 @@ class HER(DDPGDemo):
 
     def _critic_loss(self, values: th.Tensor, targets: th.Tensor) -> th.Tensor:
         """The squared errors by importance weight; the priorities follow the errors of the first critic."""
-        buffer = self.replay_buffer
-        if not isinstance(buffer, PrioritizedHerReplayBuffer) or buffer.importance_weights is None:
-            return super()._critic_loss(values, targets)
-        n_own = len(targets) - buffer.n_demonstrated(len(targets))  # type: ignore[attr-defined]
-        if not n_own:
+        buffer: Any = self.replay_buffer
+        n_own = len(targets) - buffer.n_demonstrated(len(targets))
+        if not n_own or getattr(buffer, "importance_weights", None) is None:
             return super()._critic_loss(values, targets)
         weights = th.ones_like(targets)
         weights[:n_own] = buffer.importance_weights

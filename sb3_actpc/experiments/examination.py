@@ -409,7 +409,7 @@ def _correlation(blocks: list[np.ndarray], column: int, rng: np.random.Generator
     """Spearman's, of columns 0 and another of all blocks (one a state), and its standard error over states; or NaN."""
 
     def correlation(parts: list[np.ndarray]) -> float:
-        return float(pd.DataFrame(np.concatenate(parts)[:, [0, column]]).corr("spearman", min_periods=3).iloc[0, 1])
+        return float(pd.DataFrame(np.concatenate(parts)[:, [0, column]]).corr("spearman", min_periods=3).to_numpy()[0, 1])
 
     n = len(blocks)
     resampled = [correlation([blocks[i] for i in rng.integers(n, size=n)]) for _ in range(N_RESAMPLES)]

@@ -78,20 +78,14 @@ class _OverSeeds:
     """Values of the seeds, which a format makes into one text."""
 
     def __init__(self, values: pd.Series) -> None:
-        self.values = values.to_numpy(dtype=np.float64)
+        self.values = values.astype(float)
 
     def __format__(self, form: str) -> str:
         how, _, form = form.rpartition(" ")
-        known: dict[str, Any] = {
-            "": [self.values.mean()],
-            "each": self.values,
-            "min": [self.values.min()],
-            "max": [self.values.max()],
-            "std": [self.values.std(ddof=1) if len(self.values) > 1 else np.nan],
-        }
-        if how not in known:
+        if how not in ("", "each", "min", "max", "std"):
             raise ValueError(f"unknown {how!r} in a format: each, min, max, std, or nothing for the mean")
-        return ", ".join(number(value, form) for value in known[how])
+        values = self.values if how == "each" else [self.values.agg(how or "mean", skipna=False)]
+        return ", ".join(number(value, form) for value in values)
 
 
 def _table(spec: dict[str, Any], folder: Path) -> str:

@@ -95,20 +95,17 @@ def _rendering(env_id: str, env_kwargs: dict[str, Any]) -> Iterator[Any]:
 
     from sb3_actpc.experiments.runs.environments import make_env
 
-    env = None
     try:
         try:
             env = make_env(env_id, env_kwargs, render_mode="rgb_array")
         except ValueError as error:  # it takes no render_mode
             raise NotImplementedError(str(error)) from error
-        if env.render_mode is None:
-            raise NotImplementedError(f"{env_id} takes render_mode and does not keep it")
-        yield env
+        with contextlib.closing(env):
+            if env.render_mode is None:
+                raise NotImplementedError(f"{env_id} takes render_mode and does not keep it")
+            yield env
     except (FatalError, gym.error.Error, ImportError, OSError, RuntimeError, AttributeError) as error:
         raise RenderingUnavailable(f"{type(error).__name__}: {error}") from error
-    finally:
-        if env is not None:
-            env.close()
 
 
 def _replay(demonstrations: Demonstrations, env: Any, n_frames: int) -> list[Any]:
