@@ -47,17 +47,13 @@ from sb3_actpc.actpc.features import Batch, CircuitInputs
 from sb3_actpc.actpc.habit import Trials
 from sb3_actpc.actpc.policies import POLICIES, ActPCActor, ActPCPolicy, Critics, check_policy, check_policy_kwargs
 from sb3_actpc.actpc.reward_signals import InternalSignals, summed_squared_errors
+from sb3_actpc.actpc.room import Room
 from sb3_actpc.actpc.self_imitation import (
-    MOST_DISTANCES,
-    MOST_MEASURED,
-    MOST_NEIGHBOURS,
     Episodes,
     Observations,
     Refresh,
-    distances_to_nearest,
     imitated_return,
     is_by_return,
-    leave_room,
     map_observations,
     sample_union,
 )
@@ -500,7 +496,7 @@ class ActPC(OffPolicyAlgorithm):
             is_weighted = self.expert is not None and is_by_return([self.expert.episodes], self.refresh.weighting)
             memory.takes_all = is_weighted and self.refresh.own_episodes == "paid"
             if memory.episodes is not None:
-                memory.episodes.distances = None  # the demonstrations may be others by now
+                memory.episodes.neighbours = None  # the demonstrations may be others by now
         self._warn_of_idle_settings()
         if self.verbose:
             print(self.describe())
@@ -545,7 +541,8 @@ class ActPC(OffPolicyAlgorithm):
             f"reward: {ext:g} x task (alpha_ext) + {ep:g} x epistemic (alpha_ep) + {inst:g} x instrumental signal (alpha_in)\n"
             f"demonstrations: {'none' if self.expert is None else self.expert.demonstrations!r}\n"
             f"imitated: {self._describe_imitated()}\n"
-            f"noise on what clones imitate: {self.clone_noise:g} of the distance to another demonstration\n"
+            f"noise on what clones imitate: {self.clone_noise:g} of a step's length"
+            f"{', and steps between the episodes' if self.clone_noise else ''}\n"
             f"off: {', '.join(name for name, value in parts.items() if not value) or 'nothing'}"
         )
 
@@ -948,44 +945,32 @@ class ActPC(OffPolicyAlgorithm):
         return self.actor.circuit.hebbian_update(state)
 
     def _sample_imitated(self, n: int, noise: float = 0.0) -> tuple[th.Tensor, th.Tensor, th.Tensor | None]:
-        """Features, actions and working memory of ``n`` imitated steps, with noise where something is demonstrated."""
-        inputs = self.inputs
-        if noise and self.expert is not None:
-            self._measure_distances()
-        samples = sample_union(self._imitated(), n, self.memory_history, self.refresh.weighting)
-        features = inputs.features(inputs.observations(samples.observations))
-        if noise and samples.distances is not None:
-            features = features + noise * inputs.tensor(samples.distances) * th.randn_like(features)
-        return features, inputs.tensor(samples.actions), inputs.memory(*inputs.past(samples.history, samples.history_mask))
+        """Features, actions and working memory of ``n`` imitated steps; with noise, of steps between the demonstrations."""
+        inputs, parts = self.inputs, self._imitated()
+        room = self.room if noise else None
+        if room is not None:
+            for part in parts:
+                room.measure(part)
+        samples = sample_union(parts, n, self.memory_history, self.refresh.weighting)
+        features, actions = inputs.features(inputs.observations(samples.observations)), inputs.tensor(samples.actions)
+        if room is not None and samples.neighbours is not None:
+            features, actions = room.between(features, actions, samples.neighbours, noise)
+        return features, actions, inputs.memory(*inputs.past(samples.history, samples.history_mask))
+
+    @property
+    def room(self) -> Room | None:
+        """What lies between the demonstrations; None without any."""
+        if self.expert is not None and self.expert.room is None:
+            shown = self.expert.episodes
+            self.expert.room = Room(shown, self._features_of, is_by_return([shown], self.refresh.weighting))
+        return None if self.expert is None else self.expert.room
 
     @property
     def clone_noise(self) -> float:
         """Noise on what clones imitate: as asked for, or by default 1 where the demonstrations leave room and 0 where not."""
-        if self.expert is None:
+        if (room := self.room) is None:
             return 0.0
-        if self.refresh.noise is not None:
-            return self.refresh.noise
-        if self.expert.leaves_room is None:
-            shown = self.expert.episodes
-            rows, near = (np.arange(0, len(shown), -(-len(shown) // most)) for most in (MOST_MEASURED, MOST_NEIGHBOURS))
-            rows = rows[(rows + 1 < len(shown)) & (shown.starts[rows] == shown.starts[np.minimum(rows + 1, len(shown) - 1)])]
-            here, next_, others = (self._features_of(shown, some) for some in (rows, rows + 1, near))
-            self.expert.leaves_room = leave_room(here, next_, shown.starts[rows], others, shown.starts[near])
-        return float(self.expert.leaves_room)
-
-    def _measure_distances(self) -> None:
-        """Of all imitated steps, where they are not known: own episodes are others after each that is stored."""
-        assert self.expert is not None
-        shown = self.expert.episodes
-        for part in self._imitated():
-            if part.distances is None:
-                near = np.arange(0, len(shown), -(-len(shown) // MOST_NEIGHBOURS))
-                every = -(-len(part) // MOST_DISTANCES)
-                rows = np.arange(0, len(part), every)
-                features, others = self._features_of(part, rows), self._features_of(shown, near)
-                numbers = shown.starts[rows] if part is shown else np.full(len(rows), -1)  # own episodes are none of these
-                measured = distances_to_nearest(features, numbers, others, shown.starts[near])
-                part.distances = np.repeat(measured, every, axis=0)[: len(part)]
+        return float(room.is_wide) if self.refresh.noise is None else self.refresh.noise
 
     def _features_of(self, episodes: Episodes, rows: np.ndarray) -> th.Tensor:
         """(B, n_features) of (B,) rows, some at a time: there can be many images."""

@@ -10,6 +10,7 @@ from gymnasium import spaces
 
 from sb3_actpc.actpc.features import Batch, CircuitInputs
 from sb3_actpc.actpc.reward_signals import STORED, Normalize
+from sb3_actpc.actpc.room import Room
 from sb3_actpc.actpc.self_imitation import Episodes
 from sb3_actpc.demonstrations.dataset import Demonstrations
 from sb3_actpc.demonstrations.rows import split_observations
@@ -45,7 +46,7 @@ class DemonstrationReplay:
         )
         self.epistemic, self.instrumental = np.zeros((2, len(demonstrations)), dtype=np.float32)
         self.has_signals = self.has_scale = False
-        self.leaves_room: bool | None = None  # whether noise fills what lies between the episodes; None before that is asked
+        self.room: Room | None = None  # what lies between the episodes; None before that is asked
 
     def __len__(self) -> int:
         return len(self.demonstrations)

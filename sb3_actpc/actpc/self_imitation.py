@@ -18,9 +18,6 @@ Observations = np.ndarray | dict[str, np.ndarray]
 TensorObservations = th.Tensor | dict[str, th.Tensor]
 Weighting = Literal["returns", "uniform"]
 RETURN_EXPONENT = 4.0  # an episode that was paid half as much is imitated a sixteenth as often
-MOST_NEIGHBOURS = 20_000  # demonstrated steps among which the nearest is looked for
-MOST_DISTANCES = 100_000  # imitated steps of which that is done; those between them take the distances of the one before
-MOST_MEASURED = 1000  # steps by which it is judged whether there is room
 PATIENCE = 20  # episodes, all with a negative return, after which the memory warns
 
 
@@ -31,11 +28,12 @@ class Refresh:
         reward-weighted regression, Peters and Schaal 2007; uniformly where no demonstration's return is positive) or
         "uniform" (the paper). Returns are compared as they are: where episodes differ in difficulty, as with random goals, the
         easy ones are imitated most
-    :param noise: standard deviation of Gaussian noise on the features (normalised observations) that clones imitate, not on
-        the working memory's nor on what the learning actor is refreshed with, which has to become precise; dimension by
-        dimension, in units of the distance to the nearest demonstrated step of another episode
-        (:func:`distances_to_nearest`), so that it fills the room between demonstrations. 0 for none (the paper); None for 1
-        where the demonstrations leave room (:func:`leave_room`), else 0
+    :param noise: clones imitate steps between those that are shown and the nearest of other episodes, with Gaussian noise of
+        this standard deviation on the features (normalised observations), in units of a step's length
+        (:mod:`sb3_actpc.actpc.room`); not on the working memory's, nor on what the learning actor is refreshed with, which
+        has to become precise. 0 for neither (the paper); None for 1 where the demonstrations leave room (the nearest step of
+        another one is farther than a step leads, by the medians: arms and goals, 2 to 8 times; gaits, 0.03 to 0.7, where
+        this only blurs what to do), else 0
     :param own_episodes: which of them are imitated too: "paid" (every one, as often as its return says; "best" where steps are
         not drawn by returns, or nothing is demonstrated) or "best" (those that are paid at least what the best one was: the
         paper)
@@ -68,14 +66,14 @@ class ImitationSamples(NamedTuple):
     :param actions: (B, A), scaled to [-1, 1]
     :param history: (B, H, *obs_shape), the observations before each row in its episode, oldest first; or None
     :param history_mask: (B, H), 1 where there was such an observation, or None
-    :param distances: (B, n_features), or None: see :class:`Episodes`
+    :param neighbours: (B, k), or None: see :class:`Episodes`
     """
 
     observations: Observations
     actions: np.ndarray
     history: Observations | None
     history_mask: np.ndarray | None
-    distances: np.ndarray | None = None
+    neighbours: np.ndarray | None = None
 
 
 def map_observations(function: Callable[[Any], Any], observations: Any) -> Any:
@@ -93,14 +91,14 @@ class Episodes:
     :param actions: (N, A), scaled to [-1, 1]
     :param starts: (N,) index of the first transition of each row's episode
     :param returns: (N,) what each row's episode was paid
-    :param distances: (N, n_features), of :func:`distances_to_nearest`; None before they are measured
+    :param neighbours: (N, k) rows of the demonstrations (:mod:`sb3_actpc.actpc.room`); None before they are looked for
     """
 
     observations: Observations
     actions: np.ndarray
     starts: np.ndarray
     returns: np.ndarray
-    distances: np.ndarray | None = None
+    neighbours: np.ndarray | None = None
 
     @cached_property
     def weights(self) -> np.ndarray:
@@ -137,9 +135,9 @@ class Episodes:
     def take(self, indices: np.ndarray, history: int = 0) -> ImitationSamples:
         """(B,) rows, each with ``history`` preceding observations of the same episode."""
         past, mask = self.past(indices, history)
-        distances = None if self.distances is None else self.distances[indices]
+        neighbours = None if self.neighbours is None else self.neighbours[indices]
         observations = map_observations(lambda array: array[indices], self.observations)
-        return ImitationSamples(observations, self.actions[indices], past, mask, distances)
+        return ImitationSamples(observations, self.actions[indices], past, mask, neighbours)
 
     def past(
         self, indices: np.ndarray, history: int, including: bool = False
@@ -218,7 +216,7 @@ class SelfImitationMemory:
         """The stored episodes and their returns, for a checkpoint."""
         episodes = None
         if self.episodes is not None:
-            names = [field.name for field in fields(self.episodes) if field.name != "distances"]  # they are measured anew
+            names = [field.name for field in fields(self.episodes) if field.name != "neighbours"]  # they are looked for anew
             episodes = {name: getattr(self.episodes, name) for name in names}
         ended = [self._n_ended, None if self._n_ended == 0 else self._best_ended]
         return {"returns": list(self.returns), "lengths": list(self.lengths), "episodes": episodes, "ended": ended}
@@ -268,55 +266,6 @@ def sample_union(parts: list[Episodes], n: int, history: int = 0, weighting: Wei
         None if any(part is None for part in column) else _concatenate(column) for column in zip(*taken, strict=True)
     ]
     return ImitationSamples(*columns)
-
-
-def distances_to_nearest(
-    features: th.Tensor, episodes: np.ndarray, demonstrated: th.Tensor, demonstrated_episodes: np.ndarray
-) -> np.ndarray:
-    """
-    How far each step is from the nearest demonstrated one of another episode, in every dimension: the room that a clone fills
-    by guessing.
-
-    :param features: (N, n_features) of the steps
-    :param episodes: (N,) numbers of their episodes
-    :param demonstrated: (M, n_features) of demonstrations
-    :param demonstrated_episodes: (M,) numbers of their episodes
-    :return: (N, n_features), zeros where there is no other episode
-    """
-    of_features, of_demonstrated = (th.as_tensor(one, device=features.device) for one in (episodes, demonstrated_episodes))
-    distances, mean = th.zeros_like(features), demonstrated.mean(0)  # far from 0 the lengths would lose their digits
-    for rows in th.arange(len(features), device=features.device).split(1024):
-        lengths = th.cdist(features[rows] - mean, demonstrated - mean)
-        lengths.masked_fill_(of_features[rows, None] == of_demonstrated, th.inf)
-        shortest, nearest = lengths.min(dim=1)
-        there = shortest.isfinite()
-        distances[rows[there]] = (demonstrated[nearest[there]] - features[rows[there]]).abs()
-    return distances.cpu().numpy()
-
-
-def leave_room(
-    features: th.Tensor,
-    next_features: th.Tensor,
-    episodes: np.ndarray,
-    demonstrated: th.Tensor,
-    demonstrated_episodes: np.ndarray,
-) -> bool:
-    """
-    Whether demonstrations leave room between their episodes: the nearest step of another one is farther than a step leads.
-
-    A scale-free measure of how sparsely a task is shown. Arms and goals have distances of 2 to 7 steps (each episode begins
-    and ends elsewhere), gaits of 0.03 to 0.7, where noise only blurs what to do.
-
-    :param features: (N, n_features) of some steps
-    :param next_features: (N, n_features) one step later
-    :param episodes: (N,) numbers of their episodes
-    :param demonstrated: as for :func:`distances_to_nearest`
-    :param demonstrated_episodes: likewise
-    :return: whether it is so, by the medians
-    """
-    distances = distances_to_nearest(features, episodes, demonstrated, demonstrated_episodes)
-    lengths = (next_features - features).norm(dim=1).cpu().numpy()
-    return bool(len(lengths)) and bool(np.median(np.linalg.norm(distances, axis=1)) > np.median(lengths))
 
 
 def _concatenate(arrays: Sequence[Any]) -> Any:

@@ -21,7 +21,6 @@ from sb3_actpc import ActPC, Demonstrations
 from sb3_actpc.actpc import actpc as actpc_module
 from sb3_actpc.actpc import demonstration_replay
 from sb3_actpc.actpc.diagnostics import Diagnostics
-from sb3_actpc.actpc.self_imitation import distances_to_nearest
 from sb3_actpc.ngc import NGCCircuit, settle_coupled
 from tests.actpc.agents import QUICK, differ, imitating, make, plain, weights_of
 from tests.actpc.envs import CountingEnv, demonstrations
@@ -464,96 +463,6 @@ def test_actor_warm_start_imitates_before_any_step():
         errors.append(float((actions - th.as_tensor(data.actions / 2)).square().mean()))
         assert not differ(weights_of(model.actor_target), weights_of(model.actor.circuit))
     assert errors[1] < 0.8 * errors[0]
-
-
-def test_noise_on_refreshed_observations_is_ridge_regression():
-    """Of a linear actor on white observations noise leaves the share 1 / (1 + σ^2) (Bishop, 1995), σ in units of distances."""
-    data = demonstrations(n_episodes=20, length=50)
-    data = dataclasses.replace(data, actions=0.2 * data.observations[:, :2])
-    slopes = []
-    for noise in (0.0, 0.5):
-        model = make(
-            demonstrations=data,
-            policy_kwargs={"actor_kwargs": {"net_arch": []}},
-            actor_warm_start=2500,
-            refresh_kwargs={"noise": noise},
-        )
-        model.expert.episodes.distances = np.full_like(data.observations, 2.0)
-        model.pretrain()
-        slopes.append(model.actor.circuit.weights[0][:, :2].diagonal().mean().item())
-    assert slopes == pytest.approx([0.1, 0.05], rel=0.1)
-
-
-def test_noise_fills_the_room_between_demonstrations():
-    """Its standard deviation is the distance to the nearest demonstrated step of another episode, in each dimension."""
-    data = demonstrations(n_episodes=2, length=50)
-    observations = np.zeros_like(data.observations)
-    observations[50:] = np.arange(observations.shape[1]) / 10
-    data = dataclasses.replace(data, observations=observations)
-    for noise in (0.0, None, 0.5):  # None: 1, as nothing moves in either episode
-        model = make(demonstrations=data, refresh_kwargs={"noise": noise})
-        features = model._sample_imitated(20_000, model.clone_noise)[0].numpy()
-        first = features[: len(features) // 2 - 200]  # rows come in order
-        assert first.std(0) == pytest.approx((1.0 if noise is None else noise) * observations[-1], rel=0.05)
-        assert first.mean(0) == pytest.approx(np.zeros(observations.shape[1]), abs=0.01)
-    for place in (7.0, -9.0):  # own episodes, far from both and from each other
-        model._sample_imitated(10, 0.5)
-        model.replay_buffer.self_imitation.store(np.full_like(observations, place), data.actions, 1.0)
-        features = model._sample_imitated(10_000, 0.5)[0].numpy()
-        nearest = observations[-1] if place > 0 else np.zeros(observations.shape[1])
-        own = features[len(features) * 2 // 3 + 200 :] if place < 0 else features[len(features) // 2 + 200 :]
-        assert own.mean(0) == pytest.approx(np.full(observations.shape[1], place), rel=0.1)
-        assert own.std(0) == pytest.approx(0.5 * abs(place - nearest), rel=0.1)
-
-
-def test_distances_are_to_the_nearest_step_of_another_episode():
-    features = th.tensor([[0.0, 0.0], [0.1, 0.0], [1.0, -2.0], [5.0, 5.0]])
-    numbers = np.array([0, 0, 2, 3])
-    expected = [[1.0, 2.0], [0.9, 2.0], [0.9, 2.0], [4.9, 5.0]]
-    for far in (0.0, 4096.0):
-        there = features + far
-        assert distances_to_nearest(there, numbers, there, numbers) == pytest.approx(np.array(expected), abs=1e-3)
-    assert not distances_to_nearest(features, np.zeros(4), features, np.zeros(4)).any()  # one episode
-
-
-@pytest.mark.parametrize("scale", [1.0, 1000.0])
-@pytest.mark.parametrize(("apart", "noise"), [(0.08, 0.0), (0.12, 1.0)])
-def test_without_a_word_on_it_there_is_noise_where_the_next_episode_is_farther_than_the_next_step(apart, noise, scale):
-    """Two parallel lines in steps of 0.1; whatever the unit."""
-    data = demonstrations(n_episodes=2, length=30)
-    observations = np.zeros_like(data.observations)
-    observations[:, 0] = np.tile(np.arange(30), 2) / 10
-    observations[30:, 1] = apart
-    model = make(demonstrations=dataclasses.replace(data, observations=scale * observations))
-    assert model.clone_noise == noise
-    assert f"noise on what clones imitate: {noise:g} of" in model.describe()
-
-
-@pytest.mark.parametrize("lengths", [(40,), (1, 1, 1)])
-def test_one_episode_or_episodes_of_one_step_leave_no_room(lengths):
-    data = demonstrations(n_episodes=len(lengths), length=lengths[0])
-    model = make(demonstrations=data)
-    assert model.clone_noise == 0.0
-    assert not make().clone_noise
-
-
-def test_distances_of_long_sets_are_to_some_of_their_steps(monkeypatch):
-    monkeypatch.setattr(actpc_module, "MOST_NEIGHBOURS", 3)  # rows 0, 2 and 4
-    data = demonstrations(n_episodes=5, length=1)
-    observations = np.repeat(np.float32([[0.0], [1.0], [10.0], [11.0], [30.0]]), data.observations.shape[1], axis=1)
-    model = make(demonstrations=dataclasses.replace(data, observations=observations), refresh_kwargs={"noise": 1.0})
-    model._sample_imitated(1, 1.0)
-    assert model.expert.episodes.distances[:, 0].tolist() == [10.0, 1.0, 10.0, 1.0, 20.0]
-
-
-@pytest.mark.parametrize(("most", "expected"), [(5, [3.0, 1.0, 1.0, 6.0, 20.0]), (3, [3.0, 3.0, 1.0, 1.0, 20.0])])
-def test_of_very_long_sets_some_steps_are_measured_and_the_next_ones_take_their_distances(most, expected, monkeypatch):
-    monkeypatch.setattr(actpc_module, "MOST_DISTANCES", most)
-    data = demonstrations(n_episodes=5, length=1)
-    observations = np.repeat(np.float32([[0.0], [3.0], [4.0], [10.0], [30.0]]), data.observations.shape[1], axis=1)
-    model = make(demonstrations=dataclasses.replace(data, observations=observations), refresh_kwargs={"noise": 1.0})
-    model._sample_imitated(1, 1.0)
-    assert model.expert.episodes.distances[:, 0].tolist() == expected
 
 
 @pytest.mark.parametrize(("weighting", "share"), [("returns", 0.0), ("uniform", 0.5)])

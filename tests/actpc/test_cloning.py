@@ -239,7 +239,7 @@ def test_parameters_that_have_imitated_are_not_trained_over():
 def test_without_a_warm_start_there_is_nothing_to_measure():
     model = imitating(actor_warm_start=0)
     model.pretrain()
-    assert model.pretrained and model.expert.leaves_room is None
+    assert model.pretrained and model.expert.room is None
 
 
 def test_settings_are_checked():

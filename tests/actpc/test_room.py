@@ -1,0 +1,135 @@
+"""Between the demonstrations: neighbours, and what clones imitate there."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch as th
+
+from sb3_actpc.actpc import room as room_module
+from sb3_actpc.actpc.room import Room, nearest_steps
+from sb3_actpc.actpc.self_imitation import Episodes
+from tests.actpc.agents import make
+from tests.actpc.envs import demonstrations
+
+
+def room_of(observations, starts, actions=None, returns=None, by_return=False):
+    """A room whose features are the observations."""
+    n = len(observations)
+    actions = np.zeros((n, 1), dtype=np.float32) if actions is None else actions
+    shown = Episodes(np.float32(observations), actions, np.array(starts), np.ones(n) if returns is None else np.array(returns))
+    return Room(shown, lambda episodes, rows: th.as_tensor(episodes.observations[rows]), by_return)
+
+
+def test_neighbours_are_the_nearest_steps_of_other_episodes():
+    features = th.tensor([[0.0, 0.0], [0.1, 0.0], [1.0, -2.0], [5.0, 5.0], [5.0, 4.0]])
+    numbers = np.array([0, 0, 2, 3, 3])
+    expected = [[2, 4, -1], [2, 4, -1], [1, 4, -1], [1, 2, -1], [1, 2, -1]]
+    for far in (0.0, 4096.0):
+        there = features + far
+        assert nearest_steps(there, numbers, there, numbers, 3).tolist() == expected
+    assert (nearest_steps(features, np.zeros(5), features, np.zeros(5), 2) == -1).all()  # one episode
+    assert nearest_steps(th.zeros(1, 2), np.array([-1]), features, numbers, 2).tolist() == [[0, 2]]
+
+
+def test_steps_between_lie_on_the_plane_that_the_shown_ones_lie_on():
+    """Points between points of a linear policy are points of it: without noise nothing of it is blurred."""
+    generator = np.random.default_rng(0)
+    observations = generator.normal(size=(40, 3))
+    actions = np.float32(observations @ [[0.3], [-0.2], [0.1]])
+    room = room_of(observations, np.repeat(np.arange(0, 40, 4), 4), actions)
+    room.measure(room.shown)
+    features = room.features_of(room.shown, np.arange(40))
+    moved, turned = room.between(features, th.as_tensor(actions), room.shown.neighbours, 0.0)
+    assert not th.isclose(moved, features).any()
+    assert turned.numpy() == pytest.approx(moved.numpy() @ np.array([[0.3], [-0.2], [0.1]]), abs=1e-5)
+
+
+@pytest.mark.parametrize(("apart", "noise", "expected"), [(2.0, 0.5, 0.05), (2.0, 3.0, 0.3), (0.2, 5.0, 0.2)])
+def test_a_step_goes_a_share_of_the_way_and_is_moved_by_noise_of_its_own_length(apart, noise, expected):
+    """Two parallel lines in steps of 0.1: shares are uniform in [0, 1], and noise is along the way and no longer than it."""
+    observations = np.stack([np.tile(np.arange(30) / 10, 2), np.repeat([0.0, apart], 30)], axis=1)
+    room = room_of(observations, np.repeat([0, 30], 30), actions=np.float32(np.repeat([[0.0], [1.0]], 30, axis=0)))
+    assert room.step == pytest.approx(0.1) and room.is_wide
+    room.measure(room.shown)
+    assert room.shown.neighbours.tolist() == [[(row + 30) % 60, -1, -1] for row in range(60)]
+    rows = np.repeat(np.arange(30), 1000)
+    features, actions = room.features_of(room.shown, rows), th.as_tensor(room.shown.actions[rows])
+    moved, turned = room.between(features, actions, room.shown.neighbours[rows], noise)
+    assert th.equal(moved[:, 0], features[:, 0])
+    share = turned[:, 0].double()
+    assert share.min() >= 0.0 and share.max() <= 1.0
+    assert [share.mean().item(), share.var().item()] == pytest.approx([1 / 2, 1 / 12], rel=0.03)
+    rest = moved[:, 1].double() - share * apart
+    assert rest.std().item() == pytest.approx(expected, rel=0.03)
+    assert rest.mean().item() == pytest.approx(0.0, abs=4 * expected / len(rows) ** 0.5)
+
+
+def test_every_known_neighbour_is_gone_to_and_a_step_without_one_stays():
+    room = room_of([[0.0], [1.0], [-2.0], [9.0]], [0, 1, 2, 3])
+    room.measure(room.shown)
+    assert room.shown.neighbours[0].tolist() == [1, 2, 3]
+    neighbours = np.repeat([[1, 2, -1]], 3000, axis=0)
+    moved = room.between(th.zeros(3000, 1), th.zeros(3000, 1), neighbours, 0.0)[0]
+    assert float((moved > 0.0).float().mean()) == pytest.approx(0.5, abs=0.05) and (moved != 0.0).all()
+    alone = room.between(th.ones(5, 1), th.ones(5, 1), np.full((5, 3), -1), 1.0)
+    assert [one.tolist() for one in alone] == [[[1.0]] * 5] * 2
+
+
+def test_steps_that_are_never_drawn_are_no_neighbours():
+    observations, returns = [[0.0], [1.0], [5.0]], [1.0, 0.0, 2.0]
+    for by_return, expected in ((True, [2, -1, -1]), (False, [1, 2, -1])):
+        room = room_of(observations, [0, 1, 2], returns=returns, by_return=by_return)
+        room.measure(room.shown)
+        assert room.shown.neighbours[0].tolist() == expected
+
+
+@pytest.mark.parametrize("scale", [1.0, 1000.0])
+@pytest.mark.parametrize(("apart", "noise"), [(0.08, 0.0), (0.12, 1.0)])
+def test_without_a_word_on_it_there_is_noise_where_the_next_episode_is_farther_than_the_next_step(apart, noise, scale):
+    """Two parallel lines in steps of 0.1; whatever the unit."""
+    data = demonstrations(n_episodes=2, length=30)
+    observations = np.zeros_like(data.observations)
+    observations[:, 0] = np.tile(np.arange(30), 2) / 10
+    observations[30:, 1] = apart
+    data = dataclasses.replace(data, observations=scale * observations)
+    model = make(demonstrations=data)
+    assert model.clone_noise == noise
+    assert f"noise on what clones imitate: {noise:g} of" in model.describe()
+    assert make(demonstrations=data, refresh_kwargs={"noise": 0.3}).clone_noise == 0.3
+
+
+@pytest.mark.parametrize("lengths", [(40,), (1, 1, 1)])
+def test_one_episode_or_episodes_of_one_step_leave_no_room(lengths):
+    data = demonstrations(n_episodes=len(lengths), length=lengths[0])
+    assert make(demonstrations=data).clone_noise == 0.0
+    assert not make().clone_noise
+
+
+def test_neighbours_in_long_sets_are_some_of_their_steps(monkeypatch):
+    monkeypatch.setattr(room_module, "MOST_NEIGHBOURS", 3)  # rows 0, 2 and 4
+    room = room_of([[0.0], [1.0], [10.0], [11.0], [30.0]], np.arange(5))
+    room.measure(room.shown)
+    assert room.shown.neighbours[:, 0].tolist() == [2, 0, 0, 2, 2]
+
+
+@pytest.mark.parametrize(("most", "expected"), [(5, [1, 2, 1, 2, 3]), (3, [1, 1, 1, 1, 3])])
+def test_of_very_long_sets_some_steps_are_measured_and_the_next_ones_take_their_neighbours(most, expected, monkeypatch):
+    monkeypatch.setattr(room_module, "MOST_SEARCHES", most)
+    room = room_of([[0.0], [3.0], [4.0], [10.0], [30.0]], np.arange(5))
+    room.measure(room.shown)
+    assert room.shown.neighbours[:, 0].tolist() == expected
+
+
+def test_own_episodes_are_moved_towards_the_demonstrations():
+    data = demonstrations(n_episodes=2, length=50)
+    data = dataclasses.replace(data, observations=np.zeros_like(data.observations))
+    model = make(demonstrations=data)
+    for place in (7.0, -9.0):  # far from both and from each other
+        model._sample_imitated(10, 0.5)
+        model.replay_buffer.self_imitation.store(np.full_like(data.observations, place), data.actions, 1.0)
+    features = model._sample_imitated(20_000, 0.5)[0]
+    for place in (7.0, -9.0):
+        own = features[features[:, 0] / place > 0.0]
+        assert len(own) == pytest.approx(20_000 / 3, rel=0.05)  # three times a hundred steps
+        assert own.mean().item() == pytest.approx(place / 2, rel=0.05)
