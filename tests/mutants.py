@@ -56,6 +56,7 @@ SIGNALS, SHOWN = "actpc/reward_signals.py", "actpc/demonstration_replay.py"
 BUFFERS, IMITATION = "actpc/buffers.py", "actpc/self_imitation.py"
 SIMULATORS, RESUMES = "checkpoints/simulators.py", "tests/checkpoints/test_exact_resume.py"
 CLONING, CLONES = "actpc/cloning.py", "tests/actpc/test_cloning.py"
+ROOM, ROOMS = "actpc/room.py", "tests/actpc/test_room.py"
 LEARNS, STORES = "tests/actpc/test_agent.py", "tests/actpc/test_buffers.py"
 COUPLED, SPARSE = "ngc/coupled.py", "envs/sparse_mujoco.py"
 STATISTICS, R_STABILITY = "experiments/report/statistics.py", "experiments/report/r_stability.py"
@@ -569,8 +570,8 @@ MUTANTS = [
         "shortfall * self.imitated_return",
         f"{HABIT} -k tenth",
     ),
-    Mutant("own episodes keep old distances", AGENT, "memory.episodes.distances = None", "pass", f"{HABIT} -k anew"),
-    Mutant("a given noise is not heeded", AGENT, "return self.refresh.noise\n", "return 1.0\n", f"{LEARNS} -k ridge"),
+    Mutant("own episodes keep old neighbours", AGENT, "memory.episodes.neighbours = None", "pass", f"{HABIT} -k anew"),
+    Mutant("a given noise is not heeded", AGENT, "else self.refresh.noise\n", "else 1.0\n", f"{ROOMS} -k without_a_word"),
     Mutant("clones imitate without noise", AGENT, "_imitated(n, self.clone_noise)", "_imitated(n)", f"{HABIT} -k noise"),
     Mutant(
         "the learning actor is blurred", AGENT, "n: int, noise: float = 0.0) -> t", "n: int, noise: float = 0.5) -> t", HABIT
@@ -612,21 +613,24 @@ MUTANTS = [
         "if False:",
         "tests/experiments/test_examination.py -k held",
     ),
-    Mutant("noise where there is no room", AGENT, "float(self.expert.leaves_room)", "1.0", f"{LEARNS} -k room"),
-    Mutant("room in any unit", IMITATION, "> np.median(lengths)", "> 0.5", f"{LEARNS} -k room"),
+    Mutant("noise where there is no room", AGENT, "float(room.is_wide)", "1.0", f"{ROOMS} -k without_a_word"),
+    Mutant("room in any unit", ROOM, "> self.step", "> 0.5", f"{ROOMS} -k without_a_word"),
+    Mutant("noise of one size", ROOM, "size * way.abs() * th.randn_like(features)", "size * th.randn_like(features)", ROOMS),
+    Mutant("noise as wide as the room", ROOM, "nan_to_num(0.0).clamp_max(1.0)", "nan_to_num(0.0).clamp(1.0, 1.0)", ROOMS),
+    Mutant("noise wider than the room", ROOM, "nan_to_num(0.0).clamp_max(1.0)", "nan_to_num(0.0)", ROOMS),
+    Mutant("other places, the same actions", ROOM, "actions + share * turn", "actions", ROOMS),
+    Mutant("a neighbour's place is taken", ROOM, "features + share * way", "features + way", ROOMS),
+    Mutant("the nearest alone", ROOM, "(np.random.random(len(neighbours)) * known)", "(0 * known)", f"{ROOMS} -k every_known"),
     Mutant(
-        "noise of one size",
-        AGENT,
-        "noise * inputs.tensor(samples.distances) * th.randn_like(features)",
-        "noise * th.randn_like(features)",
-        "tests/actpc/test_agent.py -k room_between",
+        "an episode is its own neighbour twice", ROOM, "known = of_demonstrated[nearest]", "pass", f"{ROOMS} -k neighbours"
     ),
+    Mutant("unpaid neighbours", ROOM, "np.flatnonzero(shown.weights > 0.0)", "np.arange(len(shown))", f"{ROOMS} -k never"),
     Mutant(
-        "distances within an episode",
-        IMITATION,
-        "lengths.masked_fill_(of_features[rows, None] == of_demonstrated, th.inf)",
+        "neighbours within an episode",
+        ROOM,
+        "lengths.masked_fill_(known[:, None] == of_demonstrated, th.inf)",
         "lengths.masked_fill_(lengths == 0.0, th.inf)",
-        "tests/actpc/test_agent.py -k distances",
+        f"{ROOMS} -k neighbours",
     ),
     Mutant(
         "pressure begins with all its strength",

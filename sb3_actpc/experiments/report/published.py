@@ -7,7 +7,7 @@
 The YAML file, named from the Markdown file's folder, says for each name what stands in the table:
 
     NAME:
-      from: first                    # folder of an export, beside the YAML file
+      from: first                    # folder of an export, beside the YAML file, or several: [first, second]
       rows: {ActPC: actpc, demonstrators: demonstrators}
       columns: {Hopper: SparseHopper-v5, Reacher: {task: SparseReacher-v5, score: "{success_rate:.2f}"}}
       score: "{dense_return:.0f} ({sparse_return:.0f})"
@@ -99,10 +99,11 @@ def _table(spec: dict[str, Any], folder: Path) -> str:
 def _cell(spec: dict[str, Any], folder: Path) -> str:
     if unknown := sorted(set(spec) - _KEYS):
         raise ValueError(f"unknown {', '.join(unknown)}; known are {', '.join(sorted(_KEYS))}")
-    runs = exported = _runs(folder / spec["from"])
+    folders = spec["from"] if isinstance(spec["from"], list) else [spec["from"]]
+    runs = exported = pd.concat(_runs(folder / name) for name in folders)
     for key in [key for key in _CHOOSING if key in spec]:
         if spec[key] not in (known := exported[key].unique()):
-            raise ValueError(f"no {key} {spec[key]!r} in {spec['from']}: there are {', '.join(sorted(map(str, known)))}")
+            raise ValueError(f"no {key} {spec[key]!r} in {', '.join(folders)}: there are {', '.join(sorted(map(str, known)))}")
         runs = runs[runs[key] == spec[key]]
     if runs.empty:
         return ""

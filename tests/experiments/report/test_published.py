@@ -74,6 +74,13 @@ def test_a_row_says_more_than_a_column_and_runs_of_a_changed_source_tree_are_mar
     assert table[2:] == ["| TD3 | 7 (2), 1,000 † |  |", "| ActPC | 200 (2) | 1.00 |"]
 
 
+def test_a_row_can_come_from_several_exports(folder: Path) -> None:
+    write_run(folder / "more", seed=3, final=800.0)
+    export(folder / "more", folder / "later")
+    row = "both: {from: [kept, later], variant: actpc, cell: '{dense_return:each .0f} x {n:.0f}'}"
+    assert lines(folder, row)[2] == "| both | 100, 300, 800 x 3 | -4 x 1 |"
+
+
 def test_the_command_writes_what_has_changed(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = folder / "page.md"
     path.write_text(PAGE, encoding="utf-8")
