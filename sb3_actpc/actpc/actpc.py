@@ -17,7 +17,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule, TrainFreq
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn, Schedule, TrainFreq
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 from tqdm import tqdm
 
@@ -626,6 +626,14 @@ class ActPC(OffPolicyAlgorithm):
         self.prior.apply_changes(self.prior.hebbian_update(state))
 
     # ------------------------------------------------------------------ collecting
+
+    def collect_rollouts(self, *args: Any, **kwargs: Any) -> RolloutReturn:
+        """As in SB3. A callback that stops leaves a step that was made and is not stored: the next ``learn`` must not go on
+        from the observation before it, but reset the environments."""
+        rollout = super().collect_rollouts(*args, **kwargs)
+        if not rollout.continue_training:
+            self._last_obs = None
+        return rollout
 
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1

@@ -10,6 +10,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+from stable_baselines3.common.callbacks import StopTrainingOnMaxEpisodes
 from stable_baselines3.common.env_checker import check_env
 from stable_baselines3.common.envs import BitFlippingEnv
 from stable_baselines3.common.evaluation import evaluate_policy
@@ -1212,6 +1213,33 @@ def test_a_second_learn_cuts_the_episode_it_interrupts():
     _, mask = model.replay_buffer._history_at(np.array([7, 8]), np.zeros(2, int), None)
     assert mask.tolist() == [[0, 0, 0], [0, 0, 1]]
     assert model.replay_buffer._lengths.tolist() == [2]
+
+
+class Paying(CountingEnv):
+    """Pays 1 for every step, in episodes of five."""
+
+    def __init__(self):
+        super().__init__(lengths=(5,))
+
+    def step(self, action):
+        observation, _, *rest = super().step(action)
+        return observation, 1.0, *rest
+
+
+@pytest.mark.parametrize("n_envs", [1, 2])
+def test_a_callback_that_stops_cuts_the_episode_it_interrupts(n_envs):
+    """SB3 has then stepped the environments and stored nothing of it: what follows must not go on from what was stored."""
+    env, policy_kwargs = DummyVecEnv([Paying] * n_envs), {**remembering(3), "habit": True}
+    model = make(env, policy_kwargs=policy_kwargs, learning_starts=0, gradient_steps=-1)
+    for _ in range(4):
+        model.learn(1000, callback=StopTrainingOnMaxEpisodes(2), reset_num_timesteps=False)
+    memory, trials, buffer = model.replay_buffer.self_imitation, model.trials, model.replay_buffer
+    assert len(memory.lengths) == 4 * n_envs and set(memory.lengths) == {5} and set(memory.returns) == {5.0}
+    assert set(trials.noisy_returns) | set(trials.habit_returns) == {5.0}
+    rows, envs = (part.ravel() for part in np.mgrid[: buffer.pos, :n_envs])
+    steps = buffer.observations[rows, envs, 1] * 11  # of the episode
+    _, mask = buffer._history_at(rows, envs, None)
+    assert np.allclose(mask.sum(1), np.minimum(steps, 3))
 
 
 def test_vec_normalize_relabels_the_task_reward_alone():
