@@ -699,9 +699,13 @@ class ActPC(OffPolicyAlgorithm):
 
     def _prove(self, rewards: np.ndarray, dones: np.ndarray) -> None:
         """The habit follows from what whole episodes were paid: see :mod:`sb3_actpc.actpc.habit`."""
-        if self.trials is None or self.num_timesteps <= self.learning_starts:  # random actions prove nothing
+        if self.trials is None:
             return
+        is_random = self.num_timesteps < self.learning_starts + self.n_envs  # the step that was just made
         for env, (reward, done) in enumerate(zip(rewards, dones, strict=True)):
+            if is_random or env in self.trials.skipped:
+                self.trials.skip(env, bool(done))
+                continue
             self.trials.step(env, float(reward))
             if not done:
                 if self.trials.lengths[env] == ENDLESS:
