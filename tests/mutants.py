@@ -374,6 +374,13 @@ MUTANTS = [
     ),
     # ------------------------------------------------------------------ habit
     Mutant("quiet episodes are noisy", AGENT, 'role == "actor" for role', "True for role", f"{HABIT} -k quiet"),
+    Mutant(
+        "beside a schedule from zero the actor is not slower",
+        POLICIES,
+        "if self.habit and name",
+        "if start and self.habit and name",
+        f"{LEARNS} -k quarter",
+    ),
     Mutant("random actions prove something", AGENT, "if is_random or env in", "if env in", f"{HABIT} -k random"),
     Mutant("an episode's rest is a whole one", AGENT, " or env in self.trials.skipped", "", f"{HABIT} -k 'random or counts'"),
     Mutant("the habit is not copied", AGENT, "_copy(self.policy.candidate, self.actor.habit)", "pass", f"{HABIT} -k predict"),

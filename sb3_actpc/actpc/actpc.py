@@ -76,7 +76,6 @@ SMALLEST_VALUE_SCALE = 1.0
 NEED_DEMONSTRATIONS = ("demonstration_fraction", "actor_warm_start", "n_demonstrations", "n_demonstration_transitions")
 EXPERT_SIGNALS_INTERVAL = 1000  # updates between two evaluations of the demonstrations' signals
 PRETRAINING_INTERVAL = 1000  # updates between two lines about pre-training
-ACTOR_SLOWNESS = 4.0  # how much slower than the others the actor learns, after a warm start
 TARGET_NOISE_CLIP = 2.5  # standard deviations, as TD3's 0.5 for 0.2
 AVERAGING_RATE = 0.001  # per update, of the average of the actor that becomes the habit
 LARGEST_BOUND = 1e6  # of an observation; larger ones stand for none
@@ -337,10 +336,15 @@ class ActPC(OffPolicyAlgorithm):
         if not isinstance(chosen, str) or chosen != self.settling:
             raise ValueError(f"circuit_kwargs has settling={chosen!r} but the agent's is {self.settling!r}; pass settling=")
         kwargs = {**self.policy_kwargs, "circuit_kwargs": {**given, "settling": self.settling}}
-        if kwargs.get("habit"):
-            slow = self.lr_schedule(1.0) / ACTOR_SLOWNESS
-            kwargs["actor_kwargs"] = {"learning_rate": slow, **(kwargs.get("actor_kwargs") or {})}
-        return self.policy_class(self.observation_space, self.action_space, self.lr_schedule, **kwargs)  # type: ignore[return-value]
+        policy = self.policy_class(self.observation_space, self.action_space, self.lr_schedule, **kwargs)
+        assert isinstance(policy, ActPCPolicy)
+        for name, settings in policy.kwargs_of.items():  # a loaded policy has no schedule: it need not learn
+            own = (settings or {}).get("learning_rate")
+            if own and not self.lr_schedule(1.0):
+                raise ValueError(
+                    f"{name}_kwargs has learning_rate={own}, a multiple of the agent's, which begins at 0: begin above"
+                )
+        return policy
 
     def _make_replay_buffer(self) -> SignalReplay:
         kind = combined_buffer_class(self.replay_buffer_class, self.observation_space, self.n_steps)

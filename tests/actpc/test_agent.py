@@ -18,7 +18,7 @@ from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
-from sb3_actpc import ActPC, Demonstrations
+from sb3_actpc import ActPC, Demonstrations, MlpPolicy
 from sb3_actpc.actpc import actpc as actpc_module
 from sb3_actpc.actpc import demonstration_replay
 from sb3_actpc.actpc.diagnostics import Diagnostics
@@ -1099,6 +1099,15 @@ def test_policies_can_be_pickled(tmp_path):
         assert np.array_equal(pool.apply(model.policy.predict, (obs, None, start))[0], model.predict(obs, None, start)[0])
 
 
+@pytest.mark.parametrize("own", [{}, {"actor_kwargs": {"learning_rate": 1e-3}, "prior_kwargs": {"learning_rate": 1e-5}}])
+def test_a_saved_policy_acts_as_the_agent_does(own, tmp_path):
+    """Whatever its circuits' learning rates were: it does not learn."""
+    model = imitating(policy_kwargs=own).learn(20)
+    model.policy.save(tmp_path / "policy.pt")
+    seen = np.random.default_rng(0).normal(size=(5, 3)).astype(np.float32)
+    assert np.array_equal(MlpPolicy.load(tmp_path / "policy.pt").predict(seen)[0], model.predict(seen)[0])
+
+
 def test_demonstrations_that_are_set_later_are_checked_and_used(tmp_path):
     demonstrations().save(tmp_path / "demos.npz")
     model = make(demonstrations=tmp_path / "demos.npz").learn(20)
@@ -1144,6 +1153,26 @@ def test_learning_rates_of_circuits_and_error_synapses_follow_the_schedule():
     model.train(1, 16)
     actor, critic = ([g["lr"] for g in c.optimizer.param_groups] for _, c in model.policy.named_circuits()[:2])
     assert actor == pytest.approx([2.5e-3, 0.9 * 2.5e-3]) and critic == pytest.approx([0.5e-3, 0.45e-3])
+
+
+@pytest.mark.parametrize("schedule", [4e-4, lambda left: 4e-4 * left, lambda left: 4e-4 * min(1.0, 10.0 * (1.0 - left))])
+def test_beside_a_habit_the_actor_learns_at_a_quarter_of_the_others_rate(schedule):
+    """Also where a schedule begins at 0, to warm up."""
+    model = imitating(learning_rate=schedule).learn(10)
+    for left in (1.0, 0.95, 0.5):
+        model._current_progress_remaining = left
+        model.train(1, 16)
+        rate = schedule(left) if callable(schedule) else schedule
+        rates = {name: circuit.optimizer.param_groups[0]["lr"] for name, circuit in model.policy.named_circuits()}
+        assert rates == {"actor": rate / 4, **dict.fromkeys(("critic.0", "critic.1", "generator", "prior"), rate)}
+
+
+def test_a_circuit_with_a_rate_of_zero_stands_still_beside_any_schedule():
+    for schedule in (1e-3, lambda left: 1e-3 * (1.0 - left)):
+        model = make(learning_rate=schedule, policy_kwargs={"critic_kwargs": {"learning_rate": 0.0}})
+        critic, actor = weights_of(model.critic), weights_of(model.actor.circuit)
+        model.learn(40)
+        assert not differ(critic, weights_of(model.critic)) and differ(actor, weights_of(model.actor.circuit))
 
 
 @pytest.mark.parametrize("n_envs", [1, 2])
