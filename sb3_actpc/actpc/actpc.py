@@ -124,7 +124,7 @@ class ActPC(OffPolicyAlgorithm):
     :param replay_buffer_kwargs: keywords of the buffer: ``combined`` (True: the newest transition of every environment is in
         every batch) and ``self_imitation_size`` (100,000 transitions in the memory of the agent's own good episodes; 0 for
         none), and those of SB3's class
-    :param optimize_memory_usage: as in SB3
+    :param optimize_memory_usage: as in SB3; not with a generator (``alpha_ep``), which learns where every step led
     :param n_steps: length of n-step returns; 1 by default where they cannot be had (hindsight, ``optimize_memory_usage``)
         or mean nothing (``bootstrap="literal"``)
     :param settling: "scheduled" (one ordered sweep of the errors, the zero-divergence schedule or Z-IL of the
@@ -307,6 +307,7 @@ class ActPC(OffPolicyAlgorithm):
             raise ValueError("env=None: an environment or the id of one is needed, such as 'Pendulum-v1'")
         assert isinstance(self.action_space, spaces.Box)
         check_actions(self.action_space, self.action_noise)
+        self._check_generator()
         # both here, as a loaded agent may be given others; of the same signals it keeps what their normalisers have seen
         with named_in_errors(f"refresh_kwargs={self.refresh_kwargs!r}"):
             self.refresh = Refresh(**(self.refresh_kwargs or {}))
@@ -486,6 +487,7 @@ class ActPC(OffPolicyAlgorithm):
         tb_log_name: str = "run",
         progress_bar: bool = False,
     ) -> tuple[int, BaseCallback]:
+        self._check_generator()
         if reset_num_timesteps or self._last_obs is None:  # SB3 resets the environments
             self._rollout_state: tuple[np.ndarray, ...] | None = None
             self._rollout_starts = np.ones(self.n_envs, dtype=bool)
@@ -512,6 +514,14 @@ class ActPC(OffPolicyAlgorithm):
         self.start_time = time.time_ns()  # of the frames per second: pre-training has none
         self._compiled = self._compiled or compiled_update(self, self._total_timesteps)  # resumed, as straight
         return result
+
+    def _check_generator(self) -> None:
+        """:raises ValueError: where the buffer does not keep what it learns to predict: an episode's last observation"""
+        if self.alpha_ep and self.optimize_memory_usage:
+            raise ValueError(
+                f"alpha_ep={self.alpha_ep:g} does not work with optimize_memory_usage=True, which keeps the next episode's "
+                "first observation in the place of an episode's last: use optimize_memory_usage=False or alpha_ep=0"
+            )
 
     def _warn_of_idle_settings(self) -> None:
         """Warns of a run with too few updates for a learner to prove itself, and of a signal that nobody makes."""

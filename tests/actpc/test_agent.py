@@ -956,6 +956,21 @@ def test_a_wrong_keyword_is_named(keywords, named):
         make(**keywords)
 
 
+def test_a_generator_is_refused_a_buffer_that_forgets_how_episodes_end(tmp_path):
+    """With ``optimize_memory_usage`` an episode's last observation is overwritten by the next one's first."""
+    small = {"optimize_memory_usage": True, "replay_buffer_kwargs": {"handle_timeout_termination": False}}
+    named = "alpha_ep=0.5 does not work with optimize_memory_usage=True.*optimize_memory_usage=False or alpha_ep=0"
+    with pytest.raises(ValueError, match=named):
+        make(alpha_ep=0.5, **small)
+    model = make(alpha_ep=0.0, **small).learn(20)  # nobody else asks where a step led
+    model.save(tmp_path / "agent")
+    with pytest.raises(ValueError, match=named):
+        ActPC.load(tmp_path / "agent", alpha_ep=0.5)
+    model.alpha_ep = 0.5
+    with pytest.raises(ValueError, match=named):
+        model.learn(20)
+
+
 def test_whole_numbers_are_no_actions():
     class Whole(CountingEnv):
         def __init__(self):

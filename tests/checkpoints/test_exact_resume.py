@@ -71,7 +71,7 @@ def test_actpc(tmp_path: Path, n_envs: int, normalize: bool, stop_at: int) -> No
         },
         {"n_steps": 3, "signal_kwargs": {"normalizer": "quantile"}},
         {"n_steps": 4, "policy_kwargs": {"net_arch": [16, 16], "memory_history": 3}},
-        {"optimize_memory_usage": True, "replay_buffer_kwargs": {"handle_timeout_termination": False}},
+        {"optimize_memory_usage": True, "replay_buffer_kwargs": {"handle_timeout_termination": False}, "alpha_ep": 0.0},
         {"demonstration_fraction": 0.0, "actor_warm_start": 0, "observation_normalization": "none"},
         {"tau": 1.0, "target_update_interval": 7, "train_freq": (3, "step"), "gradient_steps": -1},
         {"train_freq": (1, "episode"), "gradient_steps": 2},
