@@ -211,6 +211,11 @@ class ActPCActor(BasePolicy):
         assert self.memory is not None
         shape = (len(features), self.memory_history, features.shape[1])
         history = np.zeros(shape, dtype=np.float32) if state is None else state[0].copy()
+        if len(history) != len(features):
+            raise ValueError(
+                f"state is of {len(history)} environments, the observations are of {len(features)}: pass the state that "
+                "predict returned for the same environments, or state=None where they begin"
+            )
         if episode_start is not None:
             history[np.asarray(episode_start, dtype=bool)] = 0.0
         memory = self.memory(th.as_tensor(history, device=self.device))

@@ -808,6 +808,13 @@ def test_a_bare_predict_acts_with_an_empty_memory_and_warns_once():
     assert np.array_equal(first, again) and np.array_equal(first, fresh) and not np.array_equal(first, carried)
 
 
+def test_a_state_of_another_number_of_environments_is_named():
+    model = make(policy_kwargs=remembering(3))
+    _, state = model.predict(np.ones((2, 3), np.float32), episode_start=np.ones(2, bool))
+    with pytest.raises(ValueError, match=r"state is of 2 environments, the observations are of 3: .*state=None"):
+        model.predict(np.ones((3, 3), np.float32), state, np.zeros(3, bool))
+
+
 def test_evaluate_policy_carries_the_memory_of_what_came_before_in_the_episode():
     """The action is that of o_t and of the H observations before it in its episode, o_t not among them."""
     history = 3
