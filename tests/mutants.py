@@ -381,6 +381,13 @@ MUTANTS = [
         "if start and self.habit and name",
         f"{LEARNS} -k quarter",
     ),
+    Mutant(
+        "a stopped rollout is gone on with",
+        AGENT,
+        "if not rollout.continue_training:",
+        "if False:",
+        f"{LEARNS} -k callback_that",
+    ),
     Mutant("random actions prove something", AGENT, "if is_random or env in", "if env in", f"{HABIT} -k random"),
     Mutant("an episode's rest is a whole one", AGENT, " or env in self.trials.skipped", "", f"{HABIT} -k 'random or counts'"),
     Mutant("the habit is not copied", AGENT, "_copy(self.policy.candidate, self.actor.habit)", "pass", f"{HABIT} -k predict"),
