@@ -375,7 +375,22 @@ MUTANTS = [
     ),
     # ------------------------------------------------------------------ habit
     Mutant("quiet episodes are noisy", AGENT, 'role == "actor" for role', "True for role", f"{HABIT} -k quiet"),
-    Mutant("random actions prove something", AGENT, "or self.num_timesteps <= self.learning_starts", "", f"{HABIT} -k random"),
+    Mutant(
+        "beside a schedule from zero the actor is not slower",
+        POLICIES,
+        "if self.habit and name",
+        "if start and self.habit and name",
+        f"{LEARNS} -k quarter",
+    ),
+    Mutant(
+        "a stopped rollout is gone on with",
+        AGENT,
+        "if not rollout.continue_training:",
+        "if False:",
+        f"{LEARNS} -k callback_that",
+    ),
+    Mutant("random actions prove something", AGENT, "if is_random or env in", "if env in", f"{HABIT} -k random"),
+    Mutant("an episode's rest is a whole one", AGENT, " or env in self.trials.skipped", "", f"{HABIT} -k 'random or counts'"),
     Mutant("the habit is not copied", AGENT, "_copy(self.policy.candidate, self.actor.habit)", "pass", f"{HABIT} -k predict"),
     Mutant("the learning actor acts", POLICIES, "self.circuit if self.habit is None", "self.circuit if True", HABIT),
     Mutant("one proof is enough", TRIALS, "elif n < N_PROOFS:", "elif n < 1:", HABIT),

@@ -17,7 +17,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule, TrainFreq
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn, Schedule, TrainFreq
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 from tqdm import tqdm
 
@@ -72,7 +72,6 @@ SMALLEST_VALUE_SCALE = 1.0
 NEED_DEMONSTRATIONS = ("demonstration_fraction", "actor_warm_start", "n_demonstrations", "n_demonstration_transitions")
 EXPERT_SIGNALS_INTERVAL = 1000  # updates between two evaluations of the demonstrations' signals
 PRETRAINING_INTERVAL = 1000  # updates between two lines about pre-training
-ACTOR_SLOWNESS = 4.0  # how much slower than the others the actor learns, after a warm start
 TARGET_NOISE_CLIP = 2.5  # standard deviations, as TD3's 0.5 for 0.2
 AVERAGING_RATE = 0.001  # per update, of the average of the actor that becomes the habit
 LARGEST_BOUND = 1e6  # of an observation; larger ones stand for none
@@ -119,9 +118,9 @@ class ActPC(OffPolicyAlgorithm):
     :param action_noise: SB3's exploration noise, in the place of ``exploration_noise``
     :param replay_buffer_class: None, or one of SB3's classes or its name (its ActPC counterpart is used)
     :param replay_buffer_kwargs: keywords of the buffer: ``combined`` (True: the newest transition of every environment is in
-        every batch) and ``self_imitation_size`` (100,000 transitions in the memory of the agent's own good episodes; 0 for
-        none), and those of SB3's class
-    :param optimize_memory_usage: as in SB3
+        every batch) and ``self_imitation_size`` (transitions in the memory of the agent's own good episodes: 100,000, or
+        ``buffer_size`` where that is less; 0 for none), and those of SB3's class
+    :param optimize_memory_usage: as in SB3; not with a generator (``alpha_ep``), which learns where every step led
     :param n_steps: length of n-step returns; 1 by default where they cannot be had (hindsight, ``optimize_memory_usage``)
         or mean nothing (``bootstrap="literal"``)
     :param settling: "scheduled" (one ordered sweep of the errors, the zero-divergence schedule or Z-IL of the
@@ -304,6 +303,7 @@ class ActPC(OffPolicyAlgorithm):
             raise ValueError("env=None: an environment or the id of one is needed, such as 'Pendulum-v1'")
         assert isinstance(self.action_space, spaces.Box)
         check_actions(self.action_space, self.action_noise)
+        self._check_generator()
         # both here, as a loaded agent may be given others; of the same signals it keeps what their normalisers have seen
         with named_in_errors(f"refresh_kwargs={self.refresh_kwargs!r}"):
             self.refresh = Refresh(**(self.refresh_kwargs or {}))
@@ -333,10 +333,15 @@ class ActPC(OffPolicyAlgorithm):
         if not isinstance(chosen, str) or chosen != self.settling:
             raise ValueError(f"circuit_kwargs has settling={chosen!r} but the agent's is {self.settling!r}; pass settling=")
         kwargs = {**self.policy_kwargs, "circuit_kwargs": {**given, "settling": self.settling}}
-        if kwargs.get("habit"):
-            slow = self.lr_schedule(1.0) / ACTOR_SLOWNESS
-            kwargs["actor_kwargs"] = {"learning_rate": slow, **(kwargs.get("actor_kwargs") or {})}
-        return self.policy_class(self.observation_space, self.action_space, self.lr_schedule, **kwargs)  # type: ignore[return-value]
+        policy = self.policy_class(self.observation_space, self.action_space, self.lr_schedule, **kwargs)
+        assert isinstance(policy, ActPCPolicy)
+        for name, settings in policy.kwargs_of.items():  # a loaded policy has no schedule: it need not learn
+            own = (settings or {}).get("learning_rate")
+            if own and not self.lr_schedule(1.0):
+                raise ValueError(
+                    f"{name}_kwargs has learning_rate={own}, a multiple of the agent's, which begins at 0: begin above"
+                )
+        return policy
 
     def _make_replay_buffer(self) -> SignalReplay:
         kind = combined_buffer_class(self.replay_buffer_class, self.observation_space, self.n_steps)
@@ -478,6 +483,7 @@ class ActPC(OffPolicyAlgorithm):
         tb_log_name: str = "run",
         progress_bar: bool = False,
     ) -> tuple[int, BaseCallback]:
+        self._check_generator()
         if reset_num_timesteps or self._last_obs is None:  # SB3 resets the environments
             self._rollout_state: tuple[np.ndarray, ...] | None = None
             self._rollout_starts = np.ones(self.n_envs, dtype=bool)
@@ -504,6 +510,14 @@ class ActPC(OffPolicyAlgorithm):
         self.start_time = time.time_ns()  # of the frames per second: pre-training has none
         self._compiled = self._compiled or compiled_update(self, self._total_timesteps)  # resumed, as straight
         return result
+
+    def _check_generator(self) -> None:
+        """:raises ValueError: where the buffer does not keep what it learns to predict: an episode's last observation"""
+        if self.alpha_ep and self.optimize_memory_usage:
+            raise ValueError(
+                f"alpha_ep={self.alpha_ep:g} does not work with optimize_memory_usage=True, which keeps the next episode's "
+                "first observation in the place of an episode's last: use optimize_memory_usage=False or alpha_ep=0"
+            )
 
     def _warn_of_idle_settings(self) -> None:
         """Warns of a run with too few updates for a learner to prove itself, and of a signal that nobody makes."""
@@ -624,6 +638,14 @@ class ActPC(OffPolicyAlgorithm):
 
     # ------------------------------------------------------------------ collecting
 
+    def collect_rollouts(self, *args: Any, **kwargs: Any) -> RolloutReturn:
+        """As in SB3. A callback that stops leaves a step that was made and is not stored: the next ``learn`` must not go on
+        from the observation before it, but reset the environments."""
+        rollout = super().collect_rollouts(*args, **kwargs)
+        if not rollout.continue_training:
+            self._last_obs = None
+        return rollout
+
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
     ) -> tuple[np.ndarray, np.ndarray]:
@@ -688,9 +710,13 @@ class ActPC(OffPolicyAlgorithm):
 
     def _prove(self, rewards: np.ndarray, dones: np.ndarray) -> None:
         """The habit follows from what whole episodes were paid: see :mod:`sb3_actpc.actpc.habit`."""
-        if self.trials is None or self.num_timesteps <= self.learning_starts:  # random actions prove nothing
+        if self.trials is None:
             return
+        is_random = self.num_timesteps < self.learning_starts + self.n_envs  # the step that was just made
         for env, (reward, done) in enumerate(zip(rewards, dones, strict=True)):
+            if is_random or env in self.trials.skipped:
+                self.trials.skip(env, bool(done))
+                continue
             self.trials.step(env, float(reward))
             if not done:
                 if self.trials.lengths[env] == ENDLESS:

@@ -16,7 +16,7 @@ from sb3_actpc.actpc.reward_signals import STORED, Normalize
 from sb3_actpc.actpc.self_imitation import Observations, SelfImitationMemory, TensorObservations, map_observations
 from sb3_actpc.utils.checks import LARGEST_SIZE
 
-Length = Annotated[int, Between(0, LARGEST_SIZE)]
+OWN_TRANSITIONS = 100_000  # that the self-imitation memory keeps, of a buffer that keeps more
 # (observations, actions, next observations, the working memory's past and which of it there was) of n_envs new transitions ->
 # their epistemic and instrumental signals, (n_envs,) each
 Score = Callable[
@@ -69,7 +69,8 @@ class SignalReplay(ReplayBuffer):
     * The working memory is not stored: the observations before a transition are gathered when it is sampled.
 
     :param combined: put the newest transitions into every batch
-    :param self_imitation_size: capacity of the self-imitation memory in transitions; 0 for none
+    :param self_imitation_size: capacity of the self-imitation memory in transitions; 0 for none, None for 100,000, or as many
+        as the buffer has where these are fewer
     :param history: H, how many preceding observations come with a transition; 0 for none
     :param n_steps: length of n-step returns
     :param gamma: their discount
@@ -81,8 +82,8 @@ class SignalReplay(ReplayBuffer):
         self,
         *args: Any,
         combined: bool = True,
-        self_imitation_size: Length = 100_000,
-        history: Length = 0,
+        self_imitation_size: Annotated[int | None, Between(0, LARGEST_SIZE)] = None,
+        history: Annotated[int, Between(0, LARGEST_SIZE)] = 0,
         n_steps: Size = 1,
         gamma: Share = 0.99,
         **kwargs: Any,
@@ -93,6 +94,8 @@ class SignalReplay(ReplayBuffer):
         self.combined, self.history, self.n_steps, self.gamma = combined, history, n_steps, gamma
         self.epistemic = np.zeros((self.buffer_size, self.n_envs), dtype=np.float32)
         self.instrumental = np.zeros((self.buffer_size, self.n_envs), dtype=np.float32)
+        if self_imitation_size is None:
+            self_imitation_size = min(OWN_TRANSITIONS, self.buffer_size * self.n_envs)
         self.self_imitation = SelfImitationMemory(self_imitation_size) if self_imitation_size else None
         self._lengths = np.zeros(self.n_envs, dtype=np.int64)  # of the running episodes
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import Any, NamedTuple
 
 import torch as th
@@ -37,12 +38,31 @@ class CompiledUpdate:
     def __init__(self, agent: Any) -> None:
         self.agent = agent
         self._changes = th.compile(self._all_changes, fullgraph=True, dynamic=False)
+        self._has_warned = False
 
     def ready(self) -> bool:
-        """Whether the update has all its parts: something is imitated, the pressure has begun, nothing is measured."""
+        """Whether the update has all its parts: something is imitated, the pressure has begun, nothing is measured. Warns once
+        where compiling was asked for (True) and a part is missing."""
         agent = self.agent
-        begun = bool(agent.actor_pressure) and agent._n_updates > agent.critic_warmup
-        return begun and bool(agent.refresh_weight and agent._imitated()) and not agent.diagnostics.active
+        if agent._n_updates <= agent.critic_warmup:
+            return False
+        missing = self._missing_part()
+        if missing and agent.compile is True and not self._has_warned:
+            self._has_warned = True
+            warnings.warn(
+                f"compile=True: updates run eagerly while {missing}, as the compiled one imitates and is pressed at once; "
+                "change that, or leave compile out",
+                stacklevel=2,
+            )
+        return not missing and not agent.diagnostics.active
+
+    def _missing_part(self) -> str:
+        """Why there is no such update, or nothing."""
+        agent = self.agent
+        for name in ("actor_pressure", "refresh_weight"):
+            if not getattr(agent, name):
+                return f"{name}=0"
+        return "" if agent._imitated() else "nothing is imitated (no demonstrations=, and no paid episode of its own yet)"
 
     @th.no_grad()
     def __call__(self, actor: Batch | None, critic: Batch, generator: Batch) -> None:

@@ -71,6 +71,7 @@ class Trials:
     has_learned: bool = False
     n_rejected: int = 0  # learners in a row
     tests_habit: bool = True  # before the next candidate: its return must be known, or known better
+    skipped: list[int] = field(default_factory=list)  # environments whose running episode began with random actions
 
     def __post_init__(self) -> None:
         if not self.roles:
@@ -81,7 +82,7 @@ class Trials:
         self.roles = ["actor"] * self.n_envs
         self.generations = [self.generation] * self.n_envs
         self.lengths, self.quiet_due = ([0] * self.n_envs for _ in range(2))
-        self.returns, self.quiet = [0.0] * self.n_envs, []
+        self.returns, self.quiet, self.skipped = [0.0] * self.n_envs, [], []
 
     @property
     def habit_return(self) -> float:
@@ -99,6 +100,16 @@ class Trials:
             return False
         shortfall = SHORTFALL if self.has_learned else GREAT_SHORTFALL
         return self.habit_return < self.imitated_return - shortfall * abs(self.imitated_return)
+
+    def skip(self, env: int, is_last: bool) -> None:
+        """
+        A random action, or a later step of an episode that began with one: it proves nothing.
+
+        :param env: which environment
+        :param is_last: whether its episode ends with it; the next one may count
+        """
+        others = [other for other in self.skipped if other != env]
+        self.skipped = others if is_last else [*others, env]
 
     def step(self, env: int, reward: float) -> None:
         """:param env: which environment

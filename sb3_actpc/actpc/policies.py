@@ -38,6 +38,7 @@ _SIZES = {"self", "n_inputs", "n_outputs", "hidden", "output_activation", "n_mem
 CIRCUIT_KEYWORDS = set(inspect.signature(NGCCircuit.__init__).parameters) - _SIZES
 OBSERVATION_CLIP = 10.0
 PRIOR_NET_ARCH = (512, 256)  # paper: prior of all MuJoCo tasks
+ACTOR_SLOWNESS = 4.0  # how much slower than the others the actor learns beside a habit
 
 
 class ObservationNormalizer(nn.Module):
@@ -210,6 +211,11 @@ class ActPCActor(BasePolicy):
         assert self.memory is not None
         shape = (len(features), self.memory_history, features.shape[1])
         history = np.zeros(shape, dtype=np.float32) if state is None else state[0].copy()
+        if len(history) != len(features):
+            raise ValueError(
+                f"state is of {len(history)} environments, the observations are of {len(features)}: pass the state that "
+                "predict returned for the same environments, or state=None where they begin"
+            )
         if episode_start is not None:
             history[np.asarray(episode_start, dtype=bool)] = 0.0
         memory = self.memory(th.as_tensor(history, device=self.device))
@@ -268,7 +274,8 @@ class ActPCPolicy(BasePolicy):
     :param memory_history: H observations in the working memory of actor, generator and prior; 0 for none
     :param nudge: scale of the critic's clamped error while actor and critic settle as one (the paper's is 1); None for an
         infinitesimal one, or 1 with ``dynamics="state"``. A sweep ("scheduled") is always infinitesimal
-    :param habit: keep the best proven actor beside the one that learns (:mod:`sb3_actpc.actpc.habit`)
+    :param habit: keep the best proven actor beside the one that learns (:mod:`sb3_actpc.actpc.habit`), which then has a
+        quarter of the schedule's learning rate, or its own
     :param trust_radius: of the first :class:`~sb3_actpc.actpc.trust_region.TrustRegion` around the habit, in variances of the
         demonstrated actions; 0 for none: the pressure is fixed
     :param features_extractor_class: fixed features extractor (it is never trained)
@@ -409,18 +416,16 @@ class ActPCPolicy(BasePolicy):
         return NGCCircuit(n_inputs, n_outputs, self._net_arch_of(name), **self._circuit_kwargs_of(name), **extra)
 
     def _optimizer(self, name: str, circuit: NGCCircuit) -> th.optim.Optimizer:
-        start = self.lr_schedule(1.0)
-        own = self._settings_of(name).get("learning_rate", start)
-        groups = circuit.parameter_groups(own)
+        start, own = self.lr_schedule(1.0), self._settings_of(name).get("learning_rate")
+        scale = 1.0 / ACTOR_SLOWNESS if self.habit and name == "actor" else 1.0
+        if own is not None:
+            scale = own / start if start else 0.0  # a loaded policy has no schedule, and does not learn
+        groups = circuit.parameter_groups(start * scale if own is None else own)
         for group in groups:
-            group["lr_scale"] *= own / start if start else 1.0
+            group["lr_scale"] *= scale
         kwargs = dict(self.optimizer_kwargs)
         if self.optimizer_class is th.optim.Adam:
             kwargs.setdefault("fused", True)  # one kernel for all synapses
-        if own and not start:
-            raise ValueError(
-                f"{name}_kwargs has learning_rate={own}, a multiple of the agent's, which begins at 0: begin above"
-            )
         with named_in_errors(f"optimizer_kwargs={self.optimizer_kwargs!r}"):
             return self.optimizer_class(groups, **kwargs)
 

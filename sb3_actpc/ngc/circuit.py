@@ -268,10 +268,6 @@ class NGCCircuit(nn.Module):
         )
         return SettlingChain(self.synapses, settings, x, memory)
 
-    def energy(self, state: SettledState) -> th.Tensor:
-        """1/2 Σ ||e||^2 over the layers, per sample, (B,) (paper: total discrepancy, appendix)."""
-        return state.total_discrepancy()
-
     def residual(self, state: SettledState) -> th.Tensor:
         """
         How far from rest the hidden layers still are: RMS of eq. 1's right-hand side over RMS of the feedback in it, 0-d.
@@ -295,7 +291,7 @@ class NGCCircuit(nn.Module):
         """
         The changes *to be added* that the settled ``state`` asks for: e φ(z)^T and its like, means over the batch.
 
-        For the error synapses see :attr:`HebbianChanges.feedback`. Nothing is changed yet: :meth:`apply_changes` does that.
+        Nothing is changed yet: :meth:`apply_changes` does that, and gives the error synapses those of the weights.
         """
         return hebbian_changes(state.postsynaptic, state.activations, state.memory, self.memory_weight, self.in_bfloat16)
 

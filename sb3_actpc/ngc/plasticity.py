@@ -25,11 +25,6 @@ class HebbianChanges:
     biases: list[th.Tensor]
     memory: list[th.Tensor]
 
-    @property
-    def feedback(self) -> list[th.Tensor]:
-        """ΔE = (ΔW)^T, each (n_in, n_out), as views. γ_e is the ratio of the learning rates: see ``parameter_groups``."""
-        return [change.t() for change in self.weights]
-
     def tensors(self) -> list[th.Tensor]:
         """All changes but the error synapses', which follow from the weights'."""
         return [*self.weights, *self.biases, *self.memory]

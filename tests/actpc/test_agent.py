@@ -10,6 +10,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+from stable_baselines3.common.callbacks import StopTrainingOnMaxEpisodes
 from stable_baselines3.common.env_checker import check_env
 from stable_baselines3.common.envs import BitFlippingEnv
 from stable_baselines3.common.evaluation import evaluate_policy
@@ -17,7 +18,7 @@ from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
-from sb3_actpc import ActPC, Demonstrations
+from sb3_actpc import ActPC, Demonstrations, MlpPolicy
 from sb3_actpc.actpc import actpc as actpc_module
 from sb3_actpc.actpc import demonstration_replay
 from sb3_actpc.actpc.diagnostics import Diagnostics
@@ -716,6 +717,13 @@ def test_a_bare_predict_acts_with_an_empty_memory_and_warns_once():
     assert np.array_equal(first, again) and np.array_equal(first, fresh) and not np.array_equal(first, carried)
 
 
+def test_a_state_of_another_number_of_environments_is_named():
+    model = make(policy_kwargs=remembering(3))
+    _, state = model.predict(np.ones((2, 3), np.float32), episode_start=np.ones(2, bool))
+    with pytest.raises(ValueError, match=r"state is of 2 environments, the observations are of 3: .*state=None"):
+        model.predict(np.ones((3, 3), np.float32), state, np.zeros(3, bool))
+
+
 def test_evaluate_policy_carries_the_memory_of_what_came_before_in_the_episode():
     """The action is that of o_t and of the H observations before it in its episode, o_t not among them."""
     history = 3
@@ -864,6 +872,21 @@ def test_a_wrong_keyword_is_named(keywords, named):
         make(**keywords)
 
 
+def test_a_generator_is_refused_a_buffer_that_forgets_how_episodes_end(tmp_path):
+    """With ``optimize_memory_usage`` an episode's last observation is overwritten by the next one's first."""
+    small = {"optimize_memory_usage": True, "replay_buffer_kwargs": {"handle_timeout_termination": False}}
+    named = "alpha_ep=0.5 does not work with optimize_memory_usage=True.*optimize_memory_usage=False or alpha_ep=0"
+    with pytest.raises(ValueError, match=named):
+        make(alpha_ep=0.5, **small)
+    model = make(alpha_ep=0.0, **small).learn(20)  # nobody else asks where a step led
+    model.save(tmp_path / "agent")
+    with pytest.raises(ValueError, match=named):
+        ActPC.load(tmp_path / "agent", alpha_ep=0.5)
+    model.alpha_ep = 0.5
+    with pytest.raises(ValueError, match=named):
+        model.learn(20)
+
+
 def test_whole_numbers_are_no_actions():
     class Whole(CountingEnv):
         def __init__(self):
@@ -1007,6 +1030,15 @@ def test_policies_can_be_pickled(tmp_path):
         assert np.array_equal(pool.apply(model.policy.predict, (obs, None, start))[0], model.predict(obs, None, start)[0])
 
 
+@pytest.mark.parametrize("own", [{}, {"actor_kwargs": {"learning_rate": 1e-3}, "prior_kwargs": {"learning_rate": 1e-5}}])
+def test_a_saved_policy_acts_as_the_agent_does(own, tmp_path):
+    """Whatever its circuits' learning rates were: it does not learn."""
+    model = imitating(policy_kwargs=own).learn(20)
+    model.policy.save(tmp_path / "policy.pt")
+    seen = np.random.default_rng(0).normal(size=(5, 3)).astype(np.float32)
+    assert np.array_equal(MlpPolicy.load(tmp_path / "policy.pt").predict(seen)[0], model.predict(seen)[0])
+
+
 def test_demonstrations_that_are_set_later_are_checked_and_used(tmp_path):
     demonstrations().save(tmp_path / "demos.npz")
     model = make(demonstrations=tmp_path / "demos.npz").learn(20)
@@ -1052,6 +1084,26 @@ def test_learning_rates_of_circuits_and_error_synapses_follow_the_schedule():
     model.train(1, 16)
     actor, critic = ([g["lr"] for g in c.optimizer.param_groups] for _, c in model.policy.named_circuits()[:2])
     assert actor == pytest.approx([2.5e-3, 0.9 * 2.5e-3]) and critic == pytest.approx([0.5e-3, 0.45e-3])
+
+
+@pytest.mark.parametrize("schedule", [4e-4, lambda left: 4e-4 * left, lambda left: 4e-4 * min(1.0, 10.0 * (1.0 - left))])
+def test_beside_a_habit_the_actor_learns_at_a_quarter_of_the_others_rate(schedule):
+    """Also where a schedule begins at 0, to warm up."""
+    model = imitating(learning_rate=schedule).learn(10)
+    for left in (1.0, 0.95, 0.5):
+        model._current_progress_remaining = left
+        model.train(1, 16)
+        rate = schedule(left) if callable(schedule) else schedule
+        rates = {name: circuit.optimizer.param_groups[0]["lr"] for name, circuit in model.policy.named_circuits()}
+        assert rates == {"actor": rate / 4, **dict.fromkeys(("critic.0", "critic.1", "generator", "prior"), rate)}
+
+
+def test_a_circuit_with_a_rate_of_zero_stands_still_beside_any_schedule():
+    for schedule in (1e-3, lambda left: 1e-3 * (1.0 - left)):
+        model = make(learning_rate=schedule, policy_kwargs={"critic_kwargs": {"learning_rate": 0.0}})
+        critic, actor = weights_of(model.critic), weights_of(model.actor.circuit)
+        model.learn(40)
+        assert not differ(critic, weights_of(model.critic)) and differ(actor, weights_of(model.actor.circuit))
 
 
 @pytest.mark.parametrize("n_envs", [1, 2])
@@ -1121,6 +1173,33 @@ def test_a_second_learn_cuts_the_episode_it_interrupts():
     _, mask = model.replay_buffer._history_at(np.array([7, 8]), np.zeros(2, int), None)
     assert mask.tolist() == [[0, 0, 0], [0, 0, 1]]
     assert model.replay_buffer._lengths.tolist() == [2]
+
+
+class Paying(CountingEnv):
+    """Pays 1 for every step, in episodes of five."""
+
+    def __init__(self):
+        super().__init__(lengths=(5,))
+
+    def step(self, action):
+        observation, _, *rest = super().step(action)
+        return observation, 1.0, *rest
+
+
+@pytest.mark.parametrize("n_envs", [1, 2])
+def test_a_callback_that_stops_cuts_the_episode_it_interrupts(n_envs):
+    """SB3 has then stepped the environments and stored nothing of it: what follows must not go on from what was stored."""
+    env, policy_kwargs = DummyVecEnv([Paying] * n_envs), {**remembering(3), "habit": True}
+    model = make(env, policy_kwargs=policy_kwargs, learning_starts=0, gradient_steps=-1)
+    for _ in range(4):
+        model.learn(1000, callback=StopTrainingOnMaxEpisodes(2), reset_num_timesteps=False)
+    memory, trials, buffer = model.replay_buffer.self_imitation, model.trials, model.replay_buffer
+    assert len(memory.lengths) == 4 * n_envs and set(memory.lengths) == {5} and set(memory.returns) == {5.0}
+    assert set(trials.noisy_returns) | set(trials.habit_returns) == {5.0}
+    rows, envs = (part.ravel() for part in np.mgrid[: buffer.pos, :n_envs])
+    steps = buffer.observations[rows, envs, 1] * 11  # of the episode
+    _, mask = buffer._history_at(rows, envs, None)
+    assert np.allclose(mask.sum(1), np.minimum(steps, 3))
 
 
 def test_vec_normalize_relabels_the_task_reward_alone():

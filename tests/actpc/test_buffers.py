@@ -10,6 +10,7 @@ from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 
 from sb3_actpc.actpc.buffers import CombinedReplayBuffer, combined_buffer_class
 from sb3_actpc.actpc.self_imitation import RETURN_EXPONENT, Episodes, SelfImitationMemory, sample_union
+from tests.checkpoints.runs import assert_equal
 
 SPACES = (spaces.Box(-1, 1, (2,), np.float64), spaces.Box(-1, 1, (1,), np.float32))
 
@@ -134,6 +135,66 @@ def test_the_oldest_episodes_leave_when_the_memory_is_full():
     assert list(memory.returns) == [2.0, 3.0]
     assert set(memory.episodes.observations[:, 0]) == {2.0, 3.0}
     assert not offer(memory, 13, 9.0)
+
+
+def random_episodes(n, rng, with_keys=False):
+    """Observations (or a dict of them), actions and return of n episodes; some returns occur several times."""
+    for _ in range(n):
+        length = int(rng.integers(1, 9))
+        seen, actions = rng.normal(size=(length, 3)).astype(np.float32), rng.normal(size=(length, 2)).astype(np.float32)
+        yield {"seen": seen, "goal": -seen} if with_keys else seen, actions, float(rng.integers(1, 6))
+
+
+@pytest.mark.parametrize("with_keys", [False, True])
+@pytest.mark.parametrize("halfway", ["goes on", "is pickled", "is restored"])
+def test_the_memory_is_its_last_episodes_laid_end_to_end(halfway, with_keys):
+    """After every episode, and as if it had been laid out anew: steps are drawn from it alike."""
+    memory, kept = SelfImitationMemory(60), []
+    for number, (seen, actions, paid) in enumerate(random_episodes(200, np.random.default_rng(0), with_keys)):
+        memory.store(seen, actions, paid)
+        kept.append((seen, actions, paid))
+        while sum(len(one[1]) for one in kept) > 60:
+            kept.pop(0)
+        if number == 100 and halfway == "is pickled":
+            memory = pickle.loads(pickle.dumps(memory))
+        if number == 100 and halfway == "is restored":
+            state, memory = memory.checkpoint_state(), SelfImitationMemory(60)
+            memory.restore_checkpoint_state(state)
+        lengths, returns = [len(one[1]) for one in kept], [one[2] for one in kept]
+        assert (memory.lengths, memory.returns) == (lengths, returns)
+        assert (len(memory), memory.best_return) == (sum(lengths), max(returns))
+        seen = [one[0] for one in kept]
+        if with_keys:
+            observations = {key: np.concatenate([one[key] for one in seen]) for key in ("seen", "goal")}
+        else:
+            observations = np.concatenate(seen)
+        starts = np.repeat(np.cumsum([0, *lengths[:-1]]), lengths)
+        anew = Episodes(observations, np.concatenate([one[1] for one in kept]), starts, np.repeat(returns, lengths))
+        drawn = []
+        for episodes in (anew, memory.episodes):
+            np.random.seed(number)
+            drawn.append([sample_union([episodes], 16, 2, weighting) for weighting in ("returns", "uniform")])
+        assert_equal(*drawn, "what is drawn")
+
+
+def test_storing_an_episode_seldom_copies_the_others_and_changes_nothing_that_was_laid_out():
+    """Over 2,000 episodes a row is copied a few times on average, not once for each later episode."""
+    memory, n_copied, before = SelfImitationMemory(300), 0, []
+    for seen, actions, paid in random_episodes(2000, np.random.default_rng(0)):
+        old = memory.episodes
+        memory.store(seen, actions, paid)
+        if old is not None and not np.shares_memory(old.observations, memory.episodes.observations):
+            n_copied += len(memory)
+        before.append((memory.episodes, memory.episodes.observations.copy(), memory.episodes.starts.copy()))
+    assert n_copied < 6 * 2000 * 4.5
+    assert all(np.array_equal(one.observations, seen) and np.array_equal(one.starts, starts) for one, seen, starts in before)
+
+
+@pytest.mark.parametrize(("given", "capacity"), [(None, 20), (0, None), (7, 7), (50, 50)])
+def test_the_memory_of_own_episodes_is_no_larger_than_the_buffer_unless_asked_for(given, capacity):
+    memory = CombinedReplayBuffer(20, *SPACES, n_envs=2, self_imitation_size=given, device="cpu").self_imitation
+    assert capacity is None if memory is None else memory.capacity == capacity
+    assert CombinedReplayBuffer(10**6, *SPACES, device="cpu").self_imitation.capacity == 100_000
 
 
 def test_the_replay_buffer_offers_whole_episodes_of_every_environment():

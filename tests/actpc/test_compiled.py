@@ -1,12 +1,15 @@
 """The compiled update: the same numbers as the eager one, and only where it is earned."""
 
+import warnings
+
 import numpy as np
 import pytest
 import torch as th
 from stable_baselines3.common.logger import configure
 
 from sb3_actpc.actpc import actpc as actpc_module
-from sb3_actpc.actpc.compiled import ENOUGH_UPDATES, compiled_update
+from sb3_actpc.actpc import compiled as compiled_module
+from sb3_actpc.actpc.compiled import ENOUGH_UPDATES, CompiledUpdate, compiled_update
 from tests.actpc.agents import make
 from tests.actpc.envs import demonstrations
 
@@ -78,6 +81,26 @@ def test_auto_counts_the_updates_that_a_run_will_make(keywords, per_step):
     model = agent(compile="auto", **keywords)
     enough = int(ENOUGH_UPDATES / per_step)
     assert compiled_update(model, enough - 1) is None and compiled_update(model, enough) is not None
+
+
+@pytest.mark.parametrize(
+    ("keywords", "why"),
+    [
+        ({"replay_buffer_kwargs": {"self_imitation_size": 0}}, "nothing is imitated .no demonstrations=, and no paid episode"),
+        ({"refresh_weight": 0.0}, "refresh_weight=0"),
+        ({"actor_pressure": 0.0, "critic_warmup": 5}, "actor_pressure=0"),
+    ],
+)
+def test_updates_that_were_to_be_compiled_and_cannot_be_are_named_once(keywords, why, monkeypatch):
+    """ "auto" compiles where it can."""
+    monkeypatch.setattr(CompiledUpdate, "__call__", lambda self, *parts: pytest.fail("it was compiled"))
+    with pytest.warns(UserWarning, match=f"compile=True: updates run eagerly while {why}") as said:
+        make(compile=True, alpha_in=0.0, **keywords).learn(60)
+    assert len([one for one in said if "eagerly" in str(one.message)]) == 1
+    monkeypatch.setattr(compiled_module, "ENOUGH_UPDATES", 1)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", UserWarning)
+        make(compile="auto", alpha_in=0.0, **keywords).learn(60)
 
 
 def test_without_a_compiler_updates_stay_eager(monkeypatch):

@@ -888,9 +888,19 @@ def test_an_episode_that_does_not_end_is_named_once(monkeypatch):
 def test_random_actions_prove_nothing():
     """What comes before ``learning_starts`` is nobody's: an episode that begins there counts for nothing either."""
     model, roles = imitating(learning_starts=20), Roles()
-    model.learn(40, callback=roles)  # episodes of 5, 9, 3, 12, 5 and 9 steps: the fourth goes on until step 29
-    assert [row[0] for row in roles.rows] == ["actor"] * 29 + ["habit"] * 11  # of the fourth nine steps count: two quiet ones
-    assert model.trials.habit_returns == [0.0]
+    model.learn(43, callback=roles)  # episodes of 5, 9, 3, 12, 5 and 9 steps: the fourth, paid 2, goes on until step 29
+    assert [row[0] for row in roles.rows] == ["actor"] * 34 + ["habit"] * 9
+    assert (model.trials.noisy_returns, model.trials.habit_returns) == ([0.0], [1.0])
+
+
+def test_of_several_environments_each_counts_from_its_own_next_episode_on():
+    """A random step more makes no episode whole: two environments step at once, the second one in longer episodes."""
+    pays = [partial(CountingEnv, lengths=(length,), returns=(float(length),), cut=(True,)) for length in (4, 7)]
+    model = imitating(DummyVecEnv(pays), learning_starts=9, gradient_steps=-1)
+    model.learn(16)  # five random steps of each, then three
+    assert model.trials.lengths == [0, 1] and not model.trials.noisy_returns
+    model.learn(8, reset_num_timesteps=False)  # four more
+    assert model.trials.lengths == [0, 5] and model.trials.noisy_returns == [4.0]
 
 
 @pytest.mark.parametrize("n_envs", [1, 2])

@@ -12,7 +12,7 @@ import pytest
 from gymnasium import spaces
 from gymnasium.envs.classic_control import PendulumEnv
 from stable_baselines3 import DDPG, SAC, TD3
-from stable_baselines3.common.callbacks import EvalCallback
+from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import BitFlippingEnv
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
@@ -22,7 +22,7 @@ from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 import sb3_actpc.envs  # noqa: F401, registers the sparse tasks
 from sb3_actpc import ActPC
 from sb3_actpc.actpc.cloning import Cloning
-from sb3_actpc.checkpoints import list_bundles, restore
+from sb3_actpc.checkpoints import CheckpointCallback, continue_learning, list_bundles, restore
 from sb3_actpc.checkpoints.simulators import _physics_arrays
 from tests.actpc.envs import CountingEnv, demonstrations
 from tests.checkpoints.runs import (
@@ -36,6 +36,8 @@ from tests.checkpoints.runs import (
     log_rows,
     make_actpc,
 )
+
+REMEMBERING = {"net_arch": [16, 16], "memory_history": 3}
 
 
 def check(make: Any, folder: Path, n_steps: int, stop_at: int, **options: Any) -> None:
@@ -69,7 +71,7 @@ def test_actpc(tmp_path: Path, n_envs: int, normalize: bool, stop_at: int) -> No
         },
         {"n_steps": 3, "signal_kwargs": {"normalizer": "quantile"}},
         {"n_steps": 4, "policy_kwargs": {"net_arch": [16, 16], "memory_history": 3}},
-        {"optimize_memory_usage": True, "replay_buffer_kwargs": {"handle_timeout_termination": False}},
+        {"optimize_memory_usage": True, "replay_buffer_kwargs": {"handle_timeout_termination": False}, "alpha_ep": 0.0},
         {"demonstration_fraction": 0.0, "actor_warm_start": 0, "observation_normalization": "none"},
         {"tau": 1.0, "target_update_interval": 7, "train_freq": (3, "step"), "gradient_steps": -1},
         {"train_freq": (1, "episode"), "gradient_steps": 2},
@@ -303,6 +305,30 @@ def test_a_stop_in_the_pretraining_loses_no_update(tmp_path: Path, monkeypatch: 
     assert stopped.n_cloning_updates + int(stopped.policy.n_prior_updates) == stop_after
     assert_same(straight, resumed)
     assert log_rows(tmp_path / "straight" / "progress.csv") == log_rows(tmp_path / "resumed" / "progress.csv")
+
+
+class StopOnce(BaseCallback):
+    """Ends the training within a rollout, as SB3's callbacks do."""
+
+    def __init__(self, step: int) -> None:
+        super().__init__()
+        self.step = step
+
+    def _on_step(self) -> bool:
+        return self.num_timesteps != self.step
+
+
+def test_a_run_that_a_callback_stopped_goes_on_from_its_checkpoint_as_without_one(tmp_path: Path) -> None:
+    def make() -> ActPC:
+        return make_actpc(CountingEnv, 2, normalize=True, demonstrations=demonstrations(), policy_kwargs=REMEMBERING)
+
+    straight = make().learn(90, callback=StopOnce(34))
+    straight.learn(56, reset_num_timesteps=False)
+    make().learn(90, callback=[StopOnce(34), CheckpointCallback(tmp_path)])
+    resumed = make()
+    continue_learning(restore(resumed, tmp_path), CheckpointCallback(tmp_path))
+    assert resumed.num_timesteps == 90
+    assert_same(straight, resumed)
 
 
 def test_environments_in_other_processes_start_again_from_seeded_states(tmp_path: Path) -> None:

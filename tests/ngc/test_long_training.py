@@ -41,7 +41,7 @@ def energies_while_settling(circuit, x, target):
     energies = []
     for k in range(1, steps + 1):
         circuit.n_settling_steps = k
-        energies.append(float(circuit.energy(circuit.settle(x, target)).mean()))
+        energies.append(float(circuit.settle(x, target).total_discrepancy().mean()))
     circuit.n_settling_steps = steps
     return energies
 

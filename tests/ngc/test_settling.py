@@ -42,8 +42,6 @@ def test_hebbian_change_is_minus_the_gradient_by_the_weights_at_the_settled_stat
     changes = circuit.hebbian_update(state)
     for change, synapse in zip([*changes.weights, *changes.biases], [*weights, *biases], strict=True):
         assert th.allclose(change, -synapse.grad, atol=1e-12)
-    for change, feedback in zip(changes.weights, changes.feedback, strict=True):
-        assert th.equal(change.t(), feedback)
 
 
 def test_an_error_comes_one_layer_further_with_every_step():
@@ -124,11 +122,11 @@ def test_two_krylov_steps_lower_the_energy_more_than_twenty_of_eq_1():
     for weights in circuit.weights:
         weights.mul_(2.0)  # as trained circuits have them: eq. 1 must then take small steps
     circuit.n_settling_steps = 2
-    mine = circuit.energy(circuit.settle(x, target)).mean()
+    mine = circuit.settle(x, target).total_discrepancy().mean()
     circuit.dynamics, circuit.n_settling_steps = "state", 20
     norm = max(float(th.linalg.matrix_norm(w, 2)) for w in circuit.weights)
     circuit.rates.fill_(1.0 / (1.0 + norm**2))
-    assert mine < circuit.energy(circuit.settle(x, target)).mean()
+    assert mine < circuit.settle(x, target).total_discrepancy().mean()
 
 
 def test_energy_never_rises_while_settling():
@@ -137,7 +135,7 @@ def test_energy_never_rises_while_settling():
     energies = []
     for steps in range(1, 11):
         circuit.n_settling_steps = steps
-        energies.append(float(circuit.energy(circuit.settle(x, target)).mean()))
+        energies.append(float(circuit.settle(x, target).total_discrepancy().mean()))
     start = oracle.energy(circuit, *oracle.synapses(circuit, False), _projected(circuit, x), target) / len(x)
     assert all(new < old for old, new in zip([float(start), *energies], energies, strict=False))
 
