@@ -393,13 +393,19 @@ MUTANTS = [
     Mutant("an episode's rest is a whole one", AGENT, " or env in self.trials.skipped", "", f"{HABIT} -k 'random or counts'"),
     Mutant("the habit is not copied", AGENT, "_copy(self.policy.candidate, self.actor.habit)", "pass", f"{HABIT} -k predict"),
     Mutant("the learning actor acts", POLICIES, "self.circuit if self.habit is None", "self.circuit if True", HABIT),
-    Mutant("one proof is enough", TRIALS, "elif n < N_PROOFS:", "elif n < 1:", HABIT),
+    Mutant("one proof is enough", TRIALS, "if n < N_PROOFS:", "if n < 1:", HABIT),
     Mutant("a tie is a proof", TRIALS, "gain >= max(smallest, (SURE", "gain >= max(0.0, (SURE", HABIT),
     Mutant("chance is a proof", TRIALS, "(SURE if has_time else LIKELY) * error", "0.0", HABIT),
     Mutant("chance is a tie", TRIALS, "abs(gain) + SURE * error > smallest", "abs(gain) > smallest", f"{HABIT} -k chance"),
-    Mutant("a chance loss is held against a candidate", TRIALS, "has_time * LIKELY * error", "0.0", f"{HABIT} -k chance"),
     Mutant(
-        "a sure loss waits for the end", TRIALS, "has_time * LIKELY * error", "has_time * SURE * error", f"{HABIT} -k chance"
+        "a chance loss is held against a candidate", TRIALS, "LIKELY * error if has_time else 0.0", "0.0", f"{HABIT} -k chance"
+    ),
+    Mutant(
+        "a sure loss waits for the end",
+        TRIALS,
+        "LIKELY * error if has_time else 0.0",
+        "SURE * error if has_time else 0.0",
+        f"{HABIT} -k chance",
     ),
     Mutant(
         "chance is held against a candidate",
@@ -411,7 +417,7 @@ MUTANTS = [
     Mutant(
         "a candidate plays on for ever",
         TRIALS,
-        "has_time = self.candidate_steps < MOST_PROOF_STEPS * (1 + is_doubtful)",
+        "has_time = self.candidate_steps < MOST_PROOF_STEPS * (2 if is_doubtful else 1)",
         "has_time = True",
         f"{HABIT} -k plays_on",
     ),
@@ -480,8 +486,8 @@ MUTANTS = [
     Mutant(
         "the episodes that end first count first",
         TRIALS,
-        "self.quiet.append([env, quiet, None, 0])",
-        "self.quiet.insert(0, [env, quiet, None, 0])",
+        "self.quiet.append(QuietEpisode(env, quiet))",
+        "self.quiet.insert(0, QuietEpisode(env, quiet))",
         f"{HABIT} -k order",
     ),
     Mutant(
@@ -532,7 +538,7 @@ MUTANTS = [
     Mutant(
         "the habit is not tested again",
         TRIALS,
-        'self.tests_habit = verdict != "accepted"',
+        "self.tests_habit = not is_accepted",
         "self.tests_habit = False",
         f"{HABIT} -k tested",
     ),
@@ -685,11 +691,11 @@ MUTANTS = [
     Mutant(
         "old candidates count",
         TRIALS,
-        'if one[1] == "habit" and verdict != "accepted"',
-        'if one[1] == "candidate" or verdict != "accepted"',
+        'if one.role == "habit" and not is_accepted',
+        'if one.role == "candidate" or not is_accepted',
         f"{HABIT} -k judged_meanwhile",
     ),
-    Mutant("old habits count", TRIALS, ' and verdict != "accepted"]', "]", f"{HABIT} -k old_habit"),
+    Mutant("old habits count", TRIALS, " and not is_accepted]", "]", f"{HABIT} -k old_habit"),
     Mutant(
         "short episodes prove at once",
         TRIALS,

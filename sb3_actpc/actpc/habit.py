@@ -28,6 +28,22 @@ SMALLEST_GAIN, GREAT_LOSS = 0.01, 0.2
 
 
 @dataclass
+class QuietEpisode:
+    """An episode without exploration noise.
+
+    :param env: in which environment
+    :param role: who plays it
+    :param episode_return: what it was paid; None while it runs
+    :param length: its steps
+    """
+
+    env: int
+    role: Role
+    episode_return: float | None = None
+    length: int = 0
+
+
+@dataclass
 class Trials:
     """
     Who plays which episode, and what follows from its return. Holds no circuits: the agent copies them as it is told.
@@ -55,7 +71,7 @@ class Trials:
     generation: int = 0
     returns: list[float] = field(default_factory=list)  # so far, of the running episodes
     lengths: list[int] = field(default_factory=list)
-    quiet: list[list[Any]] = field(default_factory=list)  # [environment, role, return or None, length], as they began
+    quiet: list[QuietEpisode] = field(default_factory=list)  # that run, or wait for one that does; as they began
     quiet_due: list[int] = field(default_factory=list)  # steps without noise that are still due, for each environment
     habit_returns: list[float] = field(default_factory=list)
     noisy_returns: list[float] = field(default_factory=list)  # the learning actor's last ones
@@ -76,6 +92,7 @@ class Trials:
     def __post_init__(self) -> None:
         if not self.roles:
             self.begin_all()
+        self.quiet = [QuietEpisode(**one) if isinstance(one, dict) else one for one in self.quiet]  # of a checkpoint
 
     def begin_all(self) -> None:
         """All environments were reset: episodes that were running do not count."""
@@ -133,11 +150,12 @@ class Trials:
         if role == "actor" and self.generations[env] == self.generation:  # else another actor began it
             self.noisy_returns = [*self.noisy_returns, episode_return][-KEPT_NOISY_RETURNS:]
         for one in self.quiet:
-            if one[0] == env and one[2] is None:
-                one[2:] = episode_return, length
+            if one.env == env and one.episode_return is None:
+                one.episode_return, one.length = episode_return, length
         verdict: Verdict | None = None
-        while self.quiet and self.quiet[0][2] is not None:
-            verdict = self._count(*self.quiet.pop(0)[1:]) or verdict
+        while self.quiet and (ended := self.quiet[0].episode_return) is not None:
+            first = self.quiet.pop(0)
+            verdict = self._count(first.role, ended, first.length) or verdict
         return verdict
 
     def _count(self, role: Role, episode_return: float, length: int) -> Verdict | None:
@@ -145,7 +163,10 @@ class Trials:
         if role == "candidate":
             self.candidate_returns.append(episode_return)
             self.candidate_steps += length
-            return self._judge()
+            verdict = self._judge()
+            if verdict is not None:
+                self._conclude(verdict)
+            return verdict
         self.habit_returns = [*self.habit_returns, episode_return][-KEPT_RETURNS:]
         self.habit_proofs, self.habit_steps = self.habit_proofs + 1, self.habit_steps + length
         self.tests_habit = len(self.habit_returns) < N_PROOFS or not _is_tried(self.habit_proofs, self.habit_steps)
@@ -165,7 +186,7 @@ class Trials:
         self.roles[env] = quiet if is_quiet else "actor"
         self.generations[env] = self.generation
         if is_quiet:
-            self.quiet.append([env, quiet, None, 0])
+            self.quiet.append(QuietEpisode(env, quiet))
         if self.roles[env] != "candidate" or self.on_trial:
             return False
         self.on_trial, self.is_clone = True, self.needs_clone()
@@ -173,6 +194,7 @@ class Trials:
         return True
 
     def _judge(self) -> Verdict | None:
+        """What the candidate's returns say beside the habit's; None while they say too little."""
         own, n = self.candidate_returns, len(self.candidate_returns)
         gain, unit = fmean(own) - self.habit_return, abs(self.habit_return)
         smallest, error = SMALLEST_GAIN * unit, self._standard_error()
@@ -180,27 +202,33 @@ class Trials:
         if not _is_tried(n, self.candidate_steps) and not (n >= N_PROOFS and great_loss):
             return None
         is_doubtful = not self.is_clone and not self.is_ahead()
-        has_time = self.candidate_steps < MOST_PROOF_STEPS * (1 + is_doubtful)
-        verdict: Verdict = "tied"
-        if great_loss or (n >= N_PROOFS and gain < -max(smallest, has_time * LIKELY * error)):
-            verdict = "rejected"
-        elif n < N_PROOFS:
+        has_time = self.candidate_steps < MOST_PROOF_STEPS * (2 if is_doubtful else 1)
+        if great_loss:
+            return "rejected"
+        if n < N_PROOFS:
             return None
-        elif gain > 0.0 and gain >= max(smallest, (SURE if has_time else LIKELY) * error):
-            verdict, self.habit_returns = "accepted", own[-KEPT_RETURNS:]
+        if gain < -max(smallest, LIKELY * error if has_time else 0.0):
+            return "rejected"
+        if gain > 0.0 and gain >= max(smallest, (SURE if has_time else LIKELY) * error):
+            return "accepted"
+        is_open = has_time and abs(gain) + SURE * error > smallest
+        return None if is_open else "tied"
+
+    def _conclude(self, verdict: Verdict) -> None:
+        """The candidate is judged: what is counted begins anew."""
+        is_accepted = verdict == "accepted"
+        if is_accepted:
+            self.habit_returns = self.candidate_returns[-KEPT_RETURNS:]
             self.noisy_returns = [] if self.is_clone else self.noisy_returns
             # what the old habit has begun elsewhere is no return of the new one
             self.roles = ["actor" if role == "habit" else role for role in self.roles]
             self.has_learned = self.has_learned and not self.is_clone  # the next learner begins as this clone
-        elif has_time and abs(gain) + SURE * error > smallest:
-            return None
         self.n_rejected = self.n_rejected + 1 if verdict == "rejected" and not self.is_clone else 0
-        self.tests_habit = verdict != "accepted"
-        self.quiet = [one for one in self.quiet if one[1] == "habit" and verdict != "accepted"]
+        self.tests_habit = not is_accepted
+        self.quiet = [one for one in self.quiet if one.role == "habit" and not is_accepted]
         self.candidate_returns, self.candidate_steps, self.on_trial = [], 0, False
         self.habit_proofs, self.habit_steps = 0, 0
         self.generation += 1
-        return verdict
 
     def _standard_error(self) -> float:
         """Of the difference of the two means, from the variance within both."""

@@ -27,6 +27,7 @@ from sb3_actpc.actpc.habit import (
     N_PROOFS,
     PROOF_STEPS,
     SURE,
+    QuietEpisode,
     Trials,
 )
 from sb3_actpc.actpc.self_imitation import imitated_return
@@ -57,7 +58,7 @@ def play(trials, episode_return, length=PROOF_STEPS, env=0, has_learned=True):
 def cast(trials, role, env=0):
     """The episode of ``env`` that is about to begin is played by this one."""
     trials.roles[env] = role
-    trials.quiet = [one for one in trials.quiet if one[0] != env] + [[env, role, None, 0]] * (role != "actor")
+    trials.quiet = [one for one in trials.quiet if one.env != env] + [QuietEpisode(env, role)] * (role != "actor")
 
 
 def play_quiet(trials, episode_return, length=PROOF_STEPS, env=0):
@@ -561,7 +562,7 @@ def test_what_the_habit_is_paid_elsewhere_meanwhile_does_not_stop_the_trial_of_a
         assert early(40.0) == ("habit", None)
     early(0.0, 3, 1)  # its quiet episodes are the clone's
     assert trials.roles == ["actor", "candidate"] and trials.is_clone
-    trials.roles[0], trials.quiet = "habit", [[0, "habit", None, 0], *trials.quiet]  # as if it had begun before
+    trials.roles[0], trials.quiet = "habit", [QuietEpisode(0, "habit"), *trials.quiet]  # as if it had begun before
     assert early(40.0) == ("habit", None)
     assert early(90.0, env=1) == ("candidate", None)
     assert trials.roles == ["candidate", "candidate"] and not trials.n_clones
