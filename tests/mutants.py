@@ -591,6 +591,13 @@ MUTANTS = [
         "shortfall * self.imitated_return",
         f"{HABIT} -k tenth",
     ),
+    Mutant(
+        "an episode of two habits counts",
+        AGENT,
+        "self.trials.skipped = list(range(self.n_envs))  # the running",
+        "pass  # the running",
+        f"{HABIT} -k another_habit",
+    ),
     Mutant("own episodes keep old neighbours", AGENT, "memory.episodes.neighbours = None", "pass", f"{HABIT} -k anew"),
     Mutant("a given noise is not heeded", AGENT, "else self.refresh.noise\n", "else 1.0\n", f"{ROOMS} -k without_a_word"),
     Mutant("clones imitate without noise", AGENT, "_imitated(n, self.clone_noise)", "_imitated(n)", f"{HABIT} -k noise"),

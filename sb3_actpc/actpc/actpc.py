@@ -457,6 +457,7 @@ class ActPC(OffPolicyAlgorithm):
     def _forget_trials(self) -> None:
         if self.trials is not None:
             self.trials = Trials(self.n_envs, n_clones=self.trials.n_clones, begun_at=self.trials.begun_at)
+            self.trials.skipped = list(range(self.n_envs))  # the running episodes were begun by others
 
     @property
     def pretrained(self) -> bool:

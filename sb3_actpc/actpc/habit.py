@@ -87,7 +87,7 @@ class Trials:
     has_learned: bool = False
     n_rejected: int = 0  # learners in a row
     tests_habit: bool = True  # before the next candidate: its return must be known, or known better
-    skipped: list[int] = field(default_factory=list)  # environments whose running episode began with random actions
+    skipped: list[int] = field(default_factory=list)  # environments whose running episode began otherwise
 
     def __post_init__(self) -> None:
         if not self.roles:
@@ -120,7 +120,7 @@ class Trials:
 
     def skip(self, env: int, is_last: bool) -> None:
         """
-        A random action, or a later step of an episode that began with one: it proves nothing.
+        A random action, or a later step of an episode that began with one, or with another habit: it proves nothing.
 
         :param env: which environment
         :param is_last: whether its episode ends with it; the next one may count

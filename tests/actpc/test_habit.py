@@ -904,6 +904,17 @@ def test_of_several_environments_each_counts_from_its_own_next_episode_on():
     assert model.trials.lengths == [0, 5] and model.trials.noisy_returns == [4.0]
 
 
+def test_an_episode_that_was_begun_by_another_habit_counts_for_nothing():
+    """Parameters that are given within an episode; the next one counts whole."""
+    model = imitating(env=lambda: CountingEnv(lengths=(10,), returns=(10.0,), cut=(True,)))
+    model.learn(4)
+    model.set_parameters(model.get_parameters())
+    model.learn(16, reset_num_timesteps=False)
+    assert (model.trials.noisy_returns, model.trials.habit_returns) == ([10.0], [])
+    model.learn(10, reset_num_timesteps=False)
+    assert (model.trials.noisy_returns, model.trials.habit_returns) == ([10.0], [10.0])
+
+
 @pytest.mark.parametrize("n_envs", [1, 2])
 @pytest.mark.parametrize("n_clones", [1, 4])
 def test_a_run_stopped_between_verdicts_is_the_run_never_stopped(n_clones, n_envs, tmp_path, monkeypatch):
