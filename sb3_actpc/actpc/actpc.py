@@ -25,7 +25,6 @@ from sb3_actpc.actpc.arguments import (
     MAX_SEED,
     Between,
     Count,
-    Settings,
     Share,
     Size,
     Weight,
@@ -62,7 +61,7 @@ from sb3_actpc.checkpoints import Restored, between_updates, load_checkpoint, lo
 from sb3_actpc.demonstrations import fit_demonstrations
 from sb3_actpc.demonstrations.dataset import Demonstrations
 from sb3_actpc.ngc import CoupledState, HebbianChanges, NGCCircuit, settle_coupled
-from sb3_actpc.utils.checks import check_finite, check_kinds, named_in_errors
+from sb3_actpc.utils.checks import Settings, check_finite, check_kind, named_in_errors
 
 SelfActPC = TypeVar("SelfActPC", bound="ActPC")
 
@@ -328,7 +327,7 @@ class ActPC(OffPolicyAlgorithm):
 
     def _make_policy(self) -> ActPCPolicy:
         given = self.policy_kwargs.get("circuit_kwargs") or {}
-        check_kinds({"circuit_kwargs": given}, mappings="circuit_kwargs")
+        check_kind("circuit_kwargs", given, Settings | None)
         chosen = given.get("settling", self.settling)
         if not isinstance(chosen, str) or chosen != self.settling:
             raise ValueError(f"circuit_kwargs has settling={chosen!r} but the agent's is {self.settling!r}; pass settling=")

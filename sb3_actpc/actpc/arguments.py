@@ -18,7 +18,7 @@ from stable_baselines3.common.type_aliases import TrainFreq
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_actpc.ngc.circuit import LARGEST_SIZE as LARGEST_LAYER
-from sb3_actpc.utils.checks import LARGEST_SIZE, check_device, check_kinds, nearest
+from sb3_actpc.utils.checks import KINDS, LARGEST_SIZE, check_device, check_kind, nearest
 
 Parameters = ParamSpec("Parameters")
 CIRCUITS = ("actor", "critic", "generator", "prior")
@@ -45,18 +45,6 @@ Weight = Annotated[float, Between(0)]
 Count = Annotated[int, Between(0)]
 Positive = Annotated[int, Between(1)]
 Size = Annotated[int, Between(1, LARGEST_SIZE)]
-Settings = dict[str, Any]
-
-# a plain annotation -> the kind of :func:`~sb3_actpc.utils.checks.check_kinds`; others are left to the functions in Annotated
-_KINDS: dict[Any, str] = {
-    float: "numbers",
-    int: "whole",
-    bool: "flags",
-    float | None: "optional",
-    int | None: "optional_whole",
-    str | None: "paths",
-    Settings | None: "mappings",
-}
 
 
 def checked(init: Callable[Parameters, None]) -> Callable[Parameters, None]:
@@ -90,8 +78,8 @@ def _check(name: str, value: Any, annotation: Any) -> None:
     if get_origin(kind) is Literal:
         if not isinstance(value, str) or value not in get_args(kind):
             raise ValueError(f"{name}={value!r} is unknown; choose one of {list(get_args(kind))}")
-    elif kind in _KINDS:
-        check_kinds({name: value}, **{_KINDS[kind]: name})
+    elif kind in KINDS:  # others are left to the functions in Annotated
+        check_kind(name, value, kind)
     for check in checks:
         check(name, value)
 

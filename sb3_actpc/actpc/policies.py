@@ -19,7 +19,6 @@ from sb3_actpc.actpc.arguments import (
     CIRCUITS,
     MAX_CRITICS,
     Between,
-    Settings,
     Weight,
     check_circuit,
     check_extractor,
@@ -31,7 +30,7 @@ from sb3_actpc.actpc.arguments import (
 from sb3_actpc.actpc.trust_region import TrustRegion
 from sb3_actpc.ngc import NGCCircuit, WorkingMemory, check_agreement
 from sb3_actpc.ngc.activations import ACTIVATIONS
-from sb3_actpc.utils.checks import LARGEST_SIZE, check_kinds, named_in_errors
+from sb3_actpc.utils.checks import LARGEST_SIZE, Settings, check_kind, named_in_errors
 
 # what circuit_kwargs, actor_kwargs and so on may set; sizes follow from the task
 _SIZES = {"self", "n_inputs", "n_outputs", "hidden", "output_activation", "n_memory", "n_feedback_inputs"}
@@ -488,7 +487,7 @@ def check_policy(name: str, policy: Any) -> None:
 
 def check_policy_kwargs(name: str, given: Any) -> None:
     """:raises ValueError: naming the keywords that no policy has; the policy checks the values"""
-    check_kinds({name: given}, mappings=name)
+    check_kind(name, given, Settings | None)
     known = set(inspect.signature(ActPCPolicy.__init__).parameters)
     known -= {"self", "observation_space", "action_space", "lr_schedule"}
     unknown = sorted(set(given or {}) - known)

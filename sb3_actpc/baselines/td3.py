@@ -13,7 +13,7 @@ from stable_baselines3.common.utils import polyak_update
 from sb3_actpc.actpc.arguments import Share, Weight, checked
 from sb3_actpc.actpc.self_imitation import map_observations
 from sb3_actpc.baselines.demonstrated import DemonstratedAlgorithm
-from sb3_actpc.utils.checks import check_kinds
+from sb3_actpc.utils.checks import check_kind
 
 OPTIMIZERS: dict[str, type[th.optim.Optimizer]] = {"adam": th.optim.Adam, "adamw": th.optim.AdamW}
 NETWORK_KEYWORDS = ("learning_rate", "optimizer", "optimizer_kwargs", "tau")
@@ -56,7 +56,8 @@ class TD3Demo(DemonstratedAlgorithm, TD3):
             raise ValueError(f"{name}_kwargs has unknown keys {unknown}: choose from {', '.join(NETWORK_KEYWORDS)}")
         if given.get("optimizer", "adam") not in OPTIMIZERS:
             raise ValueError(f"{name}_kwargs: optimizer={given['optimizer']!r} is unknown; choose one of {sorted(OPTIMIZERS)}")
-        check_kinds({"learning_rate": 0.0, "tau": self.tau, **given}, numbers="learning_rate tau")
+        for keyword in sorted({"learning_rate", "tau"} & set(given)):
+            check_kind(keyword, given[keyword], float)
         network: BaseModel = getattr(self, name)
         kind, options = self.policy.optimizer_class, self.policy.optimizer_kwargs
         if "optimizer" in given:

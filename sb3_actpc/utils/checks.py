@@ -17,6 +17,7 @@ from stable_baselines3.common.utils import get_device
 LARGEST_NUMBER = float(np.finfo(np.float32).max)
 LARGEST_WHOLE = 2**63 - 1
 LARGEST_SIZE = 2**31 - 1
+Settings = dict[str, Any]
 
 
 def _is(kind: type, largest: float, value: Any) -> bool:
@@ -29,32 +30,30 @@ _is_number = partial(_is, Real, LARGEST_NUMBER)
 _is_whole = partial(_is, Integral, LARGEST_WHOLE)
 
 
-# option of check_kinds -> (whether a value is of this kind, what it must be)
-_KINDS: dict[str, tuple[Callable[[Any], bool], str]] = {
-    "numbers": (_is_number, "a finite number"),
-    "whole": (_is_whole, "a whole number"),
-    "optional": (lambda value: value is None or _is_number(value), "a finite number or None"),
-    "optional_whole": (lambda value: value is None or _is_whole(value), "a whole number or None"),
-    "flags": (lambda value: isinstance(value, (bool, np.bool_)), "True or False"),
-    "paths": (lambda value: isinstance(value, (str, PathLike, NoneType)), "a path or None"),
-    "mappings": (
+# annotation -> (whether a value is of this kind, what it must be)
+KINDS: dict[Any, tuple[Callable[[Any], bool], str]] = {
+    float: (_is_number, "a finite number"),
+    int: (_is_whole, "a whole number"),
+    float | None: (lambda value: value is None or _is_number(value), "a finite number or None"),
+    int | None: (lambda value: value is None or _is_whole(value), "a whole number or None"),
+    bool: (lambda value: isinstance(value, (bool, np.bool_)), "True or False"),
+    str | None: (lambda value: isinstance(value, (str, PathLike, NoneType)), "a path or None"),
+    Settings | None: (
         lambda value: value is None or (isinstance(value, Mapping) and all(isinstance(key, str) for key in value)),
         "a dictionary with text keys, or None",
     ),
 }
 
 
-def check_kinds(given: Mapping[str, Any], **names: str) -> None:
-    """:param given: keyword -> value
-    :param names: keywords (separated by spaces) that must be ``numbers`` (finite), ``whole`` numbers, ``optional`` (a number
-        or None), ``optional_whole``, ``flags``, ``paths`` or ``mappings`` (the last two may be None)
-    :raises ValueError: naming the first value of another kind
+def check_kind(name: str, value: Any, kind: Any) -> None:
+    """:param name: the keyword
+    :param value: what it was given
+    :param kind: its annotation, one of ``KINDS``
+    :raises ValueError: naming a value of another kind
     """
-    for option, keywords in names.items():
-        is_kind, wanted = _KINDS[option]
-        for name in keywords.split():
-            if not is_kind(given[name]):
-                raise ValueError(f"{name}={given[name]!r} must be {wanted}")
+    is_kind, wanted = KINDS[kind]
+    if not is_kind(value):
+        raise ValueError(f"{name}={value!r} must be {wanted}")
 
 
 def nearest(name: str, known: Iterable[str]) -> str:

@@ -22,7 +22,7 @@ from sb3_actpc.envs import sparse_env_id
 from sb3_actpc.experiments.runs.algorithms import check_keywords, load_algorithm
 from sb3_actpc.experiments.runs.environments import make_env
 from sb3_actpc.experiments.runs.schema import Run, merged
-from sb3_actpc.utils.checks import check_kinds, nearest
+from sb3_actpc.utils.checks import Settings, check_kind, nearest
 from sb3_actpc.utils.constructors import constructor_keywords
 from sb3_actpc.utils.files import file_hash
 
@@ -140,7 +140,7 @@ def agent_keywords(run: Run, observation_space: gym.Space[Any], action_space: gy
         keywords["learning_rate"] = parse_schedule(keywords["learning_rate"])
     if isinstance(keywords.get("train_freq"), list):
         keywords["train_freq"] = tuple(keywords["train_freq"])
-    check_kinds({"policy_kwargs": keywords.get("policy_kwargs")}, mappings="policy_kwargs")
+    check_kind("policy_kwargs", keywords.get("policy_kwargs"), Settings | None)
     activation = (keywords.get("policy_kwargs") or {}).get("activation_fn")
     if isinstance(activation, str):
         if activation not in _ACTIVATIONS:
