@@ -599,7 +599,7 @@ MUTANTS = [
         f"{HABIT} -k another_habit",
     ),
     Mutant("own episodes keep old neighbours", AGENT, "memory.episodes.neighbours = None", "pass", f"{HABIT} -k anew"),
-    Mutant("a given noise is not heeded", AGENT, "else self.refresh.noise\n", "else 1.0\n", f"{ROOMS} -k without_a_word"),
+    Mutant("a given noise is not heeded", AGENT, "return self.refresh.noise\n", "return 1.0\n", f"{ROOMS} -k without_a_word"),
     Mutant("clones imitate without noise", AGENT, "_imitated(n, self.clone_noise)", "_imitated(n)", f"{HABIT} -k noise"),
     Mutant(
         "the learning actor is blurred", AGENT, "n: int, noise: float = 0.0) -> t", "n: int, noise: float = 0.5) -> t", HABIT
@@ -641,7 +641,7 @@ MUTANTS = [
         "if False:",
         "tests/experiments/test_examination.py -k held",
     ),
-    Mutant("noise where there is no room", AGENT, "float(room.is_wide)", "1.0", f"{ROOMS} -k without_a_word"),
+    Mutant("noise where there is no room", AGENT, "and self.room.is_wide)", ")", f"{ROOMS} -k without_a_word"),
     Mutant("room in any unit", ROOM, "> self.step", "> 0.5", f"{ROOMS} -k without_a_word"),
     Mutant("noise of one size", ROOM, "size * way.abs() * th.randn_like(features)", "size * th.randn_like(features)", ROOMS),
     Mutant("noise as wide as the room", ROOM, "nan_to_num(0.0).clamp_max(1.0)", "nan_to_num(0.0).clamp(1.0, 1.0)", ROOMS),

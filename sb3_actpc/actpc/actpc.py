@@ -994,9 +994,9 @@ class ActPC(OffPolicyAlgorithm):
     @property
     def clone_noise(self) -> float:
         """Noise on what clones imitate: as asked for, or by default 1 where the demonstrations leave room and 0 where not."""
-        if (room := self.room) is None:
-            return 0.0
-        return float(room.is_wide) if self.refresh.noise is None else self.refresh.noise
+        if self.expert is not None and self.refresh.noise is not None:
+            return self.refresh.noise
+        return float(self.room is not None and self.room.is_wide)
 
     def _features_of(self, episodes: Episodes, rows: np.ndarray) -> th.Tensor:
         """(B, n_features) of (B,) rows, some at a time: there can be many images."""
