@@ -13,7 +13,7 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import BaseCallback, ProgressBarCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
@@ -506,7 +506,7 @@ class ActPC(OffPolicyAlgorithm):
         self._warn_of_idle_settings()
         if self.verbose:
             print(self.describe())
-        self.pretrain(between_updates(result[1]), progress_bar)
+        self.pretrain(between_updates(result[1]), _shows_progress(result[1]))
         self.start_time = time.time_ns()  # of the frames per second: pre-training has none
         self._compiled = self._compiled or compiled_update(self, self._total_timesteps)  # resumed, as straight
         return result
@@ -1031,6 +1031,8 @@ class ActPC(OffPolicyAlgorithm):
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
     ) -> SelfActPC:
+        check_kind("total_timesteps", total_timesteps, float)
+        Between(0)("total_timesteps", total_timesteps)
         return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
 
     @classmethod
@@ -1146,6 +1148,11 @@ def _follow(targets: list[NGCCircuit], circuits: list[NGCCircuit], tau: float) -
     """Move all synapses of the ``targets`` by the share ``tau`` of the way towards those of the ``circuits``."""
     mine, theirs = ([p for circuit in part for kind in circuit.synapses for p in kind] for part in (targets, circuits))
     th._foreach_lerp_(mine, theirs, tau)
+
+
+def _shows_progress(callback: BaseCallback) -> bool:
+    """Whether there is a progress bar among them, asked for by ``progress_bar`` or given."""
+    return isinstance(callback, ProgressBarCallback) or any(map(_shows_progress, getattr(callback, "callbacks", ())))
 
 
 def _copy(source: NGCCircuit | None, *targets: NGCCircuit | None) -> None:

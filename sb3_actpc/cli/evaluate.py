@@ -37,9 +37,12 @@ def run(args: argparse.Namespace) -> int:
     from sb3_actpc.demonstrations import resolve
     from sb3_actpc.experiments.runs import evaluate_run, load_run
     from sb3_actpc.experiments.runs.presets import find_demonstrations
+    from sb3_actpc.experiments.runs.record import is_finished
     from sb3_actpc.experiments.runs.summary import result_table
 
     print(result_table(evaluate_run(folder, args.episodes, args.seed)), flush=True)
+    if not is_finished(folder):
+        print(f"{folder} is not finished: this was the agent of its last evaluation (sb3-actpc train --resume {folder})")
     if video is None:
         return 0
     run, model = load_run(folder)

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch as th
+from stable_baselines3.common.callbacks import ProgressBarCallback
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_actpc import ActPC
@@ -246,3 +247,18 @@ def test_settings_are_checked():
     for size in (0, -1, 1.5, np.nan):
         with pytest.raises(ValueError, match="ensemble_size"):
             imitating(refresh_kwargs={"ensemble_size": size})
+
+
+@pytest.mark.parametrize("asked", ["argument", "callback", None])
+def test_a_progress_bar_shows_the_warm_start_too(asked, capsys):
+    bar = ProgressBarCallback()
+    imitating().learn(2, callback=bar if asked == "callback" else None, progress_bar=asked == "argument")
+    assert ("pre-training" in capsys.readouterr().err) == (asked is not None)
+
+
+@pytest.mark.parametrize("steps", [-5, "abc", None, np.nan])
+def test_a_number_of_steps_is_refused_before_the_warm_start(steps):
+    model = imitating()
+    with pytest.raises(ValueError, match="total_timesteps="):
+        model.learn(steps)
+    assert not model.pretrained

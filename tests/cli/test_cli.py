@@ -77,6 +77,14 @@ def test_training_writes_every_file_and_prints_the_table(capsys: pytest.CaptureF
         assert text in printed
 
 
+@pytest.mark.parametrize(("more", "is_said"), [((), True), (("--demonstrations", "none"), False)])
+def test_a_run_says_when_nothing_is_shipped_for_its_environment(
+    more: tuple[str, ...], is_said: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["train", "--env", "Pendulum-v1", "--steps", "2", "--eval-episodes", "1", "--no-progress", *more]) == 0
+    assert ("Pendulum-v1: no demonstrations are shipped for it" in capsys.readouterr().out) == is_said
+
+
 def test_evaluations_are_of_the_dense_task_from_step_zero_to_the_last() -> None:
     assert train("--demonstrations", "none", "--eval-freq", "25") == 0
     rows = rows_of(RUN)
@@ -293,6 +301,12 @@ def test_evaluate_replays_a_run_and_writes_a_video(capsys: pytest.CaptureFixture
     assert imageio.imread("line.png").shape == (16, 6 * 24, 3)  # six pictures at half the size
     assert main(["evaluate", str(RUN), "--episodes", "1"]) == 0
     assert (RUN / "video.mp4").stat().st_size > 0
+    assert "not finished" not in capsys.readouterr().out
+    (RUN / "result.json").unlink()
+    assert main(["evaluate", str(RUN), "--episodes", "1", "--no-video"]) == 0
+    assert (
+        f"not finished: this was the agent of its last evaluation (sb3-actpc train --resume {RUN})" in capsys.readouterr().out
+    )
 
 
 @pytest.mark.parametrize("choice", ["shipped", "weak"])
@@ -349,6 +363,7 @@ def test_a_graphics_backend_that_does_not_work_is_set_aside(monkeypatch: pytest.
     ("arguments", "message"),
     [
         (["train", "--env", "SparseNothing-v0"], "SparseNothing"),
+        (["train", "--env", "HalfCheetah"], "id: HalfCheetah (did you mean 'HalfCheetah-v"),
         (["train", "--env", ENV_ID, "--algo", "silent"], "no preset 'silent'"),
         (["train", "--env", ENV_ID, "--algo", "unknown"], "algo='unknown' is no algorithm"),
         (TRAIN, "sb3-actpc demos collect --env SparseLine-v0"),

@@ -35,7 +35,8 @@ _NOTE = (
     f"exploration noise; their means need {WINDOW} episodes. R-stability (lower is steadier, 0 is perfect) needs "
     f"{N_EPISODES}, and divides by the best of the last {WINDOW}: where there are fewer, or that is 0, {UNDEFINED} stands; a "
     "column in which nothing else would stand is left out. Offline methods have no training episodes. Returns are those of "
-    "the dense task, which no agent is trained on. Mean ± standard deviation over seeds, (n of N) where not all are defined. "
+    "the dense task, which the agents of a sparse one are not trained on. Mean ± standard deviation over seeds, (n of N) "
+    "where not all are defined. "
     "† marks runs from a source tree with uncommitted changes. The paper's figures (arXiv 2209.09174) are means of five runs "
     "of its own: tasks, demonstrations and steps differ from these."
 )

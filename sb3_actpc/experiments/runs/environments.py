@@ -12,6 +12,8 @@ import gymnasium as gym
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecNormalize
 
+from sb3_actpc.utils.checks import nearest
+
 MAX_EVALUATION_ENVS = 10
 
 
@@ -69,4 +71,9 @@ def check_env_id(env_id: str, gym_packages: Sequence[str] = ()) -> None:
         importlib.import_module(package)
     register_tasks(env_id)
     if ":" not in env_id:
-        gym.spec(env_id)
+        try:
+            gym.spec(env_id)
+        except gym.error.UnregisteredEnv:  # it names others itself
+            raise
+        except gym.error.Error as error:
+            raise gym.error.Error(f"{error}{nearest(env_id, gym.registry)}") from error

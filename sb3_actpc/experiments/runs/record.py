@@ -81,9 +81,14 @@ def write_result(folder: Path) -> dict[str, Any]:
     return result
 
 
+def is_finished(folder: Path) -> bool:
+    """Whether the run of a folder has a result."""
+    return (folder / RESULT).is_file()
+
+
 def read_result(folder: Path) -> dict[str, Any]:
     """The content of ``result.json``; FileNotFoundError when the run is not finished, ValueError when the file is damaged."""
-    if not (folder / RESULT).is_file():
+    if not is_finished(folder):
         raise FileNotFoundError(f"no result in {folder}: the run is not finished")
     result = _read_json(folder / RESULT)
     if not isinstance(result, dict) or not {"env", "algo", "seed", "timesteps", "dense_return"} <= result.keys():

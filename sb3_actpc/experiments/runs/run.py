@@ -164,7 +164,10 @@ def _train(
     if not resumes:
         commit, dirty = git_state()
         policy = fitting_policy(run.policy or "MlpPolicy", model.observation_space)
-        reference = demonstrators_return(find_demonstrations(run.env, run.demonstrations))
+        source = find_demonstrations(run.env, run.demonstrations)
+        if source is None and run.demonstrations == "shipped" and hasattr(model, "demonstrations"):
+            report(f"{run.env}: no demonstrations are shipped for it, so there are none (--demonstrations FILE gives some)")
+        reference = demonstrators_return(source)
         filled = {"policy": policy, "demonstrators_return": reference, "versions": package_versions()}
         run = run.model_copy(update={**filled, "git_commit": commit, "dirty": dirty})
     (folder / RESULT).unlink(missing_ok=True)  # of a finished run that gets more steps, as the settings then say
