@@ -594,8 +594,8 @@ MUTANTS = [
     Mutant(
         "an episode of two habits counts",
         AGENT,
-        "self.trials.skipped = list(range(self.n_envs))  # the running",
-        "pass  # the running",
+        "self.trials.skipped = sorted({*running, *old.skipped})",
+        "self.trials.skipped = old.skipped",
         f"{HABIT} -k another_habit",
     ),
     Mutant("own episodes keep old neighbours", AGENT, "memory.episodes.neighbours = None", "pass", f"{HABIT} -k anew"),

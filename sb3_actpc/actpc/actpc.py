@@ -454,9 +454,10 @@ class ActPC(OffPolicyAlgorithm):
         self._fit_to_bounds()
 
     def _forget_trials(self) -> None:
-        if self.trials is not None:
-            self.trials = Trials(self.n_envs, n_clones=self.trials.n_clones, begun_at=self.trials.begun_at)
-            self.trials.skipped = list(range(self.n_envs))  # the running episodes were begun by others
+        if (old := self.trials) is not None:
+            self.trials = Trials(self.n_envs, n_clones=old.n_clones, begun_at=old.begun_at)
+            running = [env for env, length in enumerate(old.lengths) if length]  # begun by others
+            self.trials.skipped = sorted({*running, *old.skipped})
 
     @property
     def pretrained(self) -> bool:
