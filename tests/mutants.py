@@ -316,8 +316,8 @@ MUTANTS = [
     Mutant(
         "what a habit was paid is said of one that was given in its place",
         AGENT,
-        "super().set_parameters(*args, **kwargs)\n        self._forget_trials()",
-        "super().set_parameters(*args, **kwargs)",
+        "old = self.trials\n        self._forget_trials()",
+        "old = self.trials",
         f"{CLONES} -k parameters",
     ),
     Mutant(

@@ -454,10 +454,8 @@ class ActPC(OffPolicyAlgorithm):
         self._fit_to_bounds()
 
     def _forget_trials(self) -> None:
-        if (old := self.trials) is not None:
-            self.trials = Trials(self.n_envs, n_clones=old.n_clones, begun_at=old.begun_at)
-            running = [env for env, length in enumerate(old.lengths) if length]  # begun by others
-            self.trials.skipped = sorted({*running, *old.skipped})
+        if self.trials is not None:
+            self.trials = Trials(self.n_envs, n_clones=self.trials.n_clones, begun_at=self.trials.begun_at)
 
     @property
     def pretrained(self) -> bool:
@@ -1062,7 +1060,11 @@ class ActPC(OffPolicyAlgorithm):
     def set_parameters(self, *args: Any, **kwargs: Any) -> None:
         """As in SB3. What a habit was paid says nothing of one that is given in its place."""
         super().set_parameters(*args, **kwargs)
+        old = self.trials
         self._forget_trials()
+        if self.trials is not None and old is not None:
+            running = [env for env, length in enumerate(old.lengths) if length]  # begun by another habit
+            self.trials.skipped = sorted({*running, *old.skipped})
 
     def checkpoint_state(self) -> dict[str, Any]:
         """What a checkpoint (:mod:`sb3_actpc.checkpoints`) keeps beside SB3's state: plain values and arrays."""
