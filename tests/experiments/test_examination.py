@@ -130,7 +130,7 @@ def test_an_environment_that_is_held_is_set_into_its_episode_too() -> None:
     options: dict[str, Any] = {"values": true_values, **QUICK}
     plain, held = (examine(RotationAgent(), name, **options).rows for name in (ENV_ID, "HeldRotation-v0"))
     pd.testing.assert_frame_equal(plain, held)
-    with pytest.raises(ValueError, match=r"middle of an episode: .*'env: \w*TimeLimit', 'RotationEnv'\], .*'env: RotationEnv'\]"):
+    with pytest.raises(ValueError, match=r"middle of an ep.*'env: \w*TimeLimit', 'RotationEnv'\], .*'env: RotationEnv'\]"):
         examine(RotationAgent(), "ChangingRotation-v0", **options)
 
 
