@@ -20,7 +20,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
     file = "YAML file with these options as keys; options replace its values, but not those of a task's or variant's own entry"
     add("file", nargs="?", metavar="FILE", help=file)
     add("--envs", nargs="+", metavar="ID", help="tasks, such as SparseHopper-v5")
-    add("--algos", nargs="+", metavar="NAME", help="algorithms or named variants, such as actpc refresh_alone td3")
+    add("--algos", nargs="+", metavar="NAME", help="algorithms or named variants, also FILE's own, such as actpc td3")
     add("--ablate", action="store_true", default=None, help="ActPC with every part, and without each in turn")
     add("--seeds", type=int, metavar="N", help="how many seeds (default: 3)")
     add("--first-seed", type=int, metavar="N", help="the first of them (default: 0)")
@@ -38,15 +38,12 @@ def run(args: argparse.Namespace) -> int:
     from sb3_actpc.checkpoints import EXIT_STOPPED
     from sb3_actpc.experiments.comparison import make_engine, plan_runs, read_comparison
     from sb3_actpc.experiments.comparison.display import Display, describe_runs
-    from sb3_actpc.experiments.comparison.plan import OWN_KEYS, read_comparison_file
+    from sb3_actpc.experiments.comparison.plan import OWN_KEYS, read_comparison_file, with_options
     from sb3_actpc.experiments.comparison.schedule import run_comparison
     from sb3_actpc.experiments.runs import Run
 
     from_file = {} if args.file is None else read_comparison_file(Path(args.file))
-    options = given(args, (*OWN_KEYS, *Run.known_keys()))
-    if "steps" in options:  # a file may call them n_timesteps
-        from_file.pop("n_timesteps", None)
-    comparison = read_comparison({**from_file, **options})
+    comparison = read_comparison(with_options(from_file, given(args, (*OWN_KEYS, *Run.known_keys()))))
     runs, folder = plan_runs(comparison), Path(comparison.output)
     if args.dry_run:
         print(describe_runs(runs))

@@ -60,6 +60,17 @@ def read_comparison_file(path: Path) -> dict[str, Any]:
     return content
 
 
+def with_options(content: Mapping[str, Any], options: Mapping[str, Any]) -> dict[str, Any]:
+    """The content of a file, with options in the place of its values. An algorithm's name may be that of the file's own variant."""
+    content, options = dict(content), dict(options)
+    if "steps" in options:  # a file may call them n_timesteps
+        content.pop("n_timesteps", None)
+    if "algos" in options:
+        own = {entry["name"]: entry for entry in _list(content, "algos") if isinstance(entry, Mapping) and "name" in entry}
+        options["algos"] = [own.get(name, name) for name in options["algos"]]
+    return {**content, **options}
+
+
 def plan_runs(comparison: Comparison, folder: Path | None = None) -> list[Run]:
     """Fill in and check every run before any is begun: the first seed of everything, then the second, ... Their folders are
     ``<task>/<variant>/seed<seed>_<id>`` in ``folder``, by default the comparison's. ValueError when a name or a setting is

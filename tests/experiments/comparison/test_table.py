@@ -103,6 +103,13 @@ def test_variants_and_tasks_of_a_file_have_settings_of_their_own() -> None:
     assert {key: runs[1].settings[key] for key in ("actor_pressure", "gamma")} == {"actor_pressure": 0.0, "gamma": 0.5}
 
 
+def test_an_algorithm_can_be_chosen_by_the_name_that_a_file_gives_it(capsys: pytest.CaptureFixture[str]) -> None:
+    own = {"base": "refresh_alone", "name": "slow", "steps": 20}
+    Path("c.yml").write_text(yaml.safe_dump({"envs": ["SparseReacher-v5"], "algos": [own], "n_timesteps": 70}), encoding="utf-8")
+    assert main(["compare", "c.yml", "--algos", "slow", "actpc", "--seeds", "1", "--steps", "60", "--dry-run"]) == 0
+    assert [line.split()[2:5:2] for line in capsys.readouterr().out.splitlines()[1:3]] == [["slow", "20"], ["actpc", "60"]]
+
+
 def test_every_named_variant_has_settings_that_its_algorithm_takes() -> None:
     for name in variant_names():
         variant = find_variant(name)
