@@ -61,7 +61,7 @@ def read_comparison_file(path: Path) -> dict[str, Any]:
 
 
 def with_options(content: Mapping[str, Any], options: Mapping[str, Any]) -> dict[str, Any]:
-    """The content of a file, with options in the place of its values. An algorithm's name may be that of the file's own variant."""
+    """The content of a file, with options in the place of its values; a name of its own variants stands for that variant."""
     content, options = dict(content), dict(options)
     if "steps" in options:  # a file may call them n_timesteps
         content.pop("n_timesteps", None)

@@ -105,7 +105,8 @@ def test_variants_and_tasks_of_a_file_have_settings_of_their_own() -> None:
 
 def test_an_algorithm_can_be_chosen_by_the_name_that_a_file_gives_it(capsys: pytest.CaptureFixture[str]) -> None:
     own = {"base": "refresh_alone", "name": "slow", "steps": 20}
-    Path("c.yml").write_text(yaml.safe_dump({"envs": ["SparseReacher-v5"], "algos": [own], "n_timesteps": 70}), encoding="utf-8")
+    content = {"envs": ["SparseReacher-v5"], "algos": [own], "n_timesteps": 70}
+    Path("c.yml").write_text(yaml.safe_dump(content), encoding="utf-8")
     assert main(["compare", "c.yml", "--algos", "slow", "actpc", "--seeds", "1", "--steps", "60", "--dry-run"]) == 0
     assert [line.split()[2:5:2] for line in capsys.readouterr().out.splitlines()[1:3]] == [["slow", "20"], ["actpc", "60"]]
 
