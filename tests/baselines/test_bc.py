@@ -223,29 +223,30 @@ def test_what_it_cannot_act_on_is_refused() -> None:
         BC("MlpPolicy", VecNormalize(make_vec_env(ENV)), demonstrations=record(ENV), device="cpu")
 
 
-def test_an_offline_method_is_evaluated_at_every_interval_and_not_untrained(tmp_path: Path) -> None:
-    """Steps 10, 20 and 30 of BC; ActPC also at 0, there in five episodes at most."""
-    steps, episodes = {}, {}
-    played = []
+def test_an_offline_method_is_evaluated_at_every_interval_and_others_before_their_first_step(tmp_path: Path) -> None:
+    """Steps 10, 20 and 30 of BC; ActPC also at 0, after its warm start, or in five episodes at most where it has none."""
+    steps, episodes, imitated = {}, {}, {}
+    played: list[tuple[int, float]] = []
 
     def counted(model: Any, envs: Any, n_episodes: int, seed: int) -> Any:
-        played.append(n_episodes)
+        played.append((n_episodes, getattr(model, "n_cloning_updates", 0)))
         return play_episodes(model, envs, n_episodes, seed)
 
+    kinds = {"bc": ("bc", {}), "untrained": ("actpc", {"actor_warm_start": 0}), "clone": ("actpc", {"actor_warm_start": 2})}
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("sb3_actpc.experiments.runs.evaluation.play_episodes", counted)
-        for algo in ("bc", "actpc"):
+        for name, (algo, settings) in kinds.items():
             played.clear()
-            settings = {"batch_size": 4} | ({"actor_warm_start": 0} if algo == "actpc" else {})
-            folder = tmp_path / algo
+            folder = tmp_path / name
             train_run(
                 Run(
                     env="SparseReacher-v5", algo=algo, n_timesteps=30, eval_freq=10, eval_episodes=6, checkpoint_freq=0,
-                    progress=False, output=str(folder), settings=settings,
+                    progress=False, output=str(folder), settings={"batch_size": 4} | settings,
                 )
             )  # fmt: skip
             with open(folder / "progress.csv", encoding="utf-8") as file:
-                steps[algo] = [int(row["timesteps"]) for row in csv.DictReader(file)]
-            episodes[algo] = list(played)
-    assert steps == {"bc": [10, 20, 30], "actpc": [0, 10, 20, 30]}
-    assert episodes == {"bc": [6, 6, 6], "actpc": [5, 6, 6, 6]}
+                steps[name] = [int(row["timesteps"]) for row in csv.DictReader(file)]
+            episodes[name], imitated[name] = [n for n, _ in played], played[0][1]
+    assert steps == {"bc": [10, 20, 30], "untrained": [0, 10, 20, 30], "clone": [0, 10, 20, 30]}
+    assert episodes == {"bc": [6, 6, 6], "untrained": [5, 6, 6, 6], "clone": [6, 6, 6, 6]}
+    assert imitated["clone"] == 4 * 2  # three teachers and the clone

@@ -150,7 +150,7 @@ def stacked(observations: Sequence[Any]) -> Any:
 
 
 class EvaluationCallback(CsvCallback):
-    """Evaluates the untrained agent (:meth:`begin`; offline methods excepted), then every ``eval_freq`` steps, and at the end.
+    """Evaluates before the first step (offline methods excepted), then every ``eval_freq`` steps, and at the end.
 
     Each evaluation starts its episodes from the same seeds, appends a row to ``progress.csv`` and saves
     ``model.zip`` (written under another name and renamed, so that a stopped run leaves a whole one), where the agent of the
@@ -200,16 +200,12 @@ class EvaluationCallback(CsvCallback):
         self._started = time.perf_counter()
 
     def begin(self, model: BaseAlgorithm) -> None:
-        """Evaluate before ``learn``, which may begin with demonstrations and not with steps. An untrained agent fails for
-        as long as an episode may last, which in robosuite's tasks takes minutes: it plays ``UNTRAINED_EPISODES`` at most,
-        and an offline method's, which has seen nothing, none."""
+        """A new run. An offline method's agent, which has seen nothing, is not evaluated before it has."""
         self.model = model
         self._started = time.perf_counter()
         self.begin_file()
         if getattr(model, "is_offline", False):
             self.last_timesteps = 0
-        else:
-            self._evaluate(min(self.eval_episodes, UNTRAINED_EPISODES))
 
     @property
     def wall_seconds(self) -> float:
@@ -224,6 +220,13 @@ class EvaluationCallback(CsvCallback):
         """Go on where the checkpoint was taken, with its timers."""
         super().restore_checkpoint_state(state)
         self._started = time.perf_counter() - state["wall_seconds"]
+
+    def _on_training_start(self) -> None:
+        """Step 0 is what an agent can do before its first one, after its warm start. An untrained agent fails for as long as
+        an episode may last, which in robosuite's tasks takes minutes: it plays ``UNTRAINED_EPISODES`` at most."""
+        if self.last_timesteps < 0:
+            is_clone = getattr(self.model, "actor_warm_start", 0) > 0
+            self._evaluate(self.eval_episodes if is_clone else min(self.eval_episodes, UNTRAINED_EPISODES))
 
     def _on_step(self) -> bool:
         # at the last step, the update that belongs to it is still to come
