@@ -395,6 +395,24 @@ def test_mistakes_give_one_line_and_exit_code_2(
     assert not Path("runs").exists()
 
 
+def test_what_is_no_runs_folder_is_told_from_one(capsys: pytest.CaptureFixture[str]) -> None:
+    """The folder of a comparison, or of all runs; a file of a run; and where there is nothing."""
+    folders = [Path("all", *parts) for parts in (("line", "td3", "seed0"), ("line", "td3", "seed1"), ("other",))]
+    for folder in folders:
+        folder.mkdir(parents=True)
+        (folder / "config.json").write_text("{}", encoding="utf-8")
+    Path("all/other/model.zip").touch()
+    Path("empty").mkdir()
+    for given, message in (
+        ("all", f"config.json is missing; runs in it: {folders[2]}, {folders[0]}, {folders[1]}\n"),
+        ("all/line", f"config.json is missing; runs in it: {folders[0]}, {folders[1]}\n"),
+        ("all/other/model.zip", "config.json is missing; a run is a folder, as sb3-actpc train writes it: all/other\n"),
+        ("empty", "config.json is missing; a run is a folder, as sb3-actpc train writes it\n"),
+    ):
+        assert main(["evaluate", given, "--no-video"]) == 2
+        assert capsys.readouterr().err == f"sb3-actpc: error: no run in {given}: {message}"
+
+
 def test_debug_shows_where_an_error_came_from() -> None:
     with pytest.raises(FileNotFoundError):
         main(["--debug", "evaluate", "nowhere"])

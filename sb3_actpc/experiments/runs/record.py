@@ -25,7 +25,7 @@ def read_config(folder: Path) -> dict[str, Any]:
     """The content of ``config.json``, of whatever version; FileNotFoundError when there is none, ValueError when it is not
     JSON or lacks what identifies a run."""
     if not (folder / CONFIG).is_file():
-        raise FileNotFoundError(f"no run in {folder}: {CONFIG} is missing")
+        raise FileNotFoundError(f"no run in {folder}: {CONFIG} is missing; {_where_runs_are(folder)}")
     record, needed = _read_json(folder / CONFIG), {"env", "env_kwargs", "algo", "seed"}
     if not isinstance(record, dict) or not needed <= record.keys():
         raise ValueError(f"{folder / CONFIG}: expected the settings of a run ({', '.join(sorted(needed))})")
@@ -94,6 +94,15 @@ def read_result(folder: Path) -> dict[str, Any]:
     if not isinstance(result, dict) or not {"env", "algo", "seed", "timesteps", "dense_return"} <= result.keys():
         raise ValueError(f"{folder / RESULT}: expected the result of a run")
     return result
+
+
+def _where_runs_are(folder: Path) -> str:
+    """In the folders below, or beside a file."""
+    runs = [str(path.parent) for depth in (1, 2, 3) for path in sorted(folder.glob("*/" * depth + CONFIG))]
+    if runs:
+        return f"runs in it: {', '.join(runs[:8])}" + (f" and {len(runs) - 8} more" if len(runs) > 8 else "")
+    beside = f": {folder.parent}" if folder.is_file() and (folder.parent / CONFIG).is_file() else ""
+    return f"a run is a folder, as sb3-actpc train writes it{beside}"
 
 
 def _read_evaluations(path: Path) -> Any:
