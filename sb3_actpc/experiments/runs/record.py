@@ -5,8 +5,6 @@ import math
 from pathlib import Path
 from typing import Any
 
-import pandas as pd
-
 from sb3_actpc.experiments.runs.evaluation import PROGRESS
 from sb3_actpc.experiments.runs.schema import VERSION, Run
 from sb3_actpc.utils.files import atomic_write
@@ -107,6 +105,8 @@ def _where_runs_are(folder: Path) -> str:
 
 def _read_evaluations(path: Path) -> Any:
     """A dictionary for each row of a ``progress.csv``; the success rate is None where it is not reported."""
+    import pandas as pd  # takes as long to import as the rest
+
     try:
         rows = pd.read_csv(path, dtype=float, float_precision="round_trip").astype({"timesteps": int, "updates": int})
         if rows.empty or rows.drop(columns="success_rate").isna().any(axis=None):
