@@ -20,10 +20,12 @@ from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 from sb3_actpc.cli import main
 from sb3_actpc.demonstrations.dataset import DATA_FOLDER, Demonstrations
 from sb3_actpc.envs import SPARSE_MUJOCO_IDS
+from sb3_actpc.experiments.demonstrators import train_demonstrator
 from sb3_actpc.experiments.runs import Run, load_preset, load_run, play_episodes, train_run
 from sb3_actpc.experiments.runs.evaluation import EpisodeStatistics, NormalizedPredictor
 from sb3_actpc.experiments.runs.presets import find_demonstrations, parse_assignments, parse_schedule
 from sb3_actpc.experiments.runs.video import RenderingUnavailable, choose_gl_backend
+from sb3_actpc.utils.files import FolderBusy
 from tests.cli.line import ENV_ID, RESULTS, RUN, TRAIN, SilentTD3, rows_of, train
 
 PLAIN = [*TRAIN, "--demonstrations", "none"]
@@ -230,6 +232,32 @@ def test_a_folder_in_which_another_process_trains_is_not_taken() -> None:
         other.kill()
     assert train("--demonstrations", "none", "--steps", "20") == 0
     assert (RUN / "result.json").exists() and not (RUN / ".lock").exists()
+
+
+def test_a_folder_that_was_named_is_refused_while_another_process_trains_in_it(capsys: pytest.CaptureFixture[str]) -> None:
+    """A new run there, one that goes on, and a demonstrator; the lock is gone with its process, however that ended."""
+    new = ["--demonstrations", "none", "--steps", "20", "--output", "mine"]
+    assert train(*new) == 0
+    kept = {path.name: path.read_bytes() for path in Path("mine").iterdir() if path.is_file()}
+    code = """if True:
+        from pathlib import Path
+        from sb3_actpc.utils.files import folder_lock
+        with folder_lock(Path("mine")):
+            print("holds it", flush=True)
+            input()
+    """
+    on = ["train", "--resume", "mine", "--steps", "20", "--no-progress"]
+    run = Run(env=ENV_ID, algo="td3", preset="small.yml", demonstrations="none", steps=40, output="mine", progress=False)
+    with subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as other:
+        assert other.stdout is not None and other.stdout.readline() == "holds it\n"
+        for refused in (lambda: train(*new), lambda: main(on)):
+            assert refused() == 2
+            assert "mine is in use by another process: wait until it has ended, or choose another" in capsys.readouterr().err
+        with pytest.raises(FolderBusy, match="mine is in use by another process"):
+            train_demonstrator(run, Path("mine"))
+        assert {path.name: path.read_bytes() for path in Path("mine").iterdir() if path.is_file()} == kept
+        other.kill()
+    assert main(on) == 0
 
 
 def test_a_run_that_begins_anew_in_a_folder_takes_no_normalisation_over() -> None:
