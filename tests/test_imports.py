@@ -175,6 +175,12 @@ def test_importing_the_package_leaves_the_extras_alone() -> None:
     assert loaded.isdisjoint(LAZY)
 
 
+def test_presets_are_listed_without_what_is_heavy() -> None:
+    loaded = loaded_after("from sb3_actpc.cli import main; main(['list', 'presets'])")
+    assert "actpc_paper" in loaded  # it is printed, too
+    assert loaded.isdisjoint(HEAVY)
+
+
 def test_the_agent_is_importable_from_the_package() -> None:
     loaded = loaded_after("from sb3_actpc import ActPC; ActPC.__name__")
     assert "sb3_actpc.actpc" in loaded

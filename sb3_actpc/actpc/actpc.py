@@ -519,12 +519,19 @@ class ActPC(OffPolicyAlgorithm):
             )
 
     def _warn_of_idle_settings(self) -> None:
-        """Warns of a run with too few updates for a learner to prove itself, and of a signal that nobody makes."""
+        """Warns of a run with too few updates for a learner to prove itself, of a signal that nobody makes, and of an agent
+        that was taught by demonstrations and has none."""
+        if self.pretrained and self.demonstrations is None:
+            warnings.warn(
+                "the agent was taught by demonstrations and goes on without them, so that nothing of them is imitated: pass "
+                "demonstrations= again, as from_weights(path, env, demonstrations=...)",
+                stacklevel=5,
+            )
         if self.alpha_in and self.demonstrations is None:
             warnings.warn(
                 f"alpha_in={self.alpha_in:g} pays nothing without demonstrations=, which the prior learns from: rewards are "
                 f"alpha_ext={self.alpha_ext:g} times the task's and alpha_ep={self.alpha_ep:g} times the epistemic signal",
-                stacklevel=4,
+                stacklevel=5,
             )
         n_updates, needed = round(self._total_timesteps * updates_per_step(self)), self.critic_warmup + CANDIDATE_AGE
         if updates_per_step(self) < 1.0 and self.trials is not None and self.actor_pressure and n_updates <= needed:
@@ -533,7 +540,7 @@ class ActPC(OffPolicyAlgorithm):
                 f"{self._total_timesteps} steps of n_envs={self.n_envs} with gradient_steps={self.gradient_steps} and "
                 f"train_freq={every} are {n_updates} updates, and nothing but clones can become the habit before {needed}: "
                 "gradient_steps=-1 makes as many updates as there are steps",
-                stacklevel=4,
+                stacklevel=5,
             )
 
     def describe(self) -> str:

@@ -316,6 +316,9 @@ class ActPCPolicy(BasePolicy):
     ) -> None:
         if features_extractor_class is FlattenExtractor and isinstance(observation_space, spaces.Dict):
             raise ValueError(f"{type(self).__name__} does not take Dict observations: use 'MultiInputPolicy'")
+        if features_extractor_class is CombinedExtractor and not isinstance(observation_space, spaces.Dict):
+            fitting = "CnnPolicy" if is_image_space(observation_space) else "MlpPolicy"
+            raise ValueError(f"{type(self).__name__} is for Dict observations, not {observation_space}: use {fitting!r}")
         if features_extractor_class is FlattenExtractor and is_image_space(observation_space):
             raise ValueError(
                 f"observations of shape {observation_space.shape} are images: ActPC learns no convolutions; use "

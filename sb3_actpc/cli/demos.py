@@ -3,6 +3,7 @@
 import argparse
 import shlex
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -174,9 +175,16 @@ def _collect_trained(args: argparse.Namespace) -> "Demonstrations":
     words = ("env", "algo", "steps", "target_return", "quality", "stochastic", "mixed", "episodes", "max_tries", "seed")
     metadata = {"command": command_line(args, (*words, "save_every", "n_envs", "gym_packages")), "algorithm": args.algo}
     n_episodes = 20 if args.episodes is None else args.episodes
-    return demonstrators.record_demonstrators(
+    recorded = demonstrators.record_demonstrators(
         trained, args.env, n_episodes, args.stochastic, args.seed, metadata, max_tries=args.max_tries, report=_report
     )
+    returns = recorded.dense_returns
+    with suppress(FileNotFoundError):  # nothing is shipped
+        usual = demonstrators.reference_return(args.env)
+        if target is None and returns is not None and returns.mean() < demonstrators.share_of(usual, 0.5):
+            less = f"mean dense return {returns.mean():.1f} is less than half of {usual:.1f}, that of the package's"
+            _report(f"{less}: train longer (--steps), or say that they are to be weak (--quality)")
+    return recorded
 
 
 def command_line(args: argparse.Namespace, options: Sequence[str]) -> str:

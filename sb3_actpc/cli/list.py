@@ -44,7 +44,7 @@ def _algos() -> Iterator[tuple[str, str]]:
 
 
 def _presets() -> Iterator[tuple[str, str]]:
-    from sb3_actpc.experiments.runs.presets import preset_names, preset_path
+    from sb3_actpc.utils.preset_files import preset_names, preset_path
 
     for name in preset_names():
         yield name, str(preset_path(name))

@@ -19,6 +19,7 @@ from sb3_actpc.demonstrations.minari import read_minari, write_minari
 from sb3_actpc.demonstrations.npz import read_npz, write_npz
 from sb3_actpc.demonstrations.recording import env_name, record_episodes, trajectory_columns
 from sb3_actpc.demonstrations.rows import field_error, flat_size, unchained_indices
+from sb3_actpc.envs import SPARSE_IDS
 
 if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecEnv
@@ -371,9 +372,13 @@ def shipped_demonstrations(env_id: str, weak: bool = False) -> Path:
     path = DATA_FOLDER / f"sparse_{base_name(env_id).removeprefix('Sparse').lower()}{'_weak' if weak else ''}.npz"
     observes_more = env_id.rpartition(":")[2] == "SparseReacher-v4"  # one value more than v5, of which the file is
     if observes_more or not path.is_file():
+        from sb3_actpc.utils.checks import nearest  # heavy: demonstrations do without
+
+        near = "" if env_id in gym.registry else nearest(env_id, SPARSE_IDS)
         raise FileNotFoundError(
-            f"no {'weak ' if weak else ''}demonstrations of {env_id} are shipped: collect them (sb3-actpc demos collect --env "
-            f"{env_id}) and pass --demonstrations FILE, or train without (--demonstrations none)"
+            f"no {'weak ' if weak else ''}demonstrations of {env_id} are shipped{near}: collect them (sb3-actpc demos collect "
+            f"--env {env_id}) and pass --demonstrations FILE, or train without (--demonstrations none); what is shipped: "
+            "sb3-actpc list demos"
         )
     return path
 

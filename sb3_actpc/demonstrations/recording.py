@@ -126,6 +126,9 @@ def _play(act: Callable[[Any, bool], np.ndarray], env: gym.Env[Any, Any], seed: 
     done = False
     while not done:
         action = act(observation, not rows)
+        if np.shape(action) != env.action_space.shape:
+            wanted = f"{env_name(env)} takes {env.action_space.shape}: return an array of that shape"
+            raise ValueError(f"the demonstrator gives an action of shape {np.shape(action)}, {wanted}")
         next_observation, reward, terminated, truncated, info = env.step(action)
         flat = (spaces.utils.flatten(env.observation_space, value) for value in (observation, next_observation))
         rows.append((*flat, np.ravel(action), reward, terminated, info.get("dense_reward", reward)))

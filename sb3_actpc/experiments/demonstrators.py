@@ -18,6 +18,7 @@ from sb3_actpc.experiments.runs.environments import check_env_id
 from sb3_actpc.experiments.runs.evaluation import Predictor
 from sb3_actpc.experiments.runs.run import finish_run, load_run
 from sb3_actpc.experiments.runs.schema import Run
+from sb3_actpc.utils.files import folder_lock
 
 # name of the algorithm -> its settings in hyperparams/
 DEMONSTRATOR_ALGORITHMS = {"ppo": "ppo_demonstrator", "sac": "sac", "td3": "td3_demonstrator", "trpo": "trpo"}
@@ -84,7 +85,8 @@ def demonstrator_run(
 def train_demonstrator(run: Run, folder: Path, report: Report = silent) -> Demonstrator:
     """Train a demonstrator (see :func:`demonstrator_run`), go on with a training that was stopped, or take the one that is
     there: the agent of the best evaluation."""
-    result = finish_run(run.model_copy(update={"output": str(folder)}), report)
+    with folder_lock(folder):
+        result = finish_run(run.model_copy(update={"output": str(folder)}), report)
     return Demonstrator(load_run(folder)[1], result["timesteps"], result["dense_return"])
 
 

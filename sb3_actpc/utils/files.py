@@ -1,15 +1,18 @@
-"""Writing files so that a reader never meets half of one, and telling whether one is what was written."""
+"""Writing files so that a reader never meets half of one, telling whether one is what was written, and holding folders."""
 
 import hashlib
 import os
 import re
 import shutil
 import uuid
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any, Literal
 
+from filelock import FileLock, Timeout
+
+LOCK = ".lock"  # in a folder that one process has to itself
 PIECE = 2**18  # bytes read at a time
 
 
@@ -53,3 +56,28 @@ def atomic_write(path: str | os.PathLike[str], mode: Literal["wb", "w"] = "wb") 
         os.replace(temporary, target)
     finally:
         temporary.unlink(missing_ok=True)  # nothing is left to remove once it has been renamed
+
+
+class FolderBusy(ValueError):
+    """Another process works in the folder."""
+
+
+@contextmanager
+def folder_lock(folder: Path, wait: float = 0.0, report: Callable[[str], None] = lambda line: None) -> Iterator[None]:
+    """Hold a folder, made when it does not exist; another process that holds it is waited for some seconds, then FolderBusy is
+    raised. The lock is the operating system's: it is gone with the process that held it, however that ended."""
+    folder.mkdir(parents=True, exist_ok=True)
+    lock = FileLock(folder / LOCK)
+    try:
+        lock.acquire(timeout=0)
+    except Timeout:
+        report(f"{folder} is in use by another process: waiting {wait:.0f} seconds for it")
+        try:
+            lock.acquire(timeout=wait)
+        except Timeout:
+            message = f"{folder} is in use by another process: wait until it has ended, or choose another folder"
+            raise FolderBusy(message) from None
+    try:
+        yield
+    finally:
+        lock.release()

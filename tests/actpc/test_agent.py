@@ -975,6 +975,14 @@ def test_dict_observations_ask_for_the_policy_that_takes_them():
             ActPC(policy, CountingEnv(dict_observations=True))
 
 
+@pytest.mark.parametrize(("shape", "named"), [((3,), "MlpPolicy"), ((36, 36, 3), "CnnPolicy")])
+def test_the_policy_for_dict_observations_names_the_one_for_others(shape, named):
+    env = CountingEnv()
+    env.observation_space = gym.spaces.Box(0, 255, shape, np.uint8)
+    with pytest.raises(ValueError, match=f"MultiInputPolicy is for Dict observations, not .*: use '{named}'"):
+        ActPC("MultiInputPolicy", env)
+
+
 def test_a_device_that_is_not_there_is_named_in_short():
     with pytest.raises(ValueError, match="device='xpu' must be 'auto' or a torch device of this machine") as caught:
         make(device="xpu")

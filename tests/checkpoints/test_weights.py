@@ -3,6 +3,7 @@
 import builtins
 import json
 import pickle
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -90,10 +91,14 @@ def test_weights_with_demonstrations_go_on_learning_from_new_ones(tmp_path: Path
     model.learn(30).save_weights(tmp_path / "agent.safetensors")
     alone = ActPC.from_weights(tmp_path / "agent.safetensors", make_vec_env(CountingEnv))
     again = ActPC.from_weights(tmp_path / "agent.safetensors", make_vec_env(CountingEnv), demonstrations=demonstrations())
-    for loaded in (alone, again):
+    for loaded, is_warned in ((alone, 1), (again, 0)):
         assert th.equal(loaded.actor.normalizer.mean, model.actor.normalizer.mean)
         before = loaded.prior.weights[0].clone()
-        loaded.learn(30)
+        with warnings.catch_warnings(record=True) as said:
+            warnings.simplefilter("always")
+            loaded.learn(30)
+        without = [one for one in said if "taught by demonstrations and goes on without them" in str(one.message)]
+        assert [one.filename for one in without] == [__file__] * is_warned
         assert th.equal(before, loaded.prior.weights[0])  # it was trained before, and is not again
     assert alone.expert is None and again.expert is not None
 

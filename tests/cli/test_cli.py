@@ -20,10 +20,12 @@ from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 from sb3_actpc.cli import main
 from sb3_actpc.demonstrations.dataset import DATA_FOLDER, Demonstrations
 from sb3_actpc.envs import SPARSE_MUJOCO_IDS
+from sb3_actpc.experiments.demonstrators import train_demonstrator
 from sb3_actpc.experiments.runs import Run, load_preset, load_run, play_episodes, train_run
 from sb3_actpc.experiments.runs.evaluation import EpisodeStatistics, NormalizedPredictor
 from sb3_actpc.experiments.runs.presets import find_demonstrations, parse_assignments, parse_schedule
 from sb3_actpc.experiments.runs.video import RenderingUnavailable, choose_gl_backend
+from sb3_actpc.utils.files import FolderBusy
 from tests.cli.line import ENV_ID, RESULTS, RUN, TRAIN, SilentTD3, rows_of, train
 
 PLAIN = [*TRAIN, "--demonstrations", "none"]
@@ -232,6 +234,32 @@ def test_a_folder_in_which_another_process_trains_is_not_taken() -> None:
     assert (RUN / "result.json").exists() and not (RUN / ".lock").exists()
 
 
+def test_a_folder_that_was_named_is_refused_while_another_process_trains_in_it(capsys: pytest.CaptureFixture[str]) -> None:
+    """A new run there, one that goes on, and a demonstrator; the lock is gone with its process, however that ended."""
+    new = ["--demonstrations", "none", "--steps", "20", "--output", "mine"]
+    assert train(*new) == 0
+    kept = {path.name: path.read_bytes() for path in Path("mine").iterdir() if path.is_file()}
+    code = """if True:
+        from pathlib import Path
+        from sb3_actpc.utils.files import folder_lock
+        with folder_lock(Path("mine")):
+            print("holds it", flush=True)
+            input()
+    """
+    on = ["train", "--resume", "mine", "--steps", "20", "--no-progress"]
+    run = Run(env=ENV_ID, algo="td3", preset="small.yml", demonstrations="none", steps=40, output="mine", progress=False)
+    with subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as other:
+        assert other.stdout is not None and other.stdout.readline() == "holds it\n"
+        for refused in (lambda: train(*new), lambda: main(on)):
+            assert refused() == 2
+            assert "mine is in use by another process: wait until it has ended, or choose another" in capsys.readouterr().err
+        with pytest.raises(FolderBusy, match="mine is in use by another process"):
+            train_demonstrator(run, Path("mine"))
+        assert {path.name: path.read_bytes() for path in Path("mine").iterdir() if path.is_file()} == kept
+        other.kill()
+    assert main(on) == 0
+
+
 def test_a_run_that_begins_anew_in_a_folder_takes_no_normalisation_over() -> None:
     arguments = ["--demonstrations", "none", "--steps", "20", "--checkpoint-freq", "0", "--output", "mine"]
     assert train(*arguments, "--set", "normalize=true") == 0
@@ -393,6 +421,24 @@ def test_mistakes_give_one_line_and_exit_code_2(
     assert errors.startswith("sb3-actpc: error: ")
     assert "\n" not in errors
     assert not Path("runs").exists()
+
+
+def test_what_is_no_runs_folder_is_told_from_one(capsys: pytest.CaptureFixture[str]) -> None:
+    """The folder of a comparison, or of all runs; a file of a run; and where there is nothing."""
+    folders = [Path("all", *parts) for parts in (("line", "td3", "seed0"), ("line", "td3", "seed1"), ("other",))]
+    for folder in folders:
+        folder.mkdir(parents=True)
+        (folder / "config.json").write_text("{}", encoding="utf-8")
+    Path("all/other/model.zip").touch()
+    Path("empty").mkdir()
+    for given, message in (
+        ("all", f"config.json is missing; runs in it: {folders[2]}, {folders[0]}, {folders[1]}\n"),
+        ("all/line", f"config.json is missing; runs in it: {folders[0]}, {folders[1]}\n"),
+        ("all/other/model.zip", "config.json is missing; a run is a folder, as sb3-actpc train writes it: all/other\n"),
+        ("empty", "config.json is missing; a run is a folder, as sb3-actpc train writes it\n"),
+    ):
+        assert main(["evaluate", given, "--no-video"]) == 2
+        assert capsys.readouterr().err == f"sb3-actpc: error: no run in {given}: {message}"
 
 
 def test_debug_shows_where_an_error_came_from() -> None:

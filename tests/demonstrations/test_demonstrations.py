@@ -705,6 +705,18 @@ def test_the_packages_files_are_found_wherever_it_is_installed(folder: str) -> N
         resolve(folder.replace("data", "other") + own.name)
 
 
+def test_an_unknown_task_has_nothing_shipped_and_near_ones_are_named() -> None:
+    """A task of one's own that is registered is no slip of the pen."""
+    with pytest.raises(
+        FileNotFoundError, match=r"of SparseHoper-v5 are shipped \(did you mean 'SparseHopper-v5'\?\): .* list demos"
+    ):
+        shipped_demonstrations("SparseHoper-v5")
+    gym.register("SparseHoper-v0", "gymnasium.envs.classic_control:PendulumEnv")
+    with pytest.raises(FileNotFoundError, match="of SparseHoper-v0 are shipped: collect"):
+        shipped_demonstrations("SparseHoper-v0")
+    del gym.registry["SparseHoper-v0"]
+
+
 def test_demonstrations_are_imported_without_what_is_heavy() -> None:
     program = "import sys; from sb3_actpc import Demonstrations; from sb3_actpc.demonstrations import Demonstrations as Same; "
     program += (

@@ -1,6 +1,7 @@
 """Demonstrators are runs on the dense task; what is recorded of them is what was asked for."""
 
 import argparse
+import dataclasses
 import json
 import sys
 from pathlib import Path
@@ -223,6 +224,26 @@ class TestCommand:
         )
         run_demos("collect", "--env", "SparseHopper-v5", "--algo", "trpo", "--output", str(tmp_path / "x.npz"), *words)
         assert [(run.target_return, run.algo, run.env) for run in asked] == [(target, "trpo", "Hopper-v5")]
+
+    @pytest.mark.parametrize(
+        ("words", "share", "is_said"), [([], 0.4, True), ([], 0.6, False), (["--quality", "0.4"], 0.4, False)]
+    )
+    def test_poor_demonstrators_are_told_from_those_of_the_package(
+        self,
+        words: list[str],
+        share: float,
+        is_said: bool,
+        tmp_path: Path,
+        monkeypatch: pytest.MonkeyPatch,
+        capsys: pytest.CaptureFixture[str],
+    ) -> None:
+        shown = Demonstrations.load(shipped_demonstrations("SparseHopper-v5"))
+        poor = dataclasses.replace(shown, dense_rewards=share * shown.dense_rewards)  # type: ignore[operator]
+        monkeypatch.setattr(demonstrators, "train_demonstrator", lambda *_: Demonstrator(Reaching(), 7, -3.0))
+        monkeypatch.setattr(demonstrators, "record_demonstrators", lambda *_, **options: poor)
+        assert run_demos("collect", "--env", "SparseHopper-v5", "--output", str(tmp_path / "x.npz"), *words) == 0
+        text = f"mean dense return {poor.dense_returns.mean():.1f} is less than half of {shown.dense_returns.mean():.1f}"
+        assert (text in (printed := capsys.readouterr().out)) == ("--steps" in printed) == is_said
 
     def test_an_environment_of_ones_own(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.chdir(tmp_path)

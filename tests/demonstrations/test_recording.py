@@ -102,6 +102,14 @@ def test_predict_is_given_its_own_state_and_told_of_every_new_episode() -> None:
     assert agent.started == [7, 8]
 
 
+@pytest.mark.parametrize(
+    ("action", "found"), [(0.5, r"\(\)"), (None, r"\(\)"), ([0.1, 0.2], r"\(2,\)"), ([[0.1]], r"\(1, 1\)")]
+)
+def test_an_action_of_another_shape_is_named(action: Any, found: str) -> None:
+    with pytest.raises(ValueError, match=rf"an action of shape {found}, Corridor takes \(1,\): "):
+        Demonstrations.record(lambda _: action, Corridor(), 1, only_successes=False)
+
+
 def test_several_demonstrators_take_turns_and_try_again_where_they_fail() -> None:
     first, second = Noting(), Noting()
     Demonstrations.record([first, second], Corridor(length=1), 2, seed=0)

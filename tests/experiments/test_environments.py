@@ -1,5 +1,6 @@
 """Every algorithm learns in, and is evaluated on, the same environment: same seeds, states, rewards, ends, demonstrations."""
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +40,39 @@ def prepare(algo: str, folder: Path, **more: Any) -> tuple[Any, Any]:
     run = resolve(run)
     env = make_train_env(ENV_ID, run.env_kwargs, run.n_envs, run.seed, run.normalize)
     return build_model(run, env), env
+
+
+@pytest.mark.parametrize(
+    ("env_id", "given", "message"),
+    [
+        (
+            "SparseHopper-v5",
+            {"treshold": 1.0},
+            "no keyword 'treshold' (did you mean 'threshold'?): choose from condition, thr",
+        ),
+        ("GoalHopper-v5", {"condition": "displacement", "treshold": 1.0}, "no keyword 'treshold' (did you mean 'threshold'?)"),
+        (
+            "SparseReacher-v5",
+            {"max_episode_steps": 9, "mis_reward": 0},
+            "no keyword 'mis_reward' (did you mean 'miss_reward'?)",
+        ),
+        ("gymnasium.envs:Pendulum-v1", {"gg": 1.0}, "no keyword 'gg' (did you mean 'g'?): choose from render_mode, g"),
+        ("Function-v0", {"b": 1}, "no keyword 'b': choose from a"),
+        ("Class-v0", {"b": 1}, "no keyword 'b': choose from a"),
+        ("Function-v0", {"a": 1}, "Function-v0: unsupported operand"),
+    ],
+)
+def test_an_unknown_keyword_of_an_environment_is_named_with_the_nearest_known_one(
+    env_id: str, given: dict[str, Any], message: str
+) -> None:
+    class Own(gym.Env[Any, Any]):
+        def __init__(self, a: int = 0) -> None: ...
+
+    gym.register("Function-v0", lambda a=0: a + "text")
+    gym.register("Class-v0", Own)
+    with pytest.raises(ValueError, match=re.escape(message)):
+        make_env(env_id, given)
+    del gym.registry["Function-v0"], gym.registry["Class-v0"]
 
 
 def test_algorithms_with_one_seed_see_the_same_states_rewards_and_ends(tmp_path: Path) -> None:

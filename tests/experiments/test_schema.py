@@ -12,6 +12,7 @@ from sb3_actpc import ActPC, preset
 from sb3_actpc.experiments.comparison import plan_runs, read_comparison
 from sb3_actpc.experiments.comparison.plan import read_comparison_file
 from sb3_actpc.experiments.runs import Run, resolve
+from sb3_actpc.experiments.runs.algorithms import load_algorithm
 from sb3_actpc.experiments.runs.presets import read_yaml, with_changes
 from sb3_actpc.experiments.runs.provenance import git_state
 from sb3_actpc.experiments.runs.record import read_run, write_config
@@ -64,6 +65,11 @@ def test_mistakes_are_named_in_one_line(given: dict[str, Any], message: str) -> 
     with pytest.raises(ValueError) as caught:
         Run(**given)
     assert message in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_an_unknown_algorithm_is_named_in_python_too() -> None:
+    with pytest.raises(ValueError, match=r"algo='ac_tpc' is no algorithm \(did you mean 'actpc'\?\): choose one of actpc, bc"):
+        load_algorithm("ac_tpc")
 
 
 def test_unknown_keys_of_a_comparison_are_named_with_the_nearest_known_one() -> None:

@@ -11,9 +11,10 @@ from pathlib import Path
 from typing import Any
 
 from sb3_actpc.experiments.comparison.engines import Engine, Event
-from sb3_actpc.experiments.comparison.execution import LOCK, LOG, LOST, STOPPED, Outcome, execute_run
+from sb3_actpc.experiments.comparison.execution import LOG, LOST, STOPPED, Outcome, execute_run
 from sb3_actpc.experiments.runs import Run
 from sb3_actpc.utils.extras import import_extra
+from sb3_actpc.utils.files import LOCK
 
 CONNECTION_TIME = 10.0  # seconds
 _PROBE = ".shared-"  # a file by which a node sees whether it shares the folders

@@ -4,21 +4,20 @@ import errno
 import json
 import time
 import traceback
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from filelock import FileLock, Timeout
 from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback
 
 from sb3_actpc.checkpoints import TrainingStopped
 from sb3_actpc.experiments.runs import Run, finish_run
 from sb3_actpc.experiments.runs.record import CONFIG, RESULT, read_result, write_result
-from sb3_actpc.utils.files import atomic_write
+from sb3_actpc.utils.files import FolderBusy, atomic_write, folder_lock
 
-ERROR, LOG, LOCK = "error.json", "log.txt", ".lock"
+ERROR, LOG = "error.json", "log.txt"
 FINISHED, FAILED, UNFINISHED, NEW = "finished", "failed", "unfinished", "new"
 STOPPED, LOST, DISK_FULL = "stopped", "lost", "disk full"  # outcomes that leave a run unfinished
 _FULL = (errno.ENOSPC, errno.EDQUOT)
@@ -34,31 +33,6 @@ class Outcome:
     # another at work)
     status: str
     message: str = ""  # what went wrong, one line
-
-
-class FolderBusy(ValueError):
-    """Another process works in the folder."""
-
-
-@contextmanager
-def folder_lock(folder: Path, wait: float, report: Callable[[str], None] = lambda line: None) -> Iterator[None]:
-    """Hold a folder, made when it does not exist; another process that holds it is waited for some seconds, then FolderBusy is
-    raised. The lock is the operating system's: it is gone with the process that held it, however that ended."""
-    folder.mkdir(parents=True, exist_ok=True)
-    lock = FileLock(folder / LOCK)
-    try:
-        lock.acquire(timeout=0)
-    except Timeout:
-        report(f"{folder} is in use by another process: waiting {wait:.0f} seconds for it")
-        try:
-            lock.acquire(timeout=wait)
-        except Timeout:
-            message = f"{folder} is in use by another process: wait until it has ended, or choose another folder"
-            raise FolderBusy(message) from None
-    try:
-        yield
-    finally:
-        lock.release()
 
 
 def is_disk_full(error: Exception) -> bool:

@@ -1,12 +1,14 @@
 """From tasks, algorithms and seeds to a list of runs, each with an id made from its content and a folder of its own."""
 
 from collections.abc import Mapping, Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
+from sb3_actpc.demonstrations import fit_demonstrations
 from sb3_actpc.experiments.comparison.variants import ablation_variants, parse_variant, part_of_run
 from sb3_actpc.experiments.runs import Run, resolve
-from sb3_actpc.experiments.runs.environments import check_env_id
+from sb3_actpc.experiments.runs.environments import check_env_id, make_train_env
 from sb3_actpc.experiments.runs.presets import read_yaml
 from sb3_actpc.experiments.runs.schema import Count, Schema, Seed, merged
 from sb3_actpc.utils.files import folder_name
@@ -83,6 +85,8 @@ def plan_runs(comparison: Comparison, folder: Path | None = None) -> list[Run]:
         other = names.setdefault((run.task, run.id), run.name)
         if other != run.name:
             raise ValueError(f"{run.task}: {other!r} and {run.name!r} have the same settings: leave one out")
+    for run in {(run.env, repr(run.env_kwargs), run.demonstrations): run for run in filled}.values():
+        _check_demonstrations(run)
     seeds = range(comparison.first_seed, comparison.first_seed + comparison.seeds)
     seeded = [run.model_copy(update={"seed": seed}) for seed in seeds for run in filled]
     own = [folder / folder_name(str(run.task)) / str(run.name) / f"seed{run.seed}_{run.id}" for run in seeded]
@@ -97,6 +101,17 @@ def _fill(shared: Run, task: Run, variant: Run) -> Run:
         return resolve(run)
     except (ValueError, FileNotFoundError) as error:
         raise type(error)(f"{task.env}, {variant.name}: {error}") from error
+
+
+def _check_demonstrations(run: Run) -> None:
+    """Those that were given, in the environment: a wrong file is to end the command and not each of its runs."""
+    if run.demonstrations in ("shipped", "weak", "none"):
+        return
+    with closing(make_train_env(run.env, run.env_kwargs, 1, run.seed)) as env:
+        try:
+            fit_demonstrations(run.demonstrations, env, env.observation_space, env.action_space)
+        except ValueError as error:
+            raise ValueError(f"{run.task}: {error}") from error
 
 
 def _parse_task(entry: Any) -> Run:

@@ -9,8 +9,9 @@ from sb3_actpc.checkpoints import StopSignals
 from sb3_actpc.experiments.comparison import execution
 from sb3_actpc.experiments.comparison.display import Display
 from sb3_actpc.experiments.comparison.engines import Engine, Event
-from sb3_actpc.experiments.comparison.execution import FAILED, FINISHED, folder_lock, is_disk_full, run_status
+from sb3_actpc.experiments.comparison.execution import FAILED, FINISHED, is_disk_full, run_status
 from sb3_actpc.experiments.runs import Run
+from sb3_actpc.utils.files import folder_lock
 
 MAX_LOSSES = 3  # times that the process of one run may die before the run counts as failed
 LOCK_WAIT = 5.0  # seconds for another command in the same folder to end

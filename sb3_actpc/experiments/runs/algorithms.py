@@ -38,9 +38,17 @@ _OPTION_OF = {
 }
 
 
+def known_algorithm(name: str) -> str:
+    """The name; ValueError, with the nearest known one, when it is no key of ``ALGORITHMS``."""
+    if name not in ALGORITHMS:
+        hint = f"{nearest(name, ALGORITHMS)}: choose one of {', '.join(sorted(ALGORITHMS))}"
+        raise ValueError(f"algo={name!r} is no algorithm{hint}")
+    return name
+
+
 def load_algorithm(name: str) -> type[BaseAlgorithm]:
-    """Import an algorithm, a key of ``ALGORITHMS``."""
-    module, _, class_name = ALGORITHMS[name].partition(":")
+    """Import an algorithm, a key of ``ALGORITHMS``; ValueError when it is none."""
+    module, _, class_name = ALGORITHMS[known_algorithm(name)].partition(":")
     return getattr(importlib.import_module(module), class_name)
 
 

@@ -2,17 +2,22 @@
 
 import contextlib
 import importlib
+import inspect
 import io
 import os
+import re
 import sys
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import gymnasium as gym
+from gymnasium.envs.registration import load_env_creator
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecNormalize
 
+from sb3_actpc.envs import ROBOSUITE_IDS, register_envs, sparse_env_id
 from sb3_actpc.utils.checks import nearest
+from sb3_actpc.utils.constructors import constructor_keywords
 
 MAX_EVALUATION_ENVS = 10
 
@@ -24,7 +29,19 @@ def make_env(env_id: str, env_kwargs: Mapping[str, Any], render_mode: str | None
     try:
         return gym.make(env_id, **options)
     except TypeError as error:
-        raise ValueError(f"{env_id}: {error}") from error
+        unknown = re.search(r"unexpected keyword argument '(\w+)'", str(error))
+        if unknown is None or unknown[1] not in env_kwargs:
+            raise ValueError(f"{env_id}: {error}") from error
+        known = _keywords(sparse_env_id(env_id.rpartition(":")[2]))
+        hint = f"{nearest(unknown[1], known)}: choose from {', '.join(known)}"
+        raise ValueError(f"{env_id} has no keyword {unknown[1]!r}{hint}") from error
+
+
+def _keywords(env_id: str) -> list[str]:
+    """Of a registered environment: those of its class, or of the function that makes it."""
+    entry: Any = gym.spec(env_id).entry_point
+    made_by: Any = load_env_creator(entry) if isinstance(entry, str) else entry
+    return constructor_keywords(made_by) if isinstance(made_by, type) else list(inspect.signature(made_by).parameters)
 
 
 def make_eval_envs(env_id: str, env_kwargs: Mapping[str, Any], n_episodes: int) -> list[gym.Env[Any, Any]]:
@@ -41,8 +58,6 @@ def make_train_env(
     Several of robosuite's are put into processes of their own (``SubprocVecEnv``): a step there takes longer than an
     update, one of a MuJoCo task less than the way to another process.
     """
-    from sb3_actpc.envs import ROBOSUITE_IDS
-
     in_processes = n_envs > 1 and env_id.rpartition(":")[2] in ROBOSUITE_IDS
     kind: type[VecEnv] = SubprocVecEnv if in_processes else DummyVecEnv
     arguments = {"env_id": env_id, "env_kwargs": env_kwargs}
@@ -53,8 +68,6 @@ def make_train_env(
 def register_tasks(env_id: str) -> None:
     """Register this package's tasks with Gymnasium (again does no harm), and those of gymnasium-robotics where they are
     meant."""
-    from sb3_actpc.envs import register_envs
-
     register_envs()
     if ":" not in env_id and env_id not in gym.registry:
         # not installed: Gymnasium will say that the id is unknown; installed: it prints a note on tasks of another kind

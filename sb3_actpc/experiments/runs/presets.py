@@ -25,10 +25,8 @@ from sb3_actpc.experiments.runs.schema import Run, merged
 from sb3_actpc.utils.checks import Settings, check_kind, nearest
 from sb3_actpc.utils.constructors import constructor_keywords
 from sb3_actpc.utils.files import file_hash
+from sb3_actpc.utils.preset_files import preset_path
 
-PACKAGE_FOLDER = Path(__file__).resolve().parents[2]
-# inside an installed wheel, or beside the package in a source checkout
-HYPERPARAMS_FOLDERS = (PACKAGE_FOLDER / "hyperparams", PACKAGE_FOLDER.parent / "hyperparams")
 # keys of a preset, as rl-zoo3 has them, that are not the algorithm's
 RUN_KEYS = ("n_timesteps", "n_envs", "policy", "env_kwargs", "noise_type", "noise_std", "normalize")
 _ACTIVATIONS: dict[str, type[nn.Module]] = {"relu": nn.ReLU, "tanh": nn.Tanh, "elu": nn.ELU, "leaky_relu": nn.LeakyReLU}
@@ -224,23 +222,6 @@ def demonstrations_hash(run: Run) -> str | None:
     """SHA-256 of what a run's demonstrations hold, None for none; FileNotFoundError when they are not there."""
     found = find_demonstrations(run.env, run.demonstrations)
     return None if found is None else file_hash(*(minari_files(found) if isinstance(found, str) else [found]))
-
-
-def preset_names() -> list[str]:
-    """Of the files in the package."""
-    return sorted({path.stem for folder in HYPERPARAMS_FOLDERS for path in folder.glob("*.yml")})
-
-
-def preset_path(name: str) -> Path:
-    """Where the preset of a name, or a path ending in ``.yml`` or ``.yaml``, is."""
-    if Path(name).suffix in (".yml", ".yaml"):
-        if not Path(name).is_file():
-            raise FileNotFoundError(f"no preset file at {name}")
-        return Path(name)
-    for folder in HYPERPARAMS_FOLDERS:
-        if (folder / f"{name}.yml").is_file():
-            return folder / f"{name}.yml"
-    raise FileNotFoundError(f"no preset {name!r}: expected one of {', '.join(preset_names())}, or a path ending in .yml")
 
 
 def _check_noise(run: Run, keywords: list[str]) -> None:

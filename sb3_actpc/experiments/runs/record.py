@@ -5,8 +5,6 @@ import math
 from pathlib import Path
 from typing import Any
 
-import pandas as pd
-
 from sb3_actpc.experiments.runs.evaluation import PROGRESS
 from sb3_actpc.experiments.runs.schema import VERSION, Run
 from sb3_actpc.utils.files import atomic_write
@@ -25,7 +23,7 @@ def read_config(folder: Path) -> dict[str, Any]:
     """The content of ``config.json``, of whatever version; FileNotFoundError when there is none, ValueError when it is not
     JSON or lacks what identifies a run."""
     if not (folder / CONFIG).is_file():
-        raise FileNotFoundError(f"no run in {folder}: {CONFIG} is missing")
+        raise FileNotFoundError(f"no run in {folder}: {CONFIG} is missing; {_where_runs_are(folder)}")
     record, needed = _read_json(folder / CONFIG), {"env", "env_kwargs", "algo", "seed"}
     if not isinstance(record, dict) or not needed <= record.keys():
         raise ValueError(f"{folder / CONFIG}: expected the settings of a run ({', '.join(sorted(needed))})")
@@ -96,8 +94,19 @@ def read_result(folder: Path) -> dict[str, Any]:
     return result
 
 
+def _where_runs_are(folder: Path) -> str:
+    """In the folders below, or beside a file."""
+    runs = [str(path.parent) for depth in (1, 2, 3) for path in sorted(folder.glob("*/" * depth + CONFIG))]
+    if runs:
+        return f"runs in it: {', '.join(runs[:8])}" + (f" and {len(runs) - 8} more" if len(runs) > 8 else "")
+    beside = f": {folder.parent}" if folder.is_file() and (folder.parent / CONFIG).is_file() else ""
+    return f"a run is a folder, as sb3-actpc train writes it{beside}"
+
+
 def _read_evaluations(path: Path) -> Any:
     """A dictionary for each row of a ``progress.csv``; the success rate is None where it is not reported."""
+    import pandas as pd  # takes as long to import as the rest
+
     try:
         rows = pd.read_csv(path, dtype=float, float_precision="round_trip").astype({"timesteps": int, "updates": int})
         if rows.empty or rows.drop(columns="success_rate").isna().any(axis=None):

@@ -33,7 +33,7 @@ from sb3_actpc.experiments.runs.provenance import git_state, package_versions
 from sb3_actpc.experiments.runs.record import CONFIG, RESULT, read_result, read_run, write_config, write_result
 from sb3_actpc.experiments.runs.schema import Run, content_id
 from sb3_actpc.experiments.runs.summary import plot_learning_curve
-from sb3_actpc.utils.files import folder_name
+from sb3_actpc.utils.files import LOCK, folder_lock, folder_name
 
 # the evaluation's episodes start from other states than the training's
 EVALUATION_SEED_OFFSET = 1_000_000
@@ -41,7 +41,9 @@ CHECKPOINTS = "checkpoints"  # folder in the run's folder
 DIAGNOSTICS = "diagnostics.csv"  # what the agent logs about itself
 
 
-def train_run(run: Run, report: Report = silent, callbacks: Sequence[BaseCallback] = ()) -> dict[str, Any]:
+def train_run(
+    run: Run, report: Report = silent, callbacks: Sequence[BaseCallback] = (), is_held: bool = False
+) -> dict[str, Any]:
     """Train one agent; its folder then holds ``config.json``, ``progress.csv`` (the evaluations), ``episodes.csv`` (every
     training episode), ``diagnostics.csv`` (what the agent logs), ``model.zip``, the plot and, last, ``result.json``.
 
@@ -51,20 +53,23 @@ def train_run(run: Run, report: Report = silent, callbacks: Sequence[BaseCallbac
     :param run: what to train
     :param report: given a line of text when the run starts and after each evaluation
     :param callbacks: further ones to watch the training with
+    :param is_held: the caller holds the run's folder (:func:`~sb3_actpc.utils.files.folder_lock`); else it is held here
     :return: the content of ``result.json`` (see :func:`~sb3_actpc.experiments.runs.record.write_result`), and the folder
     :raises FileNotFoundError: when the preset or the demonstrations do not exist
-    :raises ValueError: when a setting is unknown or has a wrong value
+    :raises ValueError: when a setting is unknown or has a wrong value, or another process trains in the folder
     :raises gymnasium.error.Error: when the environment is unknown
     """
     check_env_id(run.env, run.gym_packages)
-    run = resolve(run)
-    if run.output is not None and (taken := _taken(run.folder)):
-        raise ValueError(taken)
-    return _run(run, report, callbacks, resumes=False)
+    return _run(resolve(run), report, callbacks, resumes=False, is_held=is_held)
 
 
 def resume_run(
-    folder: Path, report: Report = silent, progress: bool = True, callbacks: Sequence[BaseCallback] = (), more_steps: int = 0
+    folder: Path,
+    report: Report = silent,
+    progress: bool = True,
+    callbacks: Sequence[BaseCallback] = (),
+    more_steps: int = 0,
+    is_held: bool = False,
 ) -> dict[str, Any]:
     """Go on with a run from its newest whole checkpoint, with the settings in its ``config.json``, for the steps that it was
     to have and ``more_steps``, of which a finished run needs some. ``report`` is given a line of text when the run goes on,
@@ -91,13 +96,13 @@ def resume_run(
         )
     if more_steps:
         run = run.model_copy(update={"n_timesteps": (run.n_timesteps or 0) + more_steps})
-    return _run(run, report, callbacks, resumes=True)
+    return _run(run, report, callbacks, resumes=True, is_held=is_held)
 
 
 def finish_run(run: Run, report: Report = silent, callbacks: Sequence[BaseCallback] = ()) -> dict[str, Any]:
     """Bring a run with its folder (``output``) to its end, whatever has become of it: begun now, gone on with from its newest
-    whole checkpoint, given more steps when it ended with fewer, or left alone when it is done. See :func:`train_run`;
-    ValueError also when the folder holds another run."""
+    whole checkpoint, given more steps when it ended with fewer, or left alone when it is done. The caller holds the folder.
+    See :func:`train_run`; ValueError also when the folder holds another run."""
     check_env_id(run.env, run.gym_packages)
     run, folder = resolve(run), run.folder
     stored = None
@@ -120,14 +125,14 @@ def finish_run(run: Run, report: Report = silent, callbacks: Sequence[BaseCallba
         result = read_result(folder)
         if more <= 0 or (run.target_return is not None and result["dense_return"] >= run.target_return):
             return {**result, "folder": str(folder)}
-        return resume_run(folder, report, run.progress, callbacks, more)
+        return resume_run(folder, report, run.progress, callbacks, more, is_held=True)
     if stored is not None and list_bundles(folder / CHECKPOINTS):
         try:
-            return resume_run(folder, report, run.progress, callbacks)
+            return resume_run(folder, report, run.progress, callbacks, is_held=True)
         except DamagedCheckpoint as error:
             report(f"{error}: the run starts again")
     shutil.rmtree(folder / CHECKPOINTS, ignore_errors=True)
-    return train_run(run, report, callbacks)
+    return train_run(run, report, callbacks, is_held=True)
 
 
 def _content(run: Run) -> str:
@@ -135,7 +140,7 @@ def _content(run: Run) -> str:
     return content_id({**run.model_dump(), "n_timesteps": None, "policy": None, "eval_freq": None}, run.seed)
 
 
-def _run(run: Run, report: Report, callbacks: Sequence[BaseCallback], resumes: bool) -> dict[str, Any]:
+def _run(run: Run, report: Report, callbacks: Sequence[BaseCallback], resumes: bool, is_held: bool) -> dict[str, Any]:
     th.set_num_threads(run.threads)
     with ExitStack() as stack:
         eval_envs = [stack.enter_context(env) for env in make_eval_envs(run.env, run.env_kwargs, run.eval_episodes)]
@@ -145,6 +150,10 @@ def _run(run: Run, report: Report, callbacks: Sequence[BaseCallback], resumes: b
         stack.callback(close_model, model)
         if run.output is None:
             run = run.model_copy(update={"output": str(stack.enter_context(default_folder(run)))})
+        elif not is_held:
+            stack.enter_context(folder_lock(run.folder))
+        if not resumes and (taken := _taken(run.folder)):
+            raise ValueError(taken)
         result = _train(run, model, eval_envs, report, callbacks, resumes)
     return {**result, "folder": str(run.folder)}
 
@@ -276,7 +285,7 @@ def default_folder(run: Run) -> Iterator[Path]:
         if _taken(folder):
             continue
         folder.mkdir(parents=True, exist_ok=True)
-        lock = FileLock(folder / ".lock", timeout=0)
+        lock = FileLock(folder / LOCK, timeout=0)
         try:
             lock.acquire()
         except Timeout:
@@ -287,7 +296,7 @@ def default_folder(run: Run) -> Iterator[Path]:
                 return
         finally:
             with suppress(OSError):  # Windows removes no file that is open
-                (folder / ".lock").unlink()
+                (folder / LOCK).unlink()
             lock.release()
 
 

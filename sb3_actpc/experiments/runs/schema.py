@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, AliasChoices, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
-from sb3_actpc.experiments.runs.algorithms import ALGORITHMS
+from sb3_actpc.experiments.runs.algorithms import known_algorithm
 from sb3_actpc.utils.checks import check_device, nearest
 
 VERSION = 2  # of config.json
@@ -57,12 +57,6 @@ def _number(value: Any) -> Any:
         raise ValueError("must be a number") from error
 
 
-def _algorithm(name: str) -> str:
-    if name not in ALGORITHMS:
-        raise ValueError(f"is no algorithm{nearest(name, ALGORITHMS)}: choose one of {', '.join(sorted(ALGORITHMS))}")
-    return name
-
-
 def _keywords(value: Any) -> Any:
     """As in rl-zoo3: true, false, or keywords."""
     return ({} if value else None) if isinstance(value, bool) else value
@@ -100,7 +94,7 @@ class Run(Schema):
     :func:`~sb3_actpc.experiments.runs.presets.resolve`."""
 
     env: str = ""  # Gymnasium id of the task
-    algo: Annotated[str, AfterValidator(_algorithm)] = "actpc"  # key of ``ALGORITHMS``
+    algo: Annotated[str, AfterValidator(known_algorithm)] = "actpc"  # key of ``ALGORITHMS``
     preset: str | None = None  # a file's name in ``hyperparams/``, or a path ending in ``.yml``; by default ``algo``
     # environment steps to train for
     n_timesteps: Count | None = Field(default=None, validation_alias=AliasChoices("n_timesteps", "steps"))

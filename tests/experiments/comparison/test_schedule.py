@@ -23,16 +23,15 @@ from sb3_actpc.experiments.comparison.execution import (
     LOST,
     NEW,
     UNFINISHED,
-    FolderBusy,
     Outcome,
     execute_run,
-    folder_lock,
     run_status,
 )
 from sb3_actpc.experiments.comparison.schedule import MAX_LOSSES
 from sb3_actpc.experiments.runs import Run
 from sb3_actpc.experiments.runs.record import read_result
 from sb3_actpc.experiments.runs.run import CHECKPOINTS
+from sb3_actpc.utils.files import FolderBusy, folder_lock
 from tests.checkpoints.runs import log_rows
 from tests.experiments.comparison import tasks
 from tests.experiments.comparison.tasks import bring_to_end, interrupt_after, small_runs, write_preset

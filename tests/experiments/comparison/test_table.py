@@ -8,11 +8,14 @@ import pytest
 import yaml
 
 from sb3_actpc.cli import main
+from sb3_actpc.demonstrations import Demonstrations, shipped_demonstrations
 from sb3_actpc.experiments.comparison import ablation_variants, find_variant, plan_runs, read_comparison, variant_names
 from sb3_actpc.experiments.runs import ALGORITHMS, Run
 from sb3_actpc.experiments.runs.algorithms import check_keywords, load_algorithm
 from sb3_actpc.experiments.runs.presets import with_changes
 from tests.experiments.comparison.tasks import small_runs, write_preset
+
+HOPPER = str(shipped_demonstrations("SparseHopper-v5"))
 
 
 @pytest.fixture(autouse=True)
@@ -145,6 +148,15 @@ def test_a_variant_on_another_version_of_the_task_stands_beside_the_others() -> 
         (["--algos", "actpc"], "no task to compare on"),
         (["--envs", "SparseReacher-v5", "--algos", "actpc", "actpc"], "'actpc' is given twice"),
         (["--envs", "SparseReacher-v5", "--algos", "actpc", "--demonstrations", "no.npz"], "no.npz"),
+        (
+            ["--envs", "SparseReacher-v5", "--algos", "actpc", "--demonstrations", "text.npz"],
+            "Reacher-v5: text.npz: expected a dem",
+        ),
+        (
+            ["--envs", "SparseReacher-v5", "--algos", "actpc", "--demonstrations", HOPPER],
+            "'SparseReacher-v5' (any version), found",
+        ),
+        (["task.yml"], f"SparseReacher-v5: {HOPPER}: "),
         (["--envs", "SparseReacher-v5", "--algos", "actpc", "--steps", "0"], "steps='0' must be at least 1"),
         (["--envs", "SparseReacher-v5", "--algos", "actpc", "--engine", "slurm"], "choose one of local, ray"),
         (["--envs", "SparseReacher-v5", "--algos", "actpc", "--workers", "0"], "workers=0 must be at least 1"),
@@ -164,9 +176,23 @@ def test_mistakes_give_one_line_and_begin_nothing(
     Path("list.yml").write_text("[1]", encoding="utf-8")
     Path("variant.yml").write_text("{envs: [SparseReacher-v5], algos: [{algo: actpc, colour: red}]}", encoding="utf-8")
     Path("name.yml").write_text("{envs: [SparseReacher-v5], algos: [{algo: actpc, name: ../up}]}", encoding="utf-8")
+    task = f"{{env: SparseReacher-v5, demonstrations: {HOPPER}}}"
+    Path("task.yml").write_text(f"{{envs: [SparseHopper-v5, {task}], algos: [actpc, td3], steps: 20}}", encoding="utf-8")
+    Path("text.npz").write_text("no demonstrations", encoding="utf-8")
     twins = "[{algo: actpc, name: one}, {base: actpc, name: two}]"
     Path("twins.yml").write_text(f"{{envs: [SparseReacher-v5], algos: {twins}}}", encoding="utf-8")
     assert main(["compare", *arguments]) == 2
     errors = capsys.readouterr().err.strip()
     assert message in errors and "\n" not in errors
     assert not list(Path(".").rglob("seed*"))
+
+
+def test_given_demonstrations_are_read_once_for_all_algorithms_of_a_task(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of the goal task too, whose version of them fits; those of the package are right."""
+    read: list[str] = []
+    original = Demonstrations.load
+    monkeypatch.setattr(Demonstrations, "load", lambda path: read.append(str(path)) or original(path))
+    plan(envs=["SparseHopper-v5"], algos=["actpc", "refresh_alone", "td3", "her"], demonstrations=HOPPER, seeds=2)
+    assert read == [HOPPER, HOPPER]
+    plan(envs=["SparseHopper-v5"])
+    assert len(read) == 2
