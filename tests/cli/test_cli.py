@@ -22,7 +22,7 @@ from sb3_actpc.demonstrations.dataset import DATA_FOLDER, Demonstrations
 from sb3_actpc.envs import SPARSE_MUJOCO_IDS
 from sb3_actpc.experiments.demonstrators import train_demonstrator
 from sb3_actpc.experiments.runs import Run, load_preset, load_run, play_episodes, train_run
-from sb3_actpc.experiments.runs.evaluation import EpisodeStatistics, NormalizedPredictor
+from sb3_actpc.experiments.runs.evaluation import EpisodeStatistics, EvaluationCallback, NormalizedPredictor
 from sb3_actpc.experiments.runs.presets import find_demonstrations, parse_assignments, parse_schedule
 from sb3_actpc.experiments.runs.video import RenderingUnavailable, choose_gl_backend
 from sb3_actpc.utils.files import FolderBusy
@@ -182,6 +182,17 @@ def test_evaluating_does_not_change_what_is_learned() -> None:
         assert train("--demonstrations", "none", "--eval-freq", str(eval_freq), "--output", output) == 0
         weights.append(TD3.load(Path(output) / "model.zip").policy.state_dict())
     assert all(bool((value == weights[1][name]).all()) for name, value in weights[0].items())
+
+
+def test_a_resumed_run_is_not_evaluated_as_if_it_were_new(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """It would be the best so far, as nothing is known yet of those before, and be kept in the place of the best."""
+    played: list[int] = []
+    monkeypatch.setattr(EvaluationCallback, "_evaluate", lambda self, n_episodes=None: played.append(self.num_timesteps))
+    for steps, expected in ((70, []), (0, [0])):
+        evaluation = EvaluationCallback([], tmp_path, 10, 5, 0, print, keeps_best=True)
+        evaluation.model, evaluation.num_timesteps = TD3("MlpPolicy", "Pendulum-v1", buffer_size=1), steps
+        evaluation.on_rollout_start()
+        assert played == expected
 
 
 def test_settings_given_on_the_command_line_replace_the_presets() -> None:

@@ -221,10 +221,10 @@ class EvaluationCallback(CsvCallback):
         super().restore_checkpoint_state(state)
         self._started = time.perf_counter() - state["wall_seconds"]
 
-    def _on_training_start(self) -> None:
+    def _on_rollout_start(self) -> None:
         """Step 0 is what an agent can do before its first one, after its warm start. An untrained agent fails for as long as
         an episode may last, which in robosuite's tasks takes minutes: it plays ``UNTRAINED_EPISODES`` at most."""
-        if self.last_timesteps < 0:
+        if self.last_timesteps < 0 and not self.num_timesteps:  # a resumed run has its rows by now
             is_clone = getattr(self.model, "actor_warm_start", 0) > 0
             self._evaluate(self.eval_episodes if is_clone else min(self.eval_episodes, UNTRAINED_EPISODES))
 
