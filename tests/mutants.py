@@ -316,8 +316,8 @@ MUTANTS = [
     Mutant(
         "what a habit was paid is said of one that was given in its place",
         AGENT,
-        "old = self.trials\n        self._forget_trials()",
-        "old = self.trials",
+        "self.trials = self.trials.forgotten(self.n_envs, goes_on=True)",
+        "pass",
         f"{CLONES} -k parameters",
     ),
     Mutant(
@@ -593,9 +593,9 @@ MUTANTS = [
     ),
     Mutant(
         "an episode of two habits counts",
-        AGENT,
-        "self.trials.skipped = sorted({*running, *old.skipped})",
-        "self.trials.skipped = old.skipped",
+        TRIALS,
+        "(self.lengths[env] or env in self.skipped)",
+        "env in self.skipped",
         f"{HABIT} -k another_habit",
     ),
     Mutant("own episodes keep old neighbours", AGENT, "memory.episodes.neighbours = None", "pass", f"{HABIT} -k anew"),

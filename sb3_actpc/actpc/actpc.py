@@ -318,8 +318,9 @@ class ActPC(OffPolicyAlgorithm):
         self._create_aliases()
         if self.policy.habit:
             clones = self.refresh.n_clones - 1 if self.demonstrations is not None and self.actor_warm_start else 0
-            known = self.trials or Trials(1)  # of a loaded agent, whose environment may be another: what it paid is forgotten
-            self.trials = Trials(self.n_envs, n_clones=min(known.n_clones, clones), begun_at=known.begun_at)
+            # of a loaded agent, whose environment may be another: what it paid is forgotten
+            self.trials = (self.trials or Trials(1)).forgotten(self.n_envs)
+            self.trials.n_clones = min(self.trials.n_clones, clones)
         self._setup_demonstrations()
         self._fit_to_bounds()
         self.diagnostics = Diagnostics(self.policy)
@@ -445,17 +446,14 @@ class ActPC(OffPolicyAlgorithm):
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         super().set_env(env, force_reset)
-        self._forget_trials()  # another environment may pay for other steps
+        if self.trials is not None:  # another environment may pay for other steps
+            self.trials = self.trials.forgotten(self.n_envs)
         if isinstance(self.replay_buffer, HerReplayBuffer):  # SB3 goes on paying by the old one
             assert self.env is not None
             self.replay_buffer.env = self.env
         if self.demonstrations is not None:
             self._setup_demonstrations()
         self._fit_to_bounds()
-
-    def _forget_trials(self) -> None:
-        if self.trials is not None:
-            self.trials = Trials(self.n_envs, n_clones=self.trials.n_clones, begun_at=self.trials.begun_at)
 
     @property
     def pretrained(self) -> bool:
@@ -1067,11 +1065,8 @@ class ActPC(OffPolicyAlgorithm):
     def set_parameters(self, *args: Any, **kwargs: Any) -> None:
         """As in SB3. What a habit was paid says nothing of one that is given in its place."""
         super().set_parameters(*args, **kwargs)
-        old = self.trials
-        self._forget_trials()
-        if self.trials is not None and old is not None:
-            running = [env for env, length in enumerate(old.lengths) if length]  # begun by another habit
-            self.trials.skipped = sorted({*running, *old.skipped})
+        if self.trials is not None:
+            self.trials = self.trials.forgotten(self.n_envs, goes_on=True)
 
     def checkpoint_state(self) -> dict[str, Any]:
         """What a checkpoint (:mod:`sb3_actpc.checkpoints`) keeps beside SB3's state: plain values and arrays."""

@@ -101,6 +101,17 @@ class Trials:
         self.lengths, self.quiet_due = ([0] * self.n_envs for _ in range(2))
         self.returns, self.quiet, self.skipped = [0.0] * self.n_envs, [], []
 
+    def forgotten(self, n_envs: int, goes_on: bool = False) -> "Trials":
+        """
+        Those of another habit, or of other environments: what was paid says nothing any more.
+
+        :param n_envs: environments
+        :param goes_on: whether the running episodes do; they count for nothing
+        """
+        new = Trials(n_envs, n_clones=self.n_clones, begun_at=self.begun_at)
+        new.skipped = [env for env in range(n_envs) if goes_on and (self.lengths[env] or env in self.skipped)]
+        return new
+
     @property
     def habit_return(self) -> float:
         """Mean of the habit's last returns; 0 where there is none yet."""
