@@ -970,6 +970,27 @@ MUTANTS = [
         "(joined < threshold)",
         SCORES,
     ),
+    Mutant(
+        "a resumed run's best agent is written over",
+        "experiments/runs/evaluation.py",
+        "self.last_timesteps < 0 and not self.num_timesteps:",
+        "self.last_timesteps < 0:",
+        "tests/cli/test_cli.py -k resumed",
+    ),
+    Mutant(
+        "a clone is evaluated as if it were untrained",
+        "experiments/runs/evaluation.py",
+        'getattr(self.model, "actor_warm_start", 0) > 0',
+        "False",
+        "tests/baselines/test_bc.py -k evaluated",
+    ),
+    Mutant(
+        "a file's own variant is not known by its name",
+        "experiments/comparison/plan.py",
+        "own.get(name, name) for name",
+        "name for name",
+        "tests/experiments/comparison/test_table.py -k chosen",
+    ),
 ]
 
 
