@@ -980,8 +980,8 @@ MUTANTS = [
     Mutant(
         "a clone is evaluated as if it were untrained",
         "experiments/runs/evaluation.py",
-        'getattr(self.model, "actor_warm_start", 0) > 0',
-        "False",
+        'elif not getattr(model, "actor_warm_start", 0):',
+        "else:",
         "tests/baselines/test_bc.py -k evaluated",
     ),
     Mutant(

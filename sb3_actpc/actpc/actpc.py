@@ -519,7 +519,7 @@ class ActPC(OffPolicyAlgorithm):
     def _warn_of_idle_settings(self) -> None:
         """Warns of a run with too few updates for a learner to prove itself, of a signal that nobody makes, and of an agent
         that was taught by demonstrations and has none."""
-        if self.pretrained and self.demonstrations is None:
+        if self.pretrained and self.demonstrations is None and self.refresh_weight:
             warnings.warn(
                 "the agent was taught by demonstrations and goes on without them, so that nothing of them is imitated: pass "
                 "demonstrations= again, as from_weights(path, env, demonstrations=...)",

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from sb3_actpc.demonstrations import fit_demonstrations
-from sb3_actpc.experiments.comparison.variants import ablation_variants, parse_variant, part_of_run
+from sb3_actpc.experiments.comparison.variants import ablation_variants, find_variant, parse_variant, part_of_run
 from sb3_actpc.experiments.runs import Run, resolve
 from sb3_actpc.experiments.runs.environments import check_env_id, make_train_env
 from sb3_actpc.experiments.runs.presets import read_yaml
@@ -63,12 +63,16 @@ def read_comparison_file(path: Path) -> dict[str, Any]:
 
 
 def with_options(content: Mapping[str, Any], options: Mapping[str, Any]) -> dict[str, Any]:
-    """The content of a file, with options in the place of its values; a name of its own variants stands for that variant."""
+    """The content of a file, with options in the place of its values; a name of its own variants stands for that variant.
+    ValueError for a name that neither the file nor the package knows."""
     content, options = dict(content), dict(options)
     if "steps" in options:  # a file may call them n_timesteps
         content.pop("n_timesteps", None)
     if "algos" in options:
-        own = {entry["name"]: entry for entry in _list(content, "algos") if isinstance(entry, Mapping) and "name" in entry}
+        mappings = [entry for entry in content.get("algos") or [] if isinstance(entry, Mapping)]
+        own = {str(entry.get("name", entry.get("algo"))): entry for entry in mappings}
+        for name in set(options["algos"]) - set(own):
+            find_variant(name, own)
         options["algos"] = [own.get(name, name) for name in options["algos"]]
     return {**content, **options}
 
@@ -85,7 +89,7 @@ def plan_runs(comparison: Comparison, folder: Path | None = None) -> list[Run]:
         other = names.setdefault((run.task, run.id), run.name)
         if other != run.name:
             raise ValueError(f"{run.task}: {other!r} and {run.name!r} have the same settings: leave one out")
-    for run in {(run.env, repr(run.env_kwargs), run.demonstrations): run for run in filled}.values():
+    for run in {(run.env, repr(run.env_kwargs), run.demonstrations, _limits(run)): run for run in filled}.values():
         _check_demonstrations(run)
     seeds = range(comparison.first_seed, comparison.first_seed + comparison.seeds)
     seeded = [run.model_copy(update={"seed": seed}) for seed in seeds for run in filled]
@@ -109,9 +113,13 @@ def _check_demonstrations(run: Run) -> None:
         return
     with closing(make_train_env(run.env, run.env_kwargs, 1, run.seed)) as env:
         try:
-            fit_demonstrations(run.demonstrations, env, env.observation_space, env.action_space)
+            fit_demonstrations(run.demonstrations, env, env.observation_space, env.action_space, *_limits(run))
         except ValueError as error:
             raise ValueError(f"{run.task}: {error}") from error
+
+
+def _limits(run: Run) -> tuple[Any, Any]:
+    return run.settings.get("n_demonstrations"), run.settings.get("n_demonstration_transitions")
 
 
 def _parse_task(entry: Any) -> Run:

@@ -1,6 +1,6 @@
 """Named ways of running an algorithm: each is a part of a :class:`~sb3_actpc.experiments.runs.Run`."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -15,12 +15,13 @@ PLANNED = ("seed", "task", "progress", "output")
 VARIANTS_FILE = Path(__file__).with_name("variants.yml")
 
 
-def find_variant(name: str) -> Run:
-    """The variant that goes by a name: of the shipped file, or an algorithm's."""
+def find_variant(name: str, also: Iterable[str] = ()) -> Run:
+    """The variant that goes by a name: of the shipped file, or an algorithm's. ValueError for another one, which names also
+    those of ``also``."""
     known = _variants()
     if name in known:
         return known[name]
-    names = variant_names()
+    names = [*also, *variant_names()]
     raise ValueError(f"unknown algorithm or variant {name!r}{nearest(name, names)}: expected one of {', '.join(names)}")
 
 

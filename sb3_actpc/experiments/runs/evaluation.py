@@ -200,12 +200,16 @@ class EvaluationCallback(CsvCallback):
         self._started = time.perf_counter()
 
     def begin(self, model: BaseAlgorithm) -> None:
-        """A new run. An offline method's agent, which has seen nothing, is not evaluated before it has."""
+        """A new run. An untrained agent is evaluated at once. It fails for as long as an episode may last, which takes minutes
+        in robosuite's tasks, so that it plays ``UNTRAINED_EPISODES`` at most. One that warms up is evaluated when it has, an
+        offline method's only when it has learned."""
         self.model = model
         self._started = time.perf_counter()
         self.begin_file()
         if getattr(model, "is_offline", False):
             self.last_timesteps = 0
+        elif not getattr(model, "actor_warm_start", 0):
+            self._evaluate(min(self.eval_episodes, UNTRAINED_EPISODES))
 
     @property
     def wall_seconds(self) -> float:
@@ -222,11 +226,9 @@ class EvaluationCallback(CsvCallback):
         self._started = time.perf_counter() - state["wall_seconds"]
 
     def _on_rollout_start(self) -> None:
-        """Step 0 is what an agent can do before its first one, after its warm start. An untrained agent fails for as long as
-        an episode may last, which in robosuite's tasks takes minutes: it plays ``UNTRAINED_EPISODES`` at most."""
+        """Step 0 is what an agent can do before its first one, after its warm start."""
         if self.last_timesteps < 0 and not self.num_timesteps:  # a resumed run has its rows by now
-            is_clone = getattr(self.model, "actor_warm_start", 0) > 0
-            self._evaluate(self.eval_episodes if is_clone else min(self.eval_episodes, UNTRAINED_EPISODES))
+            self._evaluate()
 
     def _on_step(self) -> bool:
         # at the last step, the update that belongs to it is still to come

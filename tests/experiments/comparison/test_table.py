@@ -112,6 +112,10 @@ def test_an_algorithm_can_be_chosen_by_the_name_that_a_file_gives_it(capsys: pyt
     Path("c.yml").write_text(yaml.safe_dump(content), encoding="utf-8")
     assert main(["compare", "c.yml", "--algos", "slow", "actpc", "--seeds", "1", "--steps", "60", "--dry-run"]) == 0
     assert [line.split()[2:5:2] for line in capsys.readouterr().out.splitlines()[1:3]] == [["slow", "20"], ["actpc", "60"]]
+    assert main(["compare", "c.yml", "--algos", "slwo", "--dry-run"]) == 2
+    assert "(did you mean 'slow'?)" in capsys.readouterr().err
+    Path("c.yml").write_text("{envs: [SparseReacher-v5], algos: }", encoding="utf-8")
+    assert main(["compare", "c.yml", "--algos", "actpc", "--dry-run"]) == 0
 
 
 def test_every_named_variant_has_settings_that_its_algorithm_takes() -> None:
