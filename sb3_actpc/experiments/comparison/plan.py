@@ -71,8 +71,9 @@ def with_options(content: Mapping[str, Any], options: Mapping[str, Any]) -> dict
     if "algos" in options:
         mappings = [entry for entry in content.get("algos") or [] if isinstance(entry, Mapping)]
         own = {str(entry.get("name", entry.get("algo"))): entry for entry in mappings}
-        for name in set(options["algos"]) - set(own):
-            find_variant(name, own)
+        for name in options["algos"]:
+            if name not in own:
+                find_variant(name, own)
         options["algos"] = [own.get(name, name) for name in options["algos"]]
     return {**content, **options}
 
