@@ -641,6 +641,7 @@ MUTANTS = [
         "if False:",
         "tests/experiments/test_examination.py -k held",
     ),
+    Mutant("changes lie crosswise", "ngc/products.py", ".t().contiguous()", ".t()", "tests/ngc/test_products.py -k shape"),
     Mutant("noise where there is no room", AGENT, "and self.room.is_wide)", ")", f"{ROOMS} -k without_a_word"),
     Mutant("room in any unit", ROOM, "> self.step", "> 0.5", f"{ROOMS} -k without_a_word"),
     Mutant("noise of one size", ROOM, "size * way.abs() * th.randn_like(features)", "size * th.randn_like(features)", ROOMS),

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import torch as th
 
-from sb3_actpc.ngc.products import multiply
+from sb3_actpc.ngc.products import sum_outer
 
 N_MIRRORED = 100  # noise vectors per source neuron; the cosine with W^T is (1 + 1 / N_MIRRORED)^-1/2
 LARGEST_MIRRORING = 10**10  # products of numbers, in mirroring one layer; a random number costs about a hundred of them
@@ -60,7 +60,7 @@ def hebbian_changes(
     inverse_batch = 1.0 / len(errors[0])
     scaled = th._foreach_mul(errors, inverse_batch)
     return HebbianChanges(
-        weights=[multiply(error.t(), activity, bfloat16) for error, activity in zip(scaled, activations, strict=True)],
+        weights=[sum_outer(error, activity, bfloat16) for error, activity in zip(scaled, activations, strict=True)],
         biases=[error.sum(0) for error in scaled],
         memory=[] if memory is None else [memory_weight * (error.t() @ memory) for error in scaled],
     )

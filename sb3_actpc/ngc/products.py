@@ -4,6 +4,7 @@ import torch as th
 
 MATMUL_PRECISIONS = ("float32", "bfloat16")
 NARROWEST = 64  # a product with a side below this one costs less than turning its numbers into bfloat16
+TALL = 8  # rows of a sum of outer products for each of its columns, from which its transpose costs up to a quarter as much
 
 
 def multiply(a: th.Tensor, b: th.Tensor, bfloat16: bool, out: th.Tensor | None = None) -> th.Tensor:
@@ -28,6 +29,20 @@ def add_product(total: th.Tensor, a: th.Tensor, b: th.Tensor, bfloat16: bool, si
     if bfloat16 and _is_wide(a, b):
         return total.add_(multiply(a, b, bfloat16), alpha=sign)
     return total.addmm_(a, b, alpha=sign)
+
+
+def sum_outer(left: th.Tensor, right: th.Tensor, bfloat16: bool) -> th.Tensor:
+    """
+    The sum of the outer products of their rows, contiguous.
+
+    :param left: (B, n)
+    :param right: (B, m)
+    :param bfloat16: see :func:`multiply`
+    :return: left^T right, (n, m)
+    """
+    if right.shape[1] < NARROWEST and TALL * right.shape[1] <= left.shape[1]:
+        return th.mm(right.t(), left).t().contiguous()
+    return multiply(left.t(), right, bfloat16)
 
 
 def _is_wide(a: th.Tensor, b: th.Tensor) -> bool:

@@ -4,7 +4,7 @@ import pytest
 import torch as th
 
 from sb3_actpc.ngc import NGCCircuit, settle_coupled
-from sb3_actpc.ngc.products import NARROWEST, add_product, multiply
+from sb3_actpc.ngc.products import NARROWEST, TALL, add_product, multiply, sum_outer
 from tests.ngc import oracle
 
 ROUNDING = 2.0**-8  # of one number, at most half of it
@@ -27,6 +27,18 @@ def test_wide_products_are_rounded_and_narrow_ones_are_not():
     for sign in (1.0, -1.0):
         expected = total + sign * multiply(a, b, True)
         assert th.equal(add_product(total.clone(), a, b, True, sign), expected)
+
+
+@pytest.mark.parametrize("bfloat16", [False, True])
+@pytest.mark.parametrize("n, m", [(TALL * 11, 11), (TALL * 11 - 1, 11), (3, 40), (TALL * NARROWEST, NARROWEST)])
+def test_outer_products_are_summed_whatever_the_shape(n, m, bfloat16):
+    """The optimiser's fused step reads changes as they lie in memory."""
+    left, right = th.randn(NARROWEST, n), th.randn(NARROWEST, m)
+    found, expected = sum_outer(left, right, bfloat16), th.einsum("bn,bm->nm", left.double(), right.double())
+    assert found.is_contiguous() and found.shape == (n, m)
+    is_rounded = bfloat16 and m >= NARROWEST
+    assert (found - expected).norm() < (ROUNDING if is_rounded else 1e-5) * expected.norm()
+    assert th.equal(found, multiply(left.t(), right, True)) if is_rounded else True
 
 
 def check_directions(changes, exact):
