@@ -642,7 +642,7 @@ MUTANTS = [
         "tests/experiments/test_examination.py -k held",
     ),
     Mutant("changes lie crosswise", "ngc/products.py", ".t().contiguous()", ".t()", "tests/ngc/test_products.py -k shape"),
-    Mutant("noise where there is no room", AGENT, "and self.room.is_wide)", ")", f"{ROOMS} -k without_a_word"),
+    Mutant("noise where there is no room", AGENT, " and self.room.is_wide", "", f"{ROOMS} -k without_a_word"),
     Mutant("room in any unit", ROOM, "> self.step", "> 0.5", f"{ROOMS} -k without_a_word"),
     Mutant("noise of one size", ROOM, "size * way.abs() * th.randn_like(features)", "size * th.randn_like(features)", ROOMS),
     Mutant("noise as wide as the room", ROOM, "nan_to_num(0.0).clamp_max(1.0)", "nan_to_num(0.0).clamp(1.0, 1.0)", ROOMS),
@@ -680,7 +680,7 @@ MUTANTS = [
     Mutant(
         "the deviation has no unit",
         REGION,
-        "(actions - habit_actions) / spread.clamp(SMALLEST_UNIT, 1.0)",
+        "(actions - habit_actions) / self.unit",
         "(actions - habit_actions)",
         REGIONS,
     ),
@@ -691,6 +691,10 @@ MUTANTS = [
         "self.deviation / self.radius - 1.0",
         REGIONS,
     ),
+    Mutant(
+        "clones that guess are sure", AGENT, "policy.spread, self.clones_guess", "policy.spread, False", f"{ROOMS} -k unless"
+    ),
+    Mutant("a small spread is as small a unit", REGION, "spread.clamp(SMALLEST_UNIT, 1.0)", "spread", REGIONS),
     Mutant("lost states count as well", REGION, "(squares * weights).mean()", "squares.mean() * weights.mean()", REGIONS),
     Mutant("pressure goes as slowly as it comes", REGION, "FALL * unused", "RISE * unused", REGIONS),
     Mutant("the multiplier is let go", REGION, ".clamp_(*MULTIPLIERS)", "", REGIONS),

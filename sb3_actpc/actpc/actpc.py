@@ -633,6 +633,8 @@ class ActPC(OffPolicyAlgorithm):
         if self.actor_warm_start:
             self.actor.circuit.optimizer.state.clear()  # its moments are those of other learning rates
             self.policy.spread.copy_(spread_of(self._imitation_residuals()))
+            if self.policy.trust_region is not None:
+                self.policy.trust_region.measure_by(self.policy.spread, self.clones_guess)
 
     def _update_prior(self, batch_size: int) -> None:
         assert self.expert is not None
@@ -907,7 +909,7 @@ class ActPC(OffPolicyAlgorithm):
         if self.policy.trust_region is not None and self.actor.habit is not None:
             habit_actions = self.actor.habit.project(batch.features, batch.memory)
             values = coupled.action_values.mean(1)
-            weight = weight * self.policy.trust_region.regulate(coupled.actions, habit_actions, values, self.policy.spread)
+            weight = weight * self.policy.trust_region.regulate(coupled.actions, habit_actions, values)
         return weight / coupled.action_values.abs().mean().clamp_min(SMALLEST_VALUE_SCALE) if self.scale_pressure else weight
 
     def _update_critic(self, batch: Batch) -> None:
@@ -996,11 +998,16 @@ class ActPC(OffPolicyAlgorithm):
         return None if self.expert is None else self.expert.room
 
     @property
+    def clones_guess(self) -> bool:
+        """Whether the demonstrations leave room, so that clones guess what is done between them."""
+        return self.room is not None and self.room.is_wide
+
+    @property
     def clone_noise(self) -> float:
         """Noise on what clones imitate: as asked for, or by default 1 where the demonstrations leave room and 0 where not."""
         if self.expert is not None and self.refresh.noise is not None:
             return self.refresh.noise
-        return float(self.room is not None and self.room.is_wide)
+        return float(self.clones_guess)
 
     def _features_of(self, episodes: Episodes, rows: np.ndarray) -> th.Tensor:
         """(B, n_features) of (B,) rows, some at a time: there can be many images."""

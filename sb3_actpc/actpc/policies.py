@@ -375,7 +375,7 @@ class ActPCPolicy(BasePolicy):
         # the slow average of the learning actor, and a frozen copy of it that has to prove itself
         self.actor_average = copy.deepcopy(self.actor.circuit) if self.habit else None
         self.candidate = copy.deepcopy(self.actor.circuit) if self.habit else None
-        self.trust_region = TrustRegion(self.trust_radius) if self.habit and self.trust_radius else None
+        self.trust_region = TrustRegion(self.trust_radius, n_actions) if self.habit and self.trust_radius else None
         for name, circuit in self.named_circuits():
             circuit.optimizer = self._optimizer(name.partition(".")[0], circuit)
 

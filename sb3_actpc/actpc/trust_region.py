@@ -36,18 +36,23 @@ class TrustRegion(nn.Module):
     outcomes: it widens with candidates that hold their own, and shrinks with those that do not.
 
     :param radius: at first
-    :raises ValueError: for one outside ``RADII``, within which outcomes move it
+    :param n_actions: A
+    :raises ValueError: for a radius outside ``RADII``, within which outcomes move it
     """
 
+    unit: th.Tensor
     radius: th.Tensor
     deviation: th.Tensor
     multiplier: th.Tensor
 
-    def __init__(self, radius: float) -> None:
+    def __init__(self, radius: float, n_actions: int) -> None:
         smallest, largest = RADII
         if not smallest <= radius <= largest:
             raise ValueError(f"trust_radius={radius!r} must be from {smallest:g} to {largest:g}, or 0 for a fixed pressure")
         super().__init__()
+        self.register_buffer(
+            "unit", th.ones(n_actions)
+        )  # (A,), standard deviations; 1, half of the range, where they are unknown
         self.register_buffer("radius", th.tensor(float(radius)))
         self.register_buffer("deviation", th.tensor(0.0))
         self.register_buffer("multiplier", th.tensor(0.0))
@@ -58,16 +63,23 @@ class TrustRegion(nn.Module):
         self.deviation.zero_()
         self.multiplier.fill_(FIRST_MULTIPLIER)
 
-    def regulate(self, actions: th.Tensor, habit_actions: th.Tensor, values: th.Tensor, spread: th.Tensor) -> th.Tensor:
+    def measure_by(self, spread: th.Tensor, guesses: bool) -> None:
+        """
+        :param spread: standard deviations of the demonstrated actions around their clone, (A,)
+        :param guesses: whether the clone has to guess between the demonstrations (:mod:`sb3_actpc.actpc.room`): how well it
+            knows the steps that are shown then says nothing about the others, and the unit is unknown
+        """
+        self.unit.copy_(th.ones_like(spread) if guesses else spread.clamp(SMALLEST_UNIT, 1.0))
+
+    def regulate(self, actions: th.Tensor, habit_actions: th.Tensor, values: th.Tensor) -> th.Tensor:
         """
         :param actions: of the learning actor, (B, A)
         :param habit_actions: of the habit in the same states, (B, A)
         :param values: what the states are worth, (B,)
-        :param spread: standard deviations of the demonstrated actions, (A,); 1 where they are unknown
         :return: the multiplier, 0-d
         """
         weights = values - values.min() + SMALLEST_VALUE  # the same for all where all are worth the same
-        squares = ((actions - habit_actions) / spread.clamp(SMALLEST_UNIT, 1.0)).square().mean(1)
+        squares = ((actions - habit_actions) / self.unit).square().mean(1)
         self.deviation.lerp_((squares * weights).mean() / weights.mean(), DEVIATION_RATE)
         unused = (1.0 - self.deviation / self.radius).clamp_min(-1.0)
         self.multiplier.mul_((RISE * unused.clamp_min(0.0) + FALL * unused.clamp_max(0.0)).exp()).clamp_(*MULTIPLIERS)

@@ -9,7 +9,8 @@ import torch as th
 from sb3_actpc.actpc import room as room_module
 from sb3_actpc.actpc.room import Room, nearest_steps
 from sb3_actpc.actpc.self_imitation import Episodes
-from tests.actpc.agents import make
+from sb3_actpc.actpc.trust_region import SMALLEST_UNIT
+from tests.actpc.agents import imitating, make
 from tests.actpc.envs import demonstrations
 
 
@@ -84,19 +85,36 @@ def test_steps_that_are_never_drawn_are_no_neighbours():
         assert room.shown.neighbours[0].tolist() == expected
 
 
-@pytest.mark.parametrize("scale", [1.0, 1000.0])
-@pytest.mark.parametrize(("apart", "noise"), [(0.08, 0.0), (0.12, 1.0)])
-def test_without_a_word_on_it_there_is_noise_where_the_next_episode_is_farther_than_the_next_step(apart, noise, scale):
-    """Two parallel lines in steps of 0.1; whatever the unit."""
+def parallel_lines(apart, scale=1.0):
+    """Two, in steps of 0.1."""
     data = demonstrations(n_episodes=2, length=30)
     observations = np.zeros_like(data.observations)
     observations[:, 0] = np.tile(np.arange(30), 2) / 10
     observations[30:, 1] = apart
-    data = dataclasses.replace(data, observations=scale * observations)
+    return dataclasses.replace(data, observations=scale * observations)
+
+
+@pytest.mark.parametrize("scale", [1.0, 1000.0])
+@pytest.mark.parametrize(("apart", "noise"), [(0.08, 0.0), (0.12, 1.0)])
+def test_without_a_word_on_it_there_is_noise_where_the_next_episode_is_farther_than_the_next_step(apart, noise, scale):
+    """Whatever the unit."""
+    data = parallel_lines(apart, scale)
     model = make(demonstrations=data)
     assert model.clone_noise == noise
     assert f"noise on what clones imitate: {noise:g} of" in model.describe()
     assert make(demonstrations=data, refresh_kwargs={"noise": 0.3}).clone_noise == 0.3
+
+
+@pytest.mark.parametrize("noise", [None, 0.0])
+@pytest.mark.parametrize(("apart", "guesses"), [(0.08, False), (0.12, True)])
+def test_the_trust_region_counts_by_the_demonstrations_spread_unless_the_clone_guesses_between_them(apart, guesses, noise):
+    keywords = {"observation_normalization": "none", "refresh_kwargs": {"noise": noise}}
+    model = imitating(demonstrations=parallel_lines(apart), **keywords)
+    region, spread = model.policy.trust_region, model.policy.spread
+    assert region.unit.tolist() == [1.0] * len(spread)
+    model.pretrain()
+    expected = np.ones(len(spread)) if guesses else np.clip(spread, SMALLEST_UNIT, 1.0)
+    assert region.unit.tolist() == pytest.approx(expected) and (spread < 1.0).all()
 
 
 @pytest.mark.parametrize("lengths", [(40,), (1, 1, 1)])

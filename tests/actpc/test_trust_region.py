@@ -20,8 +20,14 @@ from sb3_actpc.actpc.trust_region import (
 ZEROS = th.zeros(4, 2)
 
 
-ONES = th.ones(2)
 WORTH = th.full((4,), 7.0)  # all states the same
+
+
+def measured_by(spread, guesses=False):
+    """Of radius 1."""
+    region = TrustRegion(1, 2)
+    region.measure_by(th.tensor(spread), guesses)
+    return region
 
 
 def test_the_spread_is_the_residuals_root_mean_square_in_every_dimension_and_has_a_least():
@@ -31,11 +37,11 @@ def test_the_spread_is_the_residuals_root_mean_square_in_every_dimension_and_has
 
 def test_the_deviation_is_counted_in_variances_of_each_dimension():
     """One standard deviation in every dimension is a deviation of 1, whatever its spread; the start is forgotten."""
-    region, spread = TrustRegion(1), th.tensor([0.1, 0.5])
-    region.regulate(th.tensor([[0.1, -0.5]] * 4), ZEROS, WORTH, spread)
+    region = measured_by([0.1, 0.5])
+    region.regulate(th.tensor([[0.1, -0.5]] * 4), ZEROS, WORTH)
     assert float(region.deviation) == pytest.approx(DEVIATION_RATE)
     for _ in range(1000):
-        region.regulate(th.tensor([[0.1, -0.5]] * 4), ZEROS, WORTH, spread)
+        region.regulate(th.tensor([[0.1, -0.5]] * 4), ZEROS, WORTH)
     assert float(region.deviation) == pytest.approx(1.0, abs=1e-4)
 
 
@@ -43,31 +49,32 @@ def test_the_deviation_is_counted_in_variances_of_each_dimension():
 @pytest.mark.parametrize("shift", [-30.0, 0.0, 30.0])
 def test_a_state_counts_by_its_worth_above_the_worst(shift, scale):
     """Worth 0, 1, 2, 5 and squares 9, 1, 1, 4: (1 + 2 + 20) / 8, whatever values are shifted or scaled by."""
-    region = TrustRegion(1)
+    region = TrustRegion(1, 2)
     actions = th.tensor([3.0, 1.0, -1.0, 2.0])[:, None].expand(4, 2)
-    region.regulate(actions, ZEROS, shift + scale * th.tensor([0.0, 1.0, 2.0, 5.0]), ONES)
+    region.regulate(actions, ZEROS, shift + scale * th.tensor([0.0, 1.0, 2.0, 5.0]))
     assert float(region.deviation) == pytest.approx(DEVIATION_RATE * 23 / 8, rel=1e-3)
 
 
 def test_a_small_spread_counts_as_the_smallest_unit():
-    region = TrustRegion(1)
-    region.regulate(th.full((4, 2), SMALLEST_UNIT), ZEROS, WORTH, th.full((2,), SMALLEST_SPREAD))
+    region = measured_by([SMALLEST_SPREAD] * 2)
+    region.regulate(th.full((4, 2), SMALLEST_UNIT), ZEROS, WORTH)
     assert float(region.deviation) == pytest.approx(DEVIATION_RATE)
 
 
-def test_an_unknown_spread_counts_as_one():
-    region = TrustRegion(1)
-    region.regulate(th.full((4, 2), 0.5), ZEROS, WORTH, th.full((2,), th.inf))
+@pytest.mark.parametrize("region", [TrustRegion(1, 2), measured_by([th.inf] * 2), measured_by([0.1, 0.1], guesses=True)])
+def test_an_unknown_spread_counts_as_one(region):
+    """Before anything is imitated, and where the clone guesses what is done between the demonstrations."""
+    region.regulate(th.full((4, 2), 0.5), ZEROS, WORTH)
     assert float(region.deviation) == pytest.approx(0.25 * DEVIATION_RATE)
 
 
 def test_the_multiplier_grows_inside_falls_outside_and_rests_on_the_border():
     rates = []
     for deviation in (0.0, 0.5, 1.0, 1.5, 2.0, 9.0):
-        region = TrustRegion(1.0)
+        region = TrustRegion(1, 2)
         region.deviation.fill_(deviation)
         before = float(region.multiplier)
-        after = float(region.regulate(th.full((4, 2), math.sqrt(deviation)), ZEROS, WORTH, ONES))
+        after = float(region.regulate(th.full((4, 2), math.sqrt(deviation)), ZEROS, WORTH))
         rates.append(math.log(after / before))
     assert rates == pytest.approx([RISE, RISE / 2, 0.0, -FALL / 2, -FALL, -FALL], abs=1e-5)
 
@@ -75,17 +82,17 @@ def test_the_multiplier_grows_inside_falls_outside_and_rests_on_the_border():
 def test_a_wider_radius_is_reached_by_an_actor_that_follows_the_pressure():
     """A play in which the deviation is the multiplier squared: it settles where the deviation is the radius."""
     for radius in (0.25, 4.0):
-        region = TrustRegion(radius)
+        region = TrustRegion(radius, 2)
         for _ in range(6000):
-            region.regulate(region.multiplier.expand(4, 2), ZEROS, WORTH, ONES)
+            region.regulate(region.multiplier.expand(4, 2), ZEROS, WORTH)
         assert float(region.multiplier) == pytest.approx(math.sqrt(radius), rel=0.01)
 
 
 def test_multiplier_and_radius_stay_within_bounds():
     for verdict, actions, bound in (("tied", ZEROS, 1), ("rejected", ZEROS + 1e6, 0)):
-        region = TrustRegion(1)
+        region = TrustRegion(1, 2)
         for _ in range(3000):
-            region.regulate(actions, ZEROS, WORTH, ONES)
+            region.regulate(actions, ZEROS, WORTH)
             region.resize(verdict)
         assert float(region.radius) == pytest.approx(RADII[bound])
         assert float(region.multiplier) == pytest.approx(MULTIPLIERS[bound])
@@ -93,20 +100,20 @@ def test_multiplier_and_radius_stay_within_bounds():
 
 def test_holding_its_own_widens_the_radius_and_losing_shrinks_it():
     for verdict, grows in (("accepted", True), ("tied", True), ("rejected", False)):
-        region = TrustRegion(1)
+        region = TrustRegion(1, 2)
         region.resize(verdict)
         assert (float(region.radius) > 1.0) == grows
 
 
 def test_what_is_returned_does_not_change_with_the_next_update():
-    region = TrustRegion(1)
-    first = region.regulate(ZEROS, ZEROS, WORTH, ONES)
+    region = TrustRegion(1, 2)
+    first = region.regulate(ZEROS, ZEROS, WORTH)
     kept = float(first)
-    region.regulate(ZEROS, ZEROS, WORTH, ONES)
+    region.regulate(ZEROS, ZEROS, WORTH)
     assert float(first) == kept < float(region.multiplier)
 
 
 @pytest.mark.parametrize("radius", [0.05, 2000.0])
 def test_a_radius_that_no_verdict_could_leave_is_named(radius):
     with pytest.raises(ValueError, match=f"trust_radius={radius} must be from 0.1 to 1000, or 0 for a fixed pressure"):
-        TrustRegion(radius)
+        TrustRegion(radius, 2)
