@@ -39,7 +39,7 @@ RUNGS = {
     "policy_kwargs.habit",
     "policy_kwargs.trust_radius",
 }
-ARM_RUNGS = {"refresh_kwargs.noise", "refresh_kwargs.ensemble_size"}
+ARM_RUNGS = {"refresh_kwargs.noise", "refresh_kwargs.ensemble_size", "refresh_kwargs.n_clones"}
 
 
 def cases() -> list[tuple[str, str, str]]:
