@@ -125,9 +125,8 @@ class ActPC(OffPolicyAlgorithm):
     :param settling: "scheduled" (one ordered sweep of the errors, the zero-divergence schedule or Z-IL of the
         predictive-coding literature) or "iterative" (the paper: K steps of eq. 1)
     :param exploration_noise: standard deviation of the Gaussian noise on the actions in [-1, 1]; with demonstrations at most
-        their spread around the warm-started actor, dimension by dimension. With a habit a noisy episode is followed by as many
-        steps without.
-        0 for none (the paper)
+        their spread around the warm-started actor (0.02 at least), dimension by dimension. With a habit a noisy episode is
+        followed by as many steps without. 0 for none (the paper)
     :param policy_delay: updates of the critic for each of the actor, as in TD3; the paper's is 1
     :param demonstrations: a path, a Minari id, or a :class:`~sb3_actpc.demonstrations.dataset.Demonstrations`. A path is saved
         as it was given; others can be set later (``agent.demonstrations = ...``), which a trained prior outlasts
@@ -170,6 +169,8 @@ class ActPC(OffPolicyAlgorithm):
     :param seed: as in SB3
     :raises ValueError: for a keyword with a value that is not allowed, for action spaces that are not Boxes, for
         demonstrations that do not fit the environment
+    :raises FileNotFoundError: where no demonstrations file is
+    :raises ImportError: for a Minari id without the extra ``minari``
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = POLICIES
@@ -445,6 +446,7 @@ class ActPC(OffPolicyAlgorithm):
             )
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
+        """As in SB3. What a habit was paid in another environment is forgotten; ValueError where demonstrations do not fit."""
         super().set_env(env, force_reset)
         if self.trials is not None:  # another environment may pay for other steps
             self.trials = self.trials.forgotten(self.n_envs)
@@ -1042,6 +1044,8 @@ class ActPC(OffPolicyAlgorithm):
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
     ) -> SelfActPC:
+        """As in SB3, after a warm start (:meth:`pretrain`) where there are demonstrations; ValueError for a bad number of
+        environment steps, and where something that was set since does not fit."""
         check_kind("total_timesteps", total_timesteps, float)
         Between(0)("total_timesteps", total_timesteps)
         return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)

@@ -23,10 +23,10 @@ def summed_squared_errors(state: SettledState, which: str = "all") -> th.Tensor:
 def instrumental_reward(normalized: np.ndarray, form: str = "penalty") -> np.ndarray:
     """What the prior's normalised errors are worth.
 
-    :param normalized: (n,) in [0, 1], 0 where the step was as demonstrated
+    :param normalized: any shape, in [0, 1], 0 where the step was as demonstrated
     :param form: "penalty", -r in [-1, 0] (the paper's equation; never positive, so that the shortest episode is the best where
         the task can end by falling), or "unit", 1 - r in [0, 1] (the paper's sentence below it; a step as demonstrated pays 1)
-    :return: (n,)
+    :return: of the same shape
     """
     return 1.0 - normalized if form == "unit" else -normalized
 
@@ -51,7 +51,7 @@ class Saturating:
     """r = r̂ / (r̂ + 1): no state, so the same transition keeps the same signal."""
 
     def __call__(self, raw: np.ndarray) -> np.ndarray:
-        """(n,) in [0, 1), of (n,) values r̂ >= 0."""
+        """In [0, 1), of values r̂ >= 0 of any shape."""
         return raw / (raw + 1.0)
 
     rescale = __call__

@@ -1,10 +1,10 @@
 """The room between demonstrations, and what clones imitate there.
 
 Where each episode begins and ends elsewhere, as an arm's and those with goals do, a clone has to guess what is done between
-them. So it also imitates steps *between* one that is shown and the nearest of other episodes, with the actions between theirs
-(mixup, Zhang et al. 2018, among neighbours), and noise of about a step's length around them. Noise alone, as wide as the room,
-fills it too, but blurs what the dimensions say of each other: where the gripper is, where the can is, and the way from one to
-the other.
+them. So it imitates steps *between* one that is shown and one of the nearest of other episodes, with the actions between
+theirs (mixup, Zhang et al. 2018, among neighbours), and noise of about a step's length around them. Noise alone, as wide as
+the room, fills it too, but blurs what the dimensions say of each other: where the gripper is, where the can is, and the way
+from one to the other.
 """
 
 from collections.abc import Callable
@@ -45,7 +45,7 @@ class Room:
             self.is_wide = len(ways) > 0 and float(ways.median()) > self.step
 
     def measure(self, part: Episodes) -> None:
-        """The neighbours of imitated steps, where they are not known."""
+        """Sets the neighbours of imitated steps where they are not known: (N, ``N_NEIGHBOURS``) rows, -1 for none."""
         if part.neighbours is None:
             every = -(-len(part) // MOST_SEARCHES)
             rows = np.arange(0, len(part), every)

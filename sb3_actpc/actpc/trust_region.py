@@ -29,13 +29,14 @@ class TrustRegion(nn.Module):
     The critic's pressure as the multiplier of a trust region, regulated as SAC regulates its temperature.
 
     The deviation is the mean squared difference of the learning actor's actions from the habit's, in units of the variance
-    that the demonstrated actions have around their clone, dimension by dimension. A state counts by what the critic says it is
+    that the demonstrated actions have around their clone, dimension by dimension (of 1, half of the actions' range, where the
+    clone guesses between the demonstrations). A state counts by what the critic says it is
     worth, from the batch's worst up: where all is lost nothing is imitated, and refresh alone lets the actor drift there. The
     multiplier grows slowly while the deviation is below the radius, and falls quickly while it is above. So a set of
     demonstrations that holds one action for a state allows little, one that holds many allows much; and the radius follows
     outcomes: it widens with candidates that hold their own, and shrinks with those that do not.
 
-    :param radius: at first
+    :param radius: at first, a mean squared distance in that unit
     :param n_actions: A
     :raises ValueError: for a radius outside ``RADII``, within which outcomes move it
     """

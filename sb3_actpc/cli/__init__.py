@@ -11,8 +11,9 @@ from sb3_actpc import __version__
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line, by default that of the process. The exit code is 0, or 2 for a mistake of the user's (one line on
-    stderr says which), or 130 when interrupted."""
+    """Run the command line, by default that of the process. The exit code is 0; 1 where runs failed or nothing is to be
+    reported; 2 for a mistake of the user's (one line on stderr says which); 75 where a run was stopped and can go on; 130 when
+    interrupted."""
     args = build_parser().parse_args(argv)
     try:
         return int(importlib.import_module(f"{__name__}.{args.command}").run(args))

@@ -13,7 +13,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
     parser = subparsers.add_parser(
         "train",
         help="train an agent on a sparse-reward task",
-        description="Train an agent; evaluate it on the dense task as it goes; write the model, CSV files and a plot.",
+        description="Train an agent; evaluate it as it goes; write the model, CSV files and a plot.",
     )
     task = parser.add_mutually_exclusive_group(required=True)
     task.add_argument("--env", help="Gymnasium id, such as SparseHalfCheetah-v5")

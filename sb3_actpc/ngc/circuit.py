@@ -220,6 +220,7 @@ class NGCCircuit(nn.Module):
         :param x: (B, n_inputs)
         :param memory: m_t, (B, n_memory), for a circuit with a working memory
         :return: (B, n_outputs)
+        :raises ValueError: when the memory is missing, not wanted or of the wrong size
         """
         biases = self.synapses.layer_biases(memory, self.memory_weight)
         for weights, bias in zip(self.synapses.weights[:-1], biases[:-1], strict=True):
@@ -236,6 +237,7 @@ class NGCCircuit(nn.Module):
         :param target: (B, n_outputs)
         :param memory: m_t, (B, n_memory), for a circuit with a working memory
         :return: latents, activations and errors of every layer
+        :raises ValueError: as :meth:`project`
         """
         chain = self.chain(x, memory)
         chain.clamp_output(target)
@@ -312,7 +314,8 @@ class NGCCircuit(nn.Module):
 
     def apply_changes(self, changes: HebbianChanges) -> None:
         """
-        Hand the changes to the circuit's ``optimizer``, bound the step it takes, and keep the settling rates stable.
+        Hand the changes to the circuit's ``optimizer``, which its owner has set (see :meth:`parameter_groups`), bound the step
+        it takes, and keep the settling rates stable.
 
         The one place where a change becomes minus a gradient.
         """
@@ -361,7 +364,14 @@ class NGCCircuit(nn.Module):
         return named
 
     def update_settling_rates(self, n_iterations: int = 1) -> None:
-        """Follow the spectral norms of the synapses by power iteration and set the rates that are stable for them."""
+        """
+        Follow the spectral norms of the synapses by power iteration and set the rates that are stable for them.
+
+        :param n_iterations: of each matrix's singular vector
+        :raises ValueError: for a circuit that does not move by such rates
+        """
+        if not self._keep_rates:
+            raise ValueError("rates follow synapses only with settling='iterative', dynamics='state', settling_rate='auto'")
         norms = th.stack([power_iteration_(m, getattr(self, name), n_iterations) for name, m in self._coupling_matrices()])
         forward = norms[: self.n_hidden].tolist()
         feedback = norms[self.n_hidden :].tolist() or [self.feedback_scale * norm for norm in forward]

@@ -58,7 +58,7 @@ class ChainSettings(NamedTuple):
 
 class SettlingChain:
     """
-    The live latents and errors of one circuit, advanced step by step without any allocation.
+    The live latents and errors of one circuit, advanced step by step; ``integrate`` and ``predict`` allocate nothing.
 
     ``dynamics="state"`` is eq. 1 of the paper to the letter. A step has two halves: :meth:`integrate` moves the hidden layers,
     all from the same instant; :meth:`predict` brings predictions and errors up to date. "krylov" goes where that rests in a

@@ -90,7 +90,7 @@ def soft_bound_(new: th.Tensor, old: th.Tensor, bound: float) -> None:
     Scale the step that led from ``old`` to ``new`` by M = (w_b - |W|) / w_b, so that no synapse passes ±w_b.
 
     (ago109/active-neural-generative-coding, ``src/model/ngc.py``, scales by w_b - |W|; divided by w_b here so that a small
-    synapse takes the step the optimiser chose.) ``new`` is overwritten.
+    synapse takes the step the optimiser chose.) ``new`` and ``old`` are of one shape; ``new`` is overwritten.
     """
     step = new - old
     step.mul_((1.0 - old.abs() / bound).clamp_(0.0, 1.0))

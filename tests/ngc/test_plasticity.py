@@ -177,6 +177,8 @@ def test_auto_rates_follow_the_spectral_norms():
         weights.mul_(10.0)
     circuit.update_settling_rates(20)
     assert (circuit.rates < 0.2 * before).all()
+    with pytest.raises(ValueError, match="only with settling='iterative', dynamics='state', settling_rate='auto'"):
+        NGCCircuit(8, 3, (32, 32)).update_settling_rates()
 
 
 def test_working_memory_changes_its_own_synapses_and_the_output():
