@@ -7,7 +7,8 @@
 The YAML file, named from the Markdown file's folder, says for each name what stands in the table:
 
     NAME:
-      from: first                    # folder of an export, beside the YAML file, or several: [first, second]
+      from: first                    # folder of an export, beside the YAML file, or several: [first, second]; or, by the
+                                     # task: {SparseReacher-v5: second, others: first}
       rows: {ActPC: actpc, demonstrators: demonstrators}
       columns: {Hopper: SparseHopper-v5, Reacher: {task: SparseReacher-v5, score: "{success_rate:.2f}"}}
       score: "{dense_return:.0f} ({sparse_return:.0f})"
@@ -99,7 +100,12 @@ def _table(spec: dict[str, Any], folder: Path) -> str:
 def _cell(spec: dict[str, Any], folder: Path) -> str:
     if unknown := sorted(set(spec) - _KEYS):
         raise ValueError(f"unknown {', '.join(unknown)}; known are {', '.join(sorted(_KEYS))}")
-    folders = spec["from"] if isinstance(spec["from"], list) else [spec["from"]]
+    source = spec["from"]
+    if isinstance(source, dict):
+        source = source.get(spec.get("task"), source.get("others", []))
+        if not source:
+            return ""
+    folders = source if isinstance(source, list) else [source]
     runs = exported = pd.concat(_runs(folder / name) for name in folders)
     for key in [key for key in _CHOOSING if key in spec]:
         if spec[key] not in (known := exported[key].unique()):

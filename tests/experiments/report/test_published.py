@@ -81,6 +81,16 @@ def test_a_row_can_come_from_several_exports(folder: Path) -> None:
     assert lines(folder, row)[2] == "| both | 100, 300, 800 x 3 | -4 x 1 |"
 
 
+def test_each_task_can_come_from_an_export_of_its_own(folder: Path) -> None:
+    """Runs of a task that was measured again; a task that is nowhere has an empty cell."""
+    write_run(folder / "more", seed=3, final=800.0)
+    export(folder / "more", folder / "later")
+    cell = "variant: actpc, cell: '{dense_return:each .0f} x {n:.0f}'"
+    for others, reacher in ((", others: kept", "-4 x 1"), ("", "")):
+        row = f"new: {{from: {{SparseHopper-v5: later{others}}}, {cell}}}"
+        assert lines(folder, row)[2] == f"| new | 800 x 1 | {reacher} |"
+
+
 def test_the_command_writes_what_has_changed(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = folder / "page.md"
     path.write_text(PAGE, encoding="utf-8")
