@@ -691,9 +691,8 @@ MUTANTS = [
         "self.deviation / self.radius - 1.0",
         REGIONS,
     ),
-    Mutant(
-        "clones that guess are sure", AGENT, "policy.spread, self.clones_guess", "policy.spread, False", f"{ROOMS} -k unless"
-    ),
+    Mutant("clones that guess are sure", AGENT, "spread, self.clones_guess", "spread, False", f"{ROOMS} -k unless"),
+    Mutant("twenty episodes say it all", TRIALS, "NOISY_RETURNS = 100, 2", "NOISY_RETURNS = 20, 2", f"{HABIT} -k unlucky"),
     Mutant("a small spread is as small a unit", REGION, "spread.clamp(SMALLEST_UNIT, 1.0)", "spread", REGIONS),
     Mutant("lost states count as well", REGION, "(squares * weights).mean()", "squares.mean() * weights.mean()", REGIONS),
     Mutant("pressure goes as slowly as it comes", REGION, "FALL * unused", "RISE * unused", REGIONS),

@@ -17,7 +17,8 @@ N_PROOFS = 2  # episodes of a candidate at least, before it is judged by less th
 # environment steps, or episodes however short: of a candidate before it is judged, and of the habit after one not accepted
 PROOF_STEPS, ENOUGH_PROOFS = 500, 10
 MOST_PROOF_STEPS = 2000  # that a candidate has for a proof
-KEPT_RETURNS, KEPT_NOISY_RETURNS = 20, 2  # of the habit, and of the learning actor
+# of the habit, which is frozen: with random goals the last twenty alone may all be unlucky; and of the learning actor
+KEPT_RETURNS, KEPT_NOISY_RETURNS = 100, 2
 # of what the imitated episodes were paid: a clone that is paid less by more is no good one, and no good beginning
 SHORTFALL, GREAT_SHORTFALL = 0.1, 0.5
 EARLY_CLONES = 2  # that are tried before anything is learned: where these do no better, it was not by chance

@@ -249,6 +249,21 @@ def test_of_short_episodes_a_candidate_may_play_as_many_as_it_takes():
         assert verdicts == [None] * (n_needed - 1) + ["accepted" if n_needed == 35 else "tied"]
 
 
+def test_an_unlucky_row_of_the_habits_episodes_is_no_candidates_chance():
+    """Returns of random goals: 80 episodes of 0 and 30 in turn, then 20 of 0 and 18. A candidate of 12 is worse than 13.8, the
+    mean of all, and would be better than the 9 of the last."""
+    trials = Trials(1)
+    for paid in [0.0, 30.0] * 40 + [0.0, 18.0] * 10:
+        assert [play(trials, one, 50, has_learned=False)[0] for one in (0.0, paid)] == ["actor", "habit"]
+    assert trials.habit_return == pytest.approx(13.8)
+    assert play(trials, 0.0, 50) == ("actor", None)
+    verdict = None
+    while verdict is None:
+        role, verdict = play_quiet(trials, 12.0, 50)
+        assert role == "candidate"
+    assert verdict == "rejected"
+
+
 def test_the_spread_of_the_habits_own_returns_counts_too():
     """Returns that jump between 0 and 200: two candidate's episodes of 150 are no proof."""
     trials = Trials(1)
