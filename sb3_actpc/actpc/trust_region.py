@@ -30,11 +30,11 @@ class TrustRegion(nn.Module):
 
     The deviation is the mean squared difference of the learning actor's actions from the habit's, in units of the variance
     that the demonstrated actions have around their clone, dimension by dimension (of 1, half of the actions' range, where the
-    clone guesses between the demonstrations). A state counts by what the critic says it is
-    worth, from the batch's worst up: where all is lost nothing is imitated, and refresh alone lets the actor drift there. The
-    multiplier grows slowly while the deviation is below the radius, and falls quickly while it is above. So a set of
-    demonstrations that holds one action for a state allows little, one that holds many allows much; and the radius follows
-    outcomes: it widens with candidates that hold their own, and shrinks with those that do not.
+    clone guesses between the demonstrations). A state counts by what the critic says it is worth, from the batch's worst up:
+    where all is lost nothing is imitated, and refresh alone lets the actor drift there. The multiplier grows slowly while the
+    deviation is below the radius, and falls quickly while it is above. So a set of demonstrations that holds one action for a
+    state allows little, one that holds many allows much; and the radius follows outcomes: it widens with candidates that hold
+    their own, and shrinks with those that do not.
 
     :param radius: at first, a mean squared distance in that unit
     :param n_actions: A
@@ -51,9 +51,7 @@ class TrustRegion(nn.Module):
         if not smallest <= radius <= largest:
             raise ValueError(f"trust_radius={radius!r} must be from {smallest:g} to {largest:g}, or 0 for a fixed pressure")
         super().__init__()
-        self.register_buffer(
-            "unit", th.ones(n_actions)
-        )  # (A,), standard deviations; 1, half of the range, where they are unknown
+        self.register_buffer("unit", th.ones(n_actions))  # standard deviations; half of the range while they are unknown
         self.register_buffer("radius", th.tensor(float(radius)))
         self.register_buffer("deviation", th.tensor(0.0))
         self.register_buffer("multiplier", th.tensor(0.0))

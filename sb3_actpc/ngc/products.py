@@ -4,7 +4,7 @@ import torch as th
 
 MATMUL_PRECISIONS = ("float32", "bfloat16")
 NARROWEST = 64  # a product with a side below this one costs less than turning its numbers into bfloat16
-TALL = 8  # rows of a sum of outer products for each of its columns, from which its transpose costs up to a quarter as much
+TALL = 8  # rows of a sum of outer products for each of its columns, from which its transpose costs less, a third at best
 
 
 def multiply(a: th.Tensor, b: th.Tensor, bfloat16: bool, out: th.Tensor | None = None) -> th.Tensor:
