@@ -293,6 +293,7 @@ class ActPC(OffPolicyAlgorithm):
         self.n_cloning_updates = 0
         self.cloning: Cloning | None = None  # while the actor becomes a clone
         self.trials: Trials | None = None
+        self._has_bar = False  # whether learning shows its progress
         if _init_setup_model:
             self._setup_model()
 
@@ -505,7 +506,8 @@ class ActPC(OffPolicyAlgorithm):
         self._warn_of_idle_settings()
         if self.verbose:
             print(self.describe())
-        self.pretrain(between_updates(result[1]), _shows_progress(result[1]))
+        self._has_bar = _shows_progress(result[1])
+        self.pretrain(between_updates(result[1]), self._has_bar)
         self.start_time = time.time_ns()  # of the frames per second: pre-training has none
         self._compiled = self._compiled or compiled_update(self, self._total_timesteps)  # resumed, as straight
         return result
@@ -767,7 +769,7 @@ class ActPC(OffPolicyAlgorithm):
             paid, imitated = self.trials.habit_return, self.trials.imitated_return
             print(f"another clone is tried: the habit is paid {paid:.4g}, what it imitates {imitated:.4g}")
         cloning = self._clone_into(self.policy.make_actor())
-        for update in range(len(cloning)):
+        for update in tqdm(range(len(cloning)), "another clone", disable=not self._has_bar, leave=False):
             cloning.update(update)
         _copy(cloning.clone, self.policy.candidate)
 

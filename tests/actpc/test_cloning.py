@@ -250,10 +250,13 @@ def test_settings_are_checked():
 
 
 @pytest.mark.parametrize("asked", ["argument", "callback", None])
-def test_a_progress_bar_shows_the_warm_start_too(asked, capsys):
-    bar = ProgressBarCallback()
-    imitating().learn(2, callback=bar if asked == "callback" else None, progress_bar=asked == "argument")
+def test_a_progress_bar_shows_the_clones_too(asked, capsys):
+    bar, model = ProgressBarCallback(), imitating()
+    model.learn(2, callback=bar if asked == "callback" else None, progress_bar=asked == "argument")
     assert ("pre-training" in capsys.readouterr().err) == (asked is not None)
+    model.trials.on_trial = model.trials.is_clone = True
+    model._make_candidate()
+    assert ("another clone" in capsys.readouterr().err) == (asked is not None)
 
 
 @pytest.mark.parametrize("steps", [-5, "abc", None, np.nan])
