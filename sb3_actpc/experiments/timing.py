@@ -151,9 +151,14 @@ def _products(circuit: NGCCircuit, batch: int, of_update: bool = False) -> Calla
 
 
 def training(device: str) -> list[Group]:
-    """Every task's learners, one update for each environment step, batch and layers alike; SBX's where ``sbx-rl`` is
-    installed."""
-    return [(_learners(task, device), {f"SB3 TD3, {task}": f"SB3 TD3's time for a step of {task}"}) for task in TASKS]
+    """Every task's learners, one update for each environment step, batch and layers alike (SBX's where ``sbx-rl`` is
+    installed); then TD3 and ActPC as each comes."""
+    groups: list[Group] = []
+    for task in TASKS:
+        groups.append((_learners(task, device), {f"SB3 TD3, {task}": f"SB3 TD3's time for a step of {task}"}))
+        own = f"SB3 TD3's own defaults, {task}"
+        groups.append((_learners_as_they_come(task, device, own), {own: f"their time for a step of {task}"}))
+    return groups
 
 
 def _learners(task: str, device: str) -> Entries:
@@ -171,6 +176,13 @@ def _learners(task: str, device: str) -> Entries:
 
         models[f"SBX TD3, {task}"] = sbx.TD3("MlpPolicy", task, **copy.deepcopy(TD3_SIZES), **same)
     return {name: _learner(model) for name, model in models.items()}
+
+
+def _learners_as_they_come(task: str, device: str, own: str) -> Entries:
+    shared: dict[str, Any] = {"learning_starts": 100, "buffer_size": 100 * N_FILLED, "seed": 0, "device": device}
+    shipped = {**preset(task, "actpc"), **QUICK, **shared}
+    ours: ActPC = ActPC(env=task, compile=False, **shipped)
+    return {own: _learner(TD3("MlpPolicy", task, **shared)), f"ActPC's own defaults, {task}": _learner(ours)}
 
 
 def _learner(model: OffPolicyAlgorithm, n_envs: int = 1) -> Callable[[], object]:
