@@ -10,7 +10,8 @@ DEVIATION_RATE = 0.02  # of the running deviation, per update
 # of the multiplier's logarithm, per update: while nothing of the radius is used, and while twice of it is. A critic that has
 # just begun points anywhere, so that pressure comes slowly and goes at once
 RISE, FALL = 0.003, 0.01
-MULTIPLIERS, FIRST_MULTIPLIER = (0.02, 200.0), 0.05
+# the largest lets refresh still be felt: beyond it nothing is gained, and what is not paid for (torque, speed) is lost
+MULTIPLIERS, FIRST_MULTIPLIER = (0.02, 3.0), 0.05
 RADII = 0.1, 1000.0  # below a third of a standard deviation nothing is learned
 # what a verdict about a candidate (:mod:`sb3_actpc.actpc.habit`) does to the radius
 RADIUS_FACTORS = {"accepted": 1.25, "tied": 2.0, "rejected": 0.7}
