@@ -696,7 +696,15 @@ MUTANTS = [
     Mutant("a small spread is as small a unit", REGION, "spread.clamp(SMALLEST_UNIT, 1.0)", "spread", REGIONS),
     Mutant("lost states count as well", REGION, "(squares * weights).mean()", "squares.mean() * weights.mean()", REGIONS),
     Mutant("pressure goes as slowly as it comes", REGION, "FALL * unused", "RISE * unused", REGIONS),
-    Mutant("the multiplier is let go", REGION, ".clamp_(*MULTIPLIERS)", "", REGIONS),
+    Mutant("the multiplier is let go", REGION, ".clamp_max_(self.largest)", "", REGIONS),
+    Mutant("the multiplier goes to nothing", REGION, ".clamp_min_(MULTIPLIERS[0])", "", REGIONS),
+    Mutant(
+        "where clones guess as much pressure",
+        REGION,
+        "LARGEST_UNHELD if guesses else MULTIPLIERS[1]",
+        "MULTIPLIERS[1]",
+        REGIONS,
+    ),
     Mutant("ties change nothing", REGION, '"tied": 2.0', '"tied": 1.0', REGIONS),
     Mutant("unpaid ties widen", AGENT, "verdict is not None and is_paid", "verdict is not None", f"{HABIT} -k resized"),
     Mutant(

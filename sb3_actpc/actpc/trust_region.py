@@ -10,8 +10,9 @@ DEVIATION_RATE = 0.02  # of the running deviation, per update
 # of the multiplier's logarithm, per update: while nothing of the radius is used, and while twice of it is. A critic that has
 # just begun points anywhere, so that pressure comes slowly and goes at once
 RISE, FALL = 0.003, 0.01
-# the largest lets refresh still be felt: beyond it nothing is gained, and what is not paid for (torque, speed) is lost
-MULTIPLIERS, FIRST_MULTIPLIER = (0.02, 3.0), 0.05
+MULTIPLIERS, FIRST_MULTIPLIER = (0.02, 200.0), 0.05
+# the largest where the unit is unknown: there the region is too wide to hold the actor, and refresh must still be felt
+LARGEST_UNHELD = 3.0
 RADII = 0.1, 1000.0  # below a third of a standard deviation nothing is learned
 # what a verdict about a candidate (:mod:`sb3_actpc.actpc.habit`) does to the radius
 RADIUS_FACTORS = {"accepted": 1.25, "tied": 2.0, "rejected": 0.7}
@@ -35,7 +36,8 @@ class TrustRegion(nn.Module):
     where all is lost nothing is imitated, and refresh alone lets the actor drift there. The multiplier grows slowly while the
     deviation is below the radius, and falls quickly while it is above. So a set of demonstrations that holds one action for a
     state allows little, one that holds many allows much; and the radius follows outcomes: it widens with candidates that hold
-    their own, and shrinks with those that do not.
+    their own, and shrinks with those that do not. Where the unit is unknown the multiplier has a bound of its own
+    (``LARGEST_UNHELD``).
 
     :param radius: at first, a mean squared distance in that unit
     :param n_actions: A
@@ -43,6 +45,7 @@ class TrustRegion(nn.Module):
     """
 
     unit: th.Tensor
+    largest: th.Tensor
     radius: th.Tensor
     deviation: th.Tensor
     multiplier: th.Tensor
@@ -53,6 +56,7 @@ class TrustRegion(nn.Module):
             raise ValueError(f"trust_radius={radius!r} must be from {smallest:g} to {largest:g}, or 0 for a fixed pressure")
         super().__init__()
         self.register_buffer("unit", th.ones(n_actions))  # standard deviations; half of the range while they are unknown
+        self.register_buffer("largest", th.tensor(LARGEST_UNHELD))  # multiplier
         self.register_buffer("radius", th.tensor(float(radius)))
         self.register_buffer("deviation", th.tensor(0.0))
         self.register_buffer("multiplier", th.tensor(0.0))
@@ -69,6 +73,7 @@ class TrustRegion(nn.Module):
         :param guesses: whether the clone has to guess between the demonstrations (:mod:`sb3_actpc.actpc.room`): how well it
             knows the steps that are shown then says nothing about the others, and the unit is unknown
         """
+        self.largest.fill_(LARGEST_UNHELD if guesses else MULTIPLIERS[1])
         self.unit.copy_(th.ones_like(spread) if guesses else spread.clamp(SMALLEST_UNIT, 1.0))
 
     def regulate(self, actions: th.Tensor, habit_actions: th.Tensor, values: th.Tensor) -> th.Tensor:
@@ -82,7 +87,8 @@ class TrustRegion(nn.Module):
         squares = ((actions - habit_actions) / self.unit).square().mean(1)
         self.deviation.lerp_((squares * weights).mean() / weights.mean(), DEVIATION_RATE)
         unused = (1.0 - self.deviation / self.radius).clamp_min(-1.0)
-        self.multiplier.mul_((RISE * unused.clamp_min(0.0) + FALL * unused.clamp_max(0.0)).exp()).clamp_(*MULTIPLIERS)
+        self.multiplier.mul_((RISE * unused.clamp_min(0.0) + FALL * unused.clamp_max(0.0)).exp())
+        self.multiplier.clamp_min_(MULTIPLIERS[0]).clamp_max_(self.largest)
         return self.multiplier.clone()
 
     def resize(self, verdict: str) -> None:

@@ -8,6 +8,7 @@ import torch as th
 from sb3_actpc.actpc.trust_region import (
     DEVIATION_RATE,
     FALL,
+    LARGEST_UNHELD,
     MULTIPLIERS,
     RADII,
     RISE,
@@ -88,14 +89,16 @@ def test_a_wider_radius_is_reached_by_an_actor_that_follows_the_pressure():
         assert float(region.multiplier) == pytest.approx(math.sqrt(radius), rel=0.01)
 
 
-def test_multiplier_and_radius_stay_within_bounds():
-    for verdict, actions, bound in (("tied", ZEROS, 1), ("rejected", ZEROS + 1e6, 0)):
-        region = TrustRegion(1, 2)
+@pytest.mark.parametrize(("guesses", "largest"), [(False, MULTIPLIERS[1]), (True, LARGEST_UNHELD)])
+def test_multiplier_and_radius_stay_within_bounds(guesses, largest):
+    """Where clones guess the region is too wide to hold the actor: the multiplier has a bound of its own."""
+    for verdict, actions, radius, multiplier in (("tied", ZEROS, 1, largest), ("rejected", ZEROS + 1e6, 0, MULTIPLIERS[0])):
+        region = measured_by([1.0, 1.0], guesses)
         for _ in range(3000):
             region.regulate(actions, ZEROS, WORTH)
             region.resize(verdict)
-        assert float(region.radius) == pytest.approx(RADII[bound])
-        assert float(region.multiplier) == pytest.approx(MULTIPLIERS[bound])
+        assert float(region.radius) == pytest.approx(RADII[radius])
+        assert float(region.multiplier) == pytest.approx(multiplier)
 
 
 def test_holding_its_own_widens_the_radius_and_losing_shrinks_it():
