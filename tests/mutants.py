@@ -696,6 +696,21 @@ MUTANTS = [
     Mutant("a small spread is as small a unit", REGION, "spread.clamp(SMALLEST_UNIT, 1.0)", "spread", REGIONS),
     Mutant("lost states count as well", REGION, "(squares * weights).mean()", "squares.mean() * weights.mean()", REGIONS),
     Mutant("pressure goes as slowly as it comes", REGION, "FALL * unused", "RISE * unused", REGIONS),
+    Mutant("normalised twice", AGENT, " and not is_normalised", "", "tests/actpc/test_agent.py -k normalises"),
+    Mutant(
+        "a failed compilation ends the run",
+        "actpc/compiled.py",
+        "if agent.compile is True:",
+        "if True:",
+        "tests/actpc/test_compiled.py -k fails",
+    ),
+    Mutant(
+        "an interrupted clone is on trial",
+        AGENT,
+        "self.trials, self._last_obs = self.trials.forgotten(self.n_envs), None",
+        "pass",
+        "tests/actpc/test_cloning.py -k interrupted",
+    ),
     Mutant("the multiplier is let go", REGION, ".clamp_max_(self.largest)", "", REGIONS),
     Mutant("the multiplier goes to nothing", REGION, ".clamp_min_(MULTIPLIERS[0])", "", REGIONS),
     Mutant(

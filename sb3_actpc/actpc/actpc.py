@@ -132,13 +132,14 @@ class ActPC(OffPolicyAlgorithm):
         as it was given; others can be set later (``agent.demonstrations = ...``), which a trained prior outlasts
     :param n_demonstrations: use only the first so many episodes of them
     :param n_demonstration_transitions: use only the first so many transitions (the paper's "300 samples")
-    :param prior_updates: updates of the prior on the demonstrations before learning starts; then it is frozen
+    :param prior_updates: updates of the prior on the demonstrations before learning starts, where ``alpha_in`` gives it a
+        role; then it is frozen
     :param actor_warm_start: updates on the demonstrations before learning starts, of the actor and of each member of the
         ensemble that teaches it (:mod:`sb3_actpc.actpc.cloning`); the learning rate falls meanwhile
     :param refresh_weight: weight of the actor's refresh from the demonstrations and its own good episodes
     :param refresh_kwargs: keywords of :class:`~sb3_actpc.actpc.self_imitation.Refresh`, for refresh and warm start:
         ``weighting`` (by "returns"; the paper's is "uniform"), ``own_episodes``, ``noise``, ``ensemble_size`` and ``n_clones``
-    :param demonstration_fraction: share of the critic's batch that comes from the demonstrations
+    :param demonstration_fraction: share of the batch, which all circuits share, that comes from the demonstrations
     :param alpha_ep: weight of the epistemic signal
     :param alpha_in: weight of the instrumental signal
     :param alpha_ext: weight of the task's reward (the paper's is 0 with demonstrations)
@@ -410,7 +411,9 @@ class ActPC(OffPolicyAlgorithm):
             return  # a trained agent acts without them; ``learn`` says what is missing
         assert isinstance(self.action_space, spaces.Box)
         self.expert = DemonstrationReplay(demonstrations, self.observation_space, self.action_space, self.memory_history)
-        if self.observation_normalization == "demonstrations" and not self.pretrained:
+        # VecNormalize's observations are normalised already, and it knows nothing yet of what it will make of these
+        is_normalised = self._vec_normalize_env is not None and self._vec_normalize_env.norm_obs
+        if self.observation_normalization == "demonstrations" and not self.pretrained and not is_normalised:
             self.actor.normalizer.begin()
             self.actor.normalizer.fit(self._features_of(self.expert.episodes, np.arange(len(self.expert))))
 
@@ -595,8 +598,8 @@ class ActPC(OffPolicyAlgorithm):
             return
         if self._vec_normalize_env is not None and self._vec_normalize_env.norm_obs:
             warnings.warn(
-                "VecNormalize's observation statistics drift under what is learned now: use VecNormalize(norm_obs=False) with "
-                "observation_normalization='demonstrations'",
+                "VecNormalize's observation statistics drift under what is learned now, and observation_normalization="
+                "'demonstrations' is not used: use VecNormalize(norm_obs=False) with it",
                 stacklevel=2,
             )
         if self.cloning is None and not self.pretrained:
@@ -769,8 +772,12 @@ class ActPC(OffPolicyAlgorithm):
             paid, imitated = self.trials.habit_return, self.trials.imitated_return
             print(f"another clone is tried: the habit is paid {paid:.4g}, what it imitates {imitated:.4g}")
         cloning = self._clone_into(self.policy.make_actor())
-        for update in tqdm(range(len(cloning)), "another clone", disable=not self._has_bar, leave=False):
-            cloning.update(update)
+        try:
+            for update in tqdm(range(len(cloning)), "another clone", disable=not self._has_bar, leave=False):
+                cloning.update(update)
+        except BaseException:  # Ctrl-C: nobody is on trial then, and every environment begins anew
+            self.trials, self._last_obs = self.trials.forgotten(self.n_envs), None
+            raise
         _copy(cloning.clone, self.policy.candidate)
 
     def _check_observations(self, observations: Any) -> None:
@@ -831,9 +838,7 @@ class ActPC(OffPolicyAlgorithm):
             batch = self._sample_batch(batch_size)  # line 17
             due = self._n_updates % self.policy_delay == 0
             parts = batch.first(n_actor) if due else None, batch.first(n_critic), batch.first(n_generator)
-            if self._compiled is not None and self._compiled.ready():
-                self._compiled(*parts)
-            else:
+            if self._compiled is None or not self._compiled.ready() or not self._compiled(*parts):
                 if parts[0] is not None:
                     self._update_actor(parts[0])  # lines 19 and 26
                 self._update_critic(parts[1])  # lines 21 and 22

@@ -13,6 +13,7 @@ from sb3_actpc.ngc import HebbianChanges, settle_coupled
 
 # compiling takes one to three minutes on a CPU, and saves a quarter of an update's products and calls
 ENOUGH_UPDATES = 200_000
+ASSUMED_LENGTH = 100  # of an episode, where none was shown
 
 
 class _Given(NamedTuple):
@@ -65,9 +66,11 @@ class CompiledUpdate:
         return "" if agent._imitated() else "nothing is imitated (no demonstrations=, and no paid episode of its own yet)"
 
     @th.no_grad()
-    def __call__(self, actor: Batch | None, critic: Batch, generator: Batch) -> None:
+    def __call__(self, actor: Batch | None, critic: Batch, generator: Batch) -> bool:
         """
         :param actor: the rows of the sampled batch that the actor learns from, None where it waits; the others likewise
+        :return: whether the update was made; where compiling fails and nobody asked for it ("auto") it is given up, with a
+            warning, and nothing has changed
         """
         agent = self.agent
         # drawn in the order of the eager update
@@ -76,8 +79,21 @@ class CompiledUpdate:
         circuits = [*agent.critic, *([agent.generator] if agent.alpha_ep else [])]
         if actor is not None:
             circuits.insert(0, agent.actor.circuit)
-        for circuit, changes in zip(circuits, self._changes(given), strict=True):
+        try:
+            found = self._changes(given)
+        except Exception as error:
+            if agent.compile is True:
+                raise
+            agent._compiled = None
+            warnings.warn(
+                f"updates run eagerly, as compiling them failed ({type(error).__name__}); compile=False does not try, and "
+                "compile=True shows the error",
+                stacklevel=2,
+            )
+            return False
+        for circuit, changes in zip(circuits, found, strict=True):
             circuit.apply_changes(HebbianChanges(*changes))
+        return True
 
     def _all_changes(self, given: _Given) -> list[tuple[list[th.Tensor], list[th.Tensor], list[th.Tensor]]]:
         agent, batch = self.agent, given.critic
@@ -126,12 +142,15 @@ def compiled_update(agent: Any, total_timesteps: int) -> CompiledUpdate | None:
 
 
 def updates_per_step(agent: Any) -> float:
-    """Updates for each transition collected; of episodes, whose length nobody knows beforehand, one."""
-    every = agent.train_freq
+    """Updates for each transition collected; episodes are taken to be as long as those that were shown."""
+    every, length = agent.train_freq, 1.0
     assert isinstance(every, TrainFreq)
-    if agent.gradient_steps < 0 or every.unit is TrainFrequencyUnit.EPISODE:
+    if agent.gradient_steps < 0:
         return 1.0
-    return agent.gradient_steps / (every.frequency * agent.n_envs)
+    if every.unit is TrainFrequencyUnit.EPISODE:
+        shown = None if agent.expert is None else agent.expert.demonstrations
+        length = ASSUMED_LENGTH if shown is None else len(shown.rewards) / shown.n_episodes
+    return agent.gradient_steps / (every.frequency * length * agent.n_envs)
 
 
 def _has_compiler() -> bool:

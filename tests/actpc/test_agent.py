@@ -636,6 +636,18 @@ def test_fewer_demonstrations_can_be_used():
     assert len(make(demonstrations=data, n_demonstration_transitions=7).expert) == 7
 
 
+@pytest.mark.parametrize(("norm_obs", "fitted"), [(True, False), (False, True)])
+def test_what_vec_normalize_normalises_is_not_normalised_again(norm_obs, fitted):
+    """It begins with a mean of 0: what the demonstrations look like to it then says nothing of later."""
+    env = VecNormalize(DummyVecEnv([CountingEnv]), norm_obs=norm_obs)
+    model = imitating(env)
+    assert model.observation_normalization == "demonstrations"
+    shown = demonstrations().observations
+    features = model._features_of(model.expert.episodes, np.arange(len(model.expert))).numpy()
+    assert np.allclose(features.mean(0), 0.0, atol=1e-4) == fitted
+    assert np.allclose(features, env.normalize_obs(shown), atol=1e-5) != fitted
+
+
 def test_observations_are_normalised_by_the_demonstrations_and_do_not_drift():
     data = demonstrations()
     model = make(demonstrations=data, observation_normalization="demonstrations")

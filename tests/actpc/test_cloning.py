@@ -168,6 +168,24 @@ def test_further_clones_are_made_as_the_first_was(monkeypatch):
     assert not differ(weights_of(made[1].clone), weights_of(model.policy.candidate))
 
 
+def test_an_interrupted_clone_leaves_nobody_on_trial(monkeypatch):
+    model = imitating()
+    model.learn(30)
+    model.trials.on_trial = model.trials.is_clone = True
+    model.trials.habit_returns, model.trials.n_clones = [1.0], 3
+
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Cloning, "update", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            model._make_candidate()
+    assert not model.trials.on_trial and model._last_obs is None
+    model.learn(30, reset_num_timesteps=False)
+    assert model.num_timesteps >= 60
+
+
 def test_batches_are_of_one_size(monkeypatch):
     seen, original = [], ActPC._sample_imitated
     monkeypatch.setattr(ActPC, "_sample_imitated", lambda self, n, noise=0.0: (seen.append(n), original(self, n, noise))[1])

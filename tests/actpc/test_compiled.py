@@ -1,5 +1,6 @@
 """The compiled update: the same numbers as the eager one, and only where it is earned."""
 
+import math
 import warnings
 
 import numpy as np
@@ -22,6 +23,7 @@ SWEEPING = {
     "scale_pressure": True,
     "actor_warm_start": 5,
 }
+LENGTH = len(demonstrations().rewards) / demonstrations().n_episodes
 LEARNED = {"feedback": "learned", "feedback_start": "mirrored", "weight_decay": 0.1}
 
 
@@ -73,13 +75,14 @@ def test_a_resumed_run_compiles_as_the_whole_run_would(monkeypatch):
         ({"gradient_steps": 4}, 4.0),
         ({"gradient_steps": 2, "train_freq": 4}, 0.5),
         ({"gradient_steps": -1, "train_freq": 4}, 1.0),
-        ({"gradient_steps": 100, "train_freq": (1, "episode")}, 1.0),
+        ({"gradient_steps": -1, "train_freq": (1, "episode")}, 1.0),
+        ({"gradient_steps": 3, "train_freq": (2, "episode")}, 1.5 / LENGTH),
         ({"gradient_steps": 1, "n_envs": 2}, 0.5),
     ],
 )
 def test_auto_counts_the_updates_that_a_run_will_make(keywords, per_step):
     model = agent(compile="auto", **keywords)
-    enough = int(ENOUGH_UPDATES / per_step)
+    enough = math.ceil(ENOUGH_UPDATES / per_step)
     assert compiled_update(model, enough - 1) is None and compiled_update(model, enough) is not None
 
 
@@ -109,6 +112,24 @@ def test_without_a_compiler_updates_stay_eager(monkeypatch):
     model.set_logger(configure(None, []))
     monkeypatch.setattr(model.logger, "info", said.append)
     assert compiled_update(model, 1) is None and len(said) == 1 and "no C++ compiler" in said[0]
+
+
+def test_where_compiling_fails_auto_goes_on_eagerly_and_an_order_raises(monkeypatch):
+    def failing(self, given):
+        raise RuntimeError("no Python.h")
+
+    monkeypatch.setattr(CompiledUpdate, "_all_changes", failing)
+    monkeypatch.setattr(compiled_module.th, "compile", lambda function, **_: function)
+    monkeypatch.setattr(compiled_module, "ENOUGH_UPDATES", 1)
+    with pytest.raises(RuntimeError, match=r"Python\.h"):
+        agent(compile=True).learn(60)
+    model = agent(compile="auto")
+    with pytest.warns(UserWarning, match=r"compiling them failed \(RuntimeError\)") as said:
+        model.learn(60)
+    assert len([one for one in said if "compiling" in str(one.message)]) == 1
+    eager = agent(compile=False)
+    eager.learn(60)
+    assert model._compiled is None and model._n_updates == eager._n_updates
 
 
 def test_iterative_circuits_are_not_compiled():
