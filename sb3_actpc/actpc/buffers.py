@@ -62,7 +62,8 @@ class SignalReplaySamples(NamedTuple):
 class SignalReplay(ReplayBuffer):
     """What all ActPC buffers add to SB3's; combine it with one of them.
 
-    * Combined experience replay (Zhang & Sutton, 2017): the newest transition of every environment is always in the batch.
+    * Combined experience replay (Zhang & Sutton, 2017): the newest transition of every environment is always in the batch,
+      as far as its replayed rows go round.
     * The epistemic and the instrumental signal of every transition, stored apart from the task's reward.
     * Self-imitation: when an episode ends and is good enough, its rows are copied into a
       :class:`~sb3_actpc.actpc.self_imitation.SelfImitationMemory`.

@@ -12,7 +12,8 @@ from sb3_actpc.actpc.self_imitation import Observations, TensorObservations, map
 
 
 class Batch(NamedTuple):
-    """Transitions as the circuits see them, B rows, the newest first, demonstrations (if mixed in) last.
+    """Transitions as the circuits see them, B rows, the newest first, demonstrations (if mixed in) last; where circuits
+    have batches of different sizes, all but the newest in any order.
 
     :param features: normalised observations, (B, n_features)
     :param actions: (B, A), in [-1, 1]

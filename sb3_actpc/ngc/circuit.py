@@ -51,10 +51,10 @@ class NGCCircuit(nn.Module):
     :param feedback_start: how learned error synapses begin: "independent" of W (the paper; they take many thousand updates to
         align with W^T, and do so wholly only with a ``weight_decay``) or "mirrored": see :meth:`mirror_feedback`
     :param feedback_rate: γ_e, learning rate of E over that of W (the paper: below 1). At 1 both take the same steps, from any
-        optimiser that works element by element, so that the gap E - W^T never grows
+        optimiser that works element by element, so that without ``synaptic_scaling`` the gap E - W^T never grows
     :param derivative_free: leave out φ' in the state update (appendix)
-    :param synaptic_scaling: "none", "soft_bound" (no synapse passes ±``weight_bound``) or "column_norm" (no column of W or E
-        has a norm above ``weight_bound``); acts on the step after the optimiser
+    :param synaptic_scaling: "none", "soft_bound" (no synapse passes ±``weight_bound``) or "column_norm" (no column of W,
+        and none of E^T, has a norm above ``weight_bound``); acts on the step after the optimiser
     :param weight_bound: the bound of ``synaptic_scaling``
     :param weight_decay: λ: before every change W, M and E shrink by 1 - ηλ (η the learning rate, as in AdamW); biases do not.
         E and W^T get changes in the same direction, so that what they were born with is what parts them; the decay forgets
