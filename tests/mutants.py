@@ -827,6 +827,13 @@ MUTANTS = [
         f"{STORES} -k newest",
     ),
     Mutant(
+        "of many environments the same ones are always the newest",
+        BUFFERS,
+        "newest = np.random.permutation(self.n_envs)[: len(newest)]",
+        "newest = np.arange(len(newest))",
+        f"{STORES} -k newest",
+    ),
+    Mutant(
         "the memory reaches into the episode before",
         BUFFERS,
         "(self.dones[earlier, envs[:, None]] == 0)",

@@ -117,8 +117,8 @@ class ActPC(OffPolicyAlgorithm):
     :param action_noise: SB3's exploration noise, in the place of ``exploration_noise``
     :param replay_buffer_class: None, or one of SB3's classes or its name (its ActPC counterpart is used)
     :param replay_buffer_kwargs: keywords of the buffer: ``combined`` (True: the newest transition of every environment is in
-        every batch) and ``self_imitation_size`` (transitions in the memory of the agent's own good episodes: 100,000, or
-        ``buffer_size`` where that is less; 0 for none), and those of SB3's class
+        every batch, half of which these are at most) and ``self_imitation_size`` (transitions in the memory of the agent's
+        own good episodes: 100,000, or ``buffer_size`` where that is less; 0 for none), and those of SB3's class
     :param optimize_memory_usage: as in SB3; not with a generator (``alpha_ep``), which learns where every step led
     :param n_steps: length of n-step returns; 1 by default where they cannot be had (hindsight, ``optimize_memory_usage``)
         or mean nothing (``bootstrap="literal"``)
@@ -885,7 +885,7 @@ class ActPC(OffPolicyAlgorithm):
         if min(sizes) == largest:
             return batch
         # circuits with a smaller batch take its first rows: the newest, then a fair mixture of the rest
-        return batch.shuffled(keep=self.n_envs if self.replay_buffer.combined else 0)
+        return batch.shuffled(keep=self.replay_buffer.n_newest(largest - n_expert))
 
     def _update_actor(self, batch: Batch) -> None:
         """Motor-action circuit: pressure of the critic (line 19) plus refresh (line 26), in one step of the optimiser."""

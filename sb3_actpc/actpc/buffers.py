@@ -62,8 +62,8 @@ class SignalReplaySamples(NamedTuple):
 class SignalReplay(ReplayBuffer):
     """What all ActPC buffers add to SB3's; combine it with one of them.
 
-    * Combined experience replay (Zhang & Sutton, 2017): the newest transition of every environment is always in the batch,
-      as far as its replayed rows go round.
+    * Combined experience replay (Zhang & Sutton, 2017): the newest transition of every environment is always in the batch;
+      where these would be more than half of its rows, of so many environments drawn anew.
     * The epistemic and the instrumental signal of every transition, stored apart from the task's reward.
     * Self-imitation: when an episode ends and is good enough, its rows are copied into a
       :class:`~sb3_actpc.actpc.self_imitation.SelfImitationMemory`.
@@ -175,6 +175,10 @@ class SignalReplay(ReplayBuffer):
 
     # ------------------------------------------------------------------ sampling
 
+    def n_newest(self, batch_size: int) -> int:
+        """How many of ``batch_size`` sampled transitions are those of the last step."""
+        return min(self.n_envs, -(-batch_size // 2)) if self.combined else 0
+
     def sample(  # type: ignore[override]
         self, batch_size: int, env: VecNormalize | None = None, rewards_of: tuple[Normalize, Normalize] | None = STORED
     ) -> SignalReplaySamples:
@@ -182,9 +186,11 @@ class SignalReplay(ReplayBuffer):
         :param env: VecNormalize whose statistics normalise observations and the task's rewards
         :param rewards_of: what stored epistemic and instrumental signals pay, element by element; themselves by default. None
             where nobody asks: the signals are 0, and with n-step returns nothing is gathered one step on
-        :return: B transitions; with ``combined``, those of the last step (of every environment) come first
+        :return: B transitions; with ``combined``, ``n_newest`` of the last step come first
         """
-        newest = np.arange(min(self.n_envs if self.combined else 0, batch_size))
+        newest = np.arange(self.n_newest(batch_size))
+        if len(newest) < self.n_envs and len(newest):
+            newest = np.random.permutation(self.n_envs)[: len(newest)]
         rows, envs = self._draw(batch_size - len(newest))
         rows = np.concatenate([np.full(len(newest), self.newest), rows])
         envs = np.concatenate([newest, envs])

@@ -36,6 +36,19 @@ def test_every_batch_holds_the_newest_transition_of_every_environment(n_envs, st
         assert len(batch.observations) == 8
 
 
+def test_of_many_environments_the_newest_are_half_of_a_batch_and_all_have_their_turn():
+    n_envs, steps = 12, 40
+    buffer = CombinedReplayBuffer(50 * n_envs, *SPACES, n_envs=n_envs, device="cpu")
+    fill(buffer, steps, n_envs)
+    assert [buffer.n_newest(size) for size in (1, 8, 24, 100)] == [1, 4, 12, 12]
+    seen = [buffer.sample(8).observations.numpy() for _ in range(100)]
+    newest = np.concatenate([batch[:4] for batch in seen])
+    assert np.allclose(newest[:, 0] - newest[:, 1], 0.0) and newest.min() > steps - 1 - 1e-6
+    assert len(np.unique(newest[:, 0].round(1))) == n_envs
+    assert all(len(np.unique(batch[:4, 0].round(2))) == 4 for batch in seen)  # no environment twice
+    assert np.mean([(batch[4:, 0] < steps - 1).mean() for batch in seen]) > 0.9
+
+
 def test_without_combined_replay_the_newest_is_not_singled_out():
     buffer = CombinedReplayBuffer(1000, *SPACES, combined=False, device="cpu")
     fill(buffer, 1000, 1)
