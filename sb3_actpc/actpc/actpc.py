@@ -1013,9 +1013,10 @@ class ActPC(OffPolicyAlgorithm):
 
     @property
     def clone_noise(self) -> float:
-        """Noise on what clones imitate: as asked for, or by default 1 where the demonstrations leave room and 0 where not."""
+        """Noise on what clones imitate: as asked for, or by default 1 where the demonstrations leave room and 0 where not; 0
+        with a single demonstration, which has no neighbours."""
         if self.expert is not None and self.refresh.noise is not None:
-            return self.refresh.noise
+            return self.refresh.noise if self.expert.demonstrations.n_episodes > 1 else 0.0
         return float(self.clones_guess)
 
     def _features_of(self, episodes: Episodes, rows: np.ndarray) -> th.Tensor:

@@ -32,9 +32,9 @@ class Refresh:
     :param noise: clones imitate steps between those that are shown and the nearest of other episodes, with Gaussian noise of
         this standard deviation on the features (normalised observations), in units of a step's length
         (:mod:`sb3_actpc.actpc.room`); not on the working memory's, nor on what the learning actor is refreshed with, which
-        has to become precise. 0 for neither (the paper); None for 1 where the demonstrations leave room (the nearest step of
-        another one is farther than a step leads, by the medians: arms and goals, 2 to 8 times; gaits, 0.03 to 0.7, where
-        this only blurs what to do), else 0
+        has to become precise. 0 for neither (the paper; so it is with a single demonstration); None for 1 where the
+        demonstrations leave room (the nearest step of another one is farther than a step leads, by the medians: arms and
+        goals, 2 to 8 times; gaits, 0.03 to 0.7, where this only blurs what to do), else 0
     :param own_episodes: which of them are imitated too: "paid" (every one, as often as its return says; "best" where steps are
         not drawn by returns, or nothing is demonstrated) or "best" (those that are paid at least what the best one was: the
         paper)

@@ -122,6 +122,8 @@ def test_one_episode_or_episodes_of_one_step_leave_no_room(lengths):
     data = demonstrations(n_episodes=len(lengths), length=lengths[0])
     assert make(demonstrations=data).clone_noise == 0.0
     assert not make().clone_noise
+    asked_for = make(demonstrations=data, refresh_kwargs={"noise": 0.3})
+    assert asked_for.clone_noise == (0.3 if len(lengths) > 1 else 0.0)
 
 
 def test_neighbours_in_long_sets_are_some_of_their_steps(monkeypatch):
