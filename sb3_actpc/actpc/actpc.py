@@ -226,7 +226,7 @@ class ActPC(OffPolicyAlgorithm):
         target_update_interval: Annotated[int, Between(1)] = 1,
         observation_normalization: Literal["none", "demonstrations", "bounds"] | None = None,
         compile: Annotated[bool | str, check_compile] = "auto",
-        policy_kwargs: Annotated[Settings | None, check_policy_kwargs] = None,
+        policy_kwargs: Settings | None = None,
         stats_window_size: Size = 100,
         tensorboard_log: str | None = None,
         verbose: int = 0,
@@ -330,6 +330,7 @@ class ActPC(OffPolicyAlgorithm):
         self._compiled: CompiledUpdate | None = None
 
     def _make_policy(self) -> ActPCPolicy:
+        check_policy_kwargs(self.policy_class, self.policy_kwargs)
         given = self.policy_kwargs.get("circuit_kwargs") or {}
         check_kind("circuit_kwargs", given, Settings | None)
         chosen = given.get("settling", self.settling)

@@ -3,7 +3,7 @@
 import copy
 import inspect
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Annotated, Any
 
 import numpy as np
@@ -30,7 +30,7 @@ from sb3_actpc.actpc.arguments import (
 from sb3_actpc.actpc.trust_region import TrustRegion
 from sb3_actpc.ngc import NGCCircuit, WorkingMemory, check_agreement
 from sb3_actpc.ngc.activations import ACTIVATIONS
-from sb3_actpc.utils.checks import LARGEST_SIZE, Settings, check_kind, named_in_errors
+from sb3_actpc.utils.checks import LARGEST_SIZE, Settings, named_in_errors
 
 # what circuit_kwargs, actor_kwargs and so on may set; sizes follow from the task
 _SIZES = {"self", "n_inputs", "n_outputs", "hidden", "output_activation", "n_memory", "n_feedback_inputs"}
@@ -488,19 +488,21 @@ def check_policy(name: str, policy: Any) -> None:
         raise ValueError(f"{name}={policy!r} must be one of {list(POLICIES)}, or a subclass of {ActPCPolicy.__name__}")
 
 
-def check_policy_kwargs(name: str, given: Any) -> None:
-    """:raises ValueError: naming the keywords that no policy has; the policy checks the values"""
-    check_kind(name, given, Settings | None)
-    known = set(inspect.signature(ActPCPolicy.__init__).parameters)
-    known -= {"self", "observation_space", "action_space", "lr_schedule"}
-    unknown = sorted(set(given or {}) - known)
+def check_policy_kwargs(policy_class: type[BasePolicy], given: Mapping[str, Any]) -> None:
+    """:raises ValueError: naming the keywords that the class has not, nor one that it is made from; the policy checks the
+    values"""
+    classes = [kind for kind in policy_class.__mro__ if issubclass(kind, ActPCPolicy)]
+    parameters = [parameter for kind in classes for parameter in inspect.signature(kind).parameters.values()]
+    known = {one.name for one in parameters if one.kind not in (one.VAR_POSITIONAL, one.VAR_KEYWORD)}
+    known -= {"observation_space", "action_space", "lr_schedule"}
+    unknown = sorted(set(given) - known)
     if "activation_fn" in unknown:
         raise ValueError(
-            f"{name} has activation_fn={given['activation_fn']!r}: activations are chosen by name, with "
+            f"policy_kwargs has activation_fn={given['activation_fn']!r}: activations are chosen by name, with "
             f"policy_kwargs=dict(circuit_kwargs=dict(activation=...)), one of {sorted(ACTIVATIONS)}"
         )
     if unknown:
-        raise ValueError(f"{name} has unknown keys {unknown}; choose from {sorted(known)}")
+        raise ValueError(f"policy_kwargs has unknown keys {unknown}; choose from {sorted(known)}")
 
 
 MlpPolicy = ActPCPolicy

@@ -884,6 +884,21 @@ def test_a_wrong_keyword_is_named(keywords, named):
         make(**keywords)
 
 
+class TiredPolicy(MlpPolicy):
+    def __init__(self, *args, tiredness=0.0, **kwargs):
+        super().__init__(*args, **kwargs)
+        self.tiredness = tiredness
+
+
+def test_a_policy_may_have_keywords_of_its_own():
+    model = ActPC(TiredPolicy, "Pendulum-v1", policy_kwargs={"tiredness": 0.5, "net_arch": [8]})
+    assert model.policy.tiredness == 0.5 and model.actor.circuit.n_hidden == 1
+    with pytest.raises(ValueError, match=r"unknown keys \['sleepiness'\]; choose from .*'tiredness'"):
+        ActPC(TiredPolicy, "Pendulum-v1", policy_kwargs={"sleepiness": 0.5})
+    with pytest.raises(ValueError, match=r"unknown keys \['tiredness'\]"):
+        ActPC("MlpPolicy", "Pendulum-v1", policy_kwargs={"tiredness": 0.5})
+
+
 def test_a_generator_is_refused_a_buffer_that_forgets_how_episodes_end(tmp_path):
     """With ``optimize_memory_usage`` an episode's last observation is overwritten by the next one's first."""
     small = {"optimize_memory_usage": True, "replay_buffer_kwargs": {"handle_timeout_termination": False}}
