@@ -599,7 +599,7 @@ MUTANTS = [
         f"{HABIT} -k another_habit",
     ),
     Mutant("own episodes keep old neighbours", AGENT, "memory.episodes.neighbours = None", "pass", f"{HABIT} -k anew"),
-    Mutant("a given noise is not heeded", AGENT, "return self.refresh.noise if", "return 1.0 if", f"{ROOMS} -k without_a_word"),
+    Mutant("a given noise is ignored", AGENT, "return self.refresh.noise if", "return 1.0 if", f"{ROOMS} -k without_a_word"),
     Mutant("clones imitate without noise", AGENT, "_imitated(n, self.clone_noise)", "_imitated(n)", f"{HABIT} -k noise"),
     Mutant(
         "the learning actor is blurred", AGENT, "n: int, noise: float = 0.0) -> t", "n: int, noise: float = 0.5) -> t", HABIT
