@@ -54,7 +54,9 @@ class Trials:
     other. A gain must pass a share of the habit's absolute mean return and ``SURE`` of its own standard errors, from the
     variance that candidate and habit have in common, and a loss that share and ``LIKELY``. In between the candidate plays on,
     unless it surely is neither; when it has had its steps, the share is enough of a loss, and ``LIKELY`` of a gain. A learner
-    that is paid less than the habit where it plays with noise has twice the steps: two good episodes may be luck. After a
+    that is paid less than the habit where it plays with noise has twice the steps: two good episodes may be luck. And a
+    gain must be worth what has not been seen: a candidate that has played less often than the habit has had fewer occasions
+    to fall, and plays on until it has had as many, or ``ENOUGH_PROOFS``, if it gains no more than that risk. After a
     candidate that did not prove itself the habit plays again: what made it the habit was partly luck.
 
     Clones of the same demonstrations can do very differently, by their first synapses alone. So while the habit is paid less
@@ -222,9 +224,15 @@ class Trials:
         if gain < -max(smallest, LIKELY * error if has_time else 0.0):
             return "rejected"
         if gain > 0.0 and gain >= max(smallest, (SURE if has_time else LIKELY) * error):
-            return "accepted"
+            return "accepted" if gain >= self._unseen_risk() * unit else None
         is_open = has_time and abs(gain) + SURE * error > smallest
         return None if is_open else "tied"
+
+    def _unseen_risk(self) -> float:
+        """By how much more likely the candidate's next episode is a first fall than the habit's, by the rule of succession:
+        after n episodes without one that is 1 / (n + 2) (Laplace)."""
+        n_habit = min(len(self.habit_returns), ENOUGH_PROOFS)
+        return max(1.0 / (len(self.candidate_returns) + 2) - 1.0 / (n_habit + 2), 0.0)
 
     def _conclude(self, verdict: Verdict) -> None:
         """The candidate is judged: what is counted begins anew."""
