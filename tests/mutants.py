@@ -819,6 +819,23 @@ MUTANTS = [
         EQUATIONS,
     ),
     Mutant(
+        "unseen falls count for nothing", TRIALS, "if gain >= self._unseen_risk() * unit else None", "", f"{HABIT} -k occasion"
+    ),
+    Mutant(
+        "the habit's occasions are counted without end",
+        TRIALS,
+        "n_habit = min(len(self.habit_returns), ENOUGH_PROOFS)",
+        "n_habit = len(self.habit_returns)",
+        f"{HABIT} -k occasion",
+    ),
+    Mutant(
+        "the habit has had no occasions",
+        TRIALS,
+        "- 1.0 / (n_habit + 2), 0.0)",
+        "- 0.0 * n_habit, 0.0)",
+        f"{HABIT} -k occasion",
+    ),
+    Mutant(
         "a policy of one's own has no keywords of its own",
         POLICIES,
         "for kind in policy_class.__mro__ if",

@@ -126,6 +126,30 @@ def test_as_many_steps_go_without_noise_as_the_noisy_episode_before_them_had(noi
     assert [second == "actor" for _, second in roles] == [False, True, False, True]
 
 
+@pytest.mark.parametrize(
+    ("n_habit", "gain", "n"),
+    [
+        (2, 0.02, 2),  # it has played as often
+        (4, 0.02, 4),  # 1/5 - 1/6 after three, nothing after four
+        (4, 0.04, 3),
+        (4, 0.08, 3),  # 1/4 - 1/6 after two
+        (4, 0.09, 2),
+        (50, 0.011, 9),  # more than ``ENOUGH_PROOFS`` occasions count for no more
+        (50, 0.2, 2),
+    ],
+)
+def test_a_gain_is_worth_the_falls_that_a_candidate_has_had_no_occasion_for(n_habit, gain, n):
+    """By the rule of succession: after n episodes without a fall the next one is one with probability 1 / (n + 2)."""
+    trials = Trials(1, habit_returns=[100.0] * n_habit, tests_habit=False)
+    verdicts = [play_quiet(trials, 100.0 * (1.0 + gain), 1000)[1] for _ in range(n)]
+    assert verdicts == [None] * (n - 1) + ["accepted"]
+
+
+def test_a_fall_on_the_way_to_so_many_episodes_ends_the_trial():
+    trials = Trials(1, habit_returns=[100.0] * 6, tests_habit=False)
+    assert [play_quiet(trials, paid, 1000)[1] for paid in (102.0, 102.0, 40.0)] == [None, None, "rejected"]
+
+
 def test_before_anything_is_learned_the_quiet_episodes_are_the_habits():
     trials = Trials(1)
     roles = [play(trials, float(paid), has_learned=False)[0] for paid in range(2 * KEPT_RETURNS + 4)]
