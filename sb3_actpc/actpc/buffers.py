@@ -189,7 +189,7 @@ class SignalReplay(ReplayBuffer):
         :return: B transitions; with ``combined``, ``n_newest`` of the last step come first
         """
         newest = np.arange(self.n_newest(batch_size))
-        if len(newest) < self.n_envs and len(newest):
+        if 0 < len(newest) < self.n_envs:
             newest = np.random.permutation(self.n_envs)[: len(newest)]
         rows, envs = self._draw(batch_size - len(newest))
         rows = np.concatenate([np.full(len(newest), self.newest), rows])
