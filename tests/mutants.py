@@ -90,6 +90,20 @@ MUTANTS = [
         "scale = 1.0",
         f"{LEARNING} -k gamma_e",
     ),
+    Mutant(
+        "a graph's rates are constants",
+        CIRCUIT,
+        "rates.unbind() if th.compiler.is_compiling() else rates.tolist()",
+        "rates.tolist()",
+        "tests/actpc/test_compiled.py -k in_a_graph_rates",
+    ),
+    Mutant(
+        "a tensor's rate is left out",
+        "ngc/dynamics.py",
+        "signal.sub_(error).mul_(rate)",
+        "signal.sub_(error)",
+        "tests/actpc/test_compiled.py -k in_a_graph_rates",
+    ),
     Mutant("biases decay", CIRCUIT, "if parameter.dim() > 1]", "if parameter.dim() > 0]", f"{LEARNING} -k spares_the_biases"),
     Mutant(
         "one step of settling too many",

@@ -156,7 +156,7 @@ class ActPC(OffPolicyAlgorithm):
         as in DQN are ``tau=1, target_update_interval=C``
     :param observation_normalization: "none" (the paper), "demonstrations" (their mean and standard deviation, fixed) or
         "bounds" (those of the observation space, which must be finite, become -1 and 1)
-    :param compile: run the updates of sweeping circuits as one graph of ``torch.compile`` (see
+    :param compile: run the updates of circuits that sweep, or settle by eq. 1, as one graph of ``torch.compile`` (see
         :mod:`~sb3_actpc.actpc.compiled`): True, False or "auto", where the run is long enough to earn it
     :param policy_kwargs: keywords of :class:`~sb3_actpc.actpc.policies.ActPCPolicy`: ``net_arch``, ``n_critics``, ``habit``,
         ``trust_radius``, ``nudge``, ``memory_history`` (the working memory), ``circuit_kwargs`` (of every

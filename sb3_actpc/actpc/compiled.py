@@ -28,7 +28,8 @@ class _Given(NamedTuple):
 
 class CompiledUpdate:
     """
-    The update of an agent whose circuits all sweep (``settling="scheduled"``), compiled by ``torch.compile``.
+    The update of an agent whose circuits all sweep (``settling="scheduled"``) or settle by eq. 1 (``dynamics="state"``),
+    compiled by ``torch.compile``.
 
     No circuit reads in an update what another has just changed, so that all changes come from one graph; the optimisers'
     steps, decay, bounds and the targets' move stay as they are. Equal to the eager update but for rounding.
@@ -129,11 +130,14 @@ def compiled_update(agent: Any, total_timesteps: int) -> CompiledUpdate | None:
     :param total_timesteps: of the run: "auto" compiles from ``ENOUGH_UPDATES`` updates on
     :raises ValueError: when it is asked for (True) of circuits that do not sweep
     """
-    sweeps = all(circuit.settling == "scheduled" for _, circuit in agent.policy.named_circuits())
-    if agent.compile is True and not sweeps:
-        raise ValueError("compile=True needs settling='scheduled': steps that stop at a tolerance are no fixed graph")
+    is_fixed = all(circuit.has_fixed_steps for _, circuit in agent.policy.named_circuits())
+    if agent.compile is True and not is_fixed:
+        raise ValueError(
+            "compile=True needs settling='scheduled', or circuit_kwargs=dict(dynamics='state'): steps that stop at a "
+            "tolerance are no fixed graph"
+        )
     earned = agent.compile == "auto" and total_timesteps * updates_per_step(agent) >= ENOUGH_UPDATES
-    if not sweeps or not (earned or agent.compile is True):
+    if not is_fixed or not (earned or agent.compile is True):
         return None
     if agent.device.type == "cpu" and not _has_compiler():
         agent.logger.info("compile: no C++ compiler here, updates run eagerly")

@@ -42,7 +42,7 @@ def run(args: argparse.Namespace) -> int:
         return 0
     groups = [timing.updates(args.device, args.compiled), timing.settling(args.device)]
     if args.training:
-        groups += [*timing.training(args.device), timing.acting()]
+        groups += [*timing.training(args.device, args.compiled), timing.acting()]
     if args.growth:
         groups += timing.growth()
     ratios = timing.measure(groups, args.rounds, args.device)

@@ -35,6 +35,7 @@ N_STEPS = 50  # environment steps of one measurement of training
 N_ENV_STEPS = 20  # of one measurement of robosuite
 N_WARM_UP = 3  # rounds that do not count
 SWEEP = {"feedback": "learned", "feedback_start": "mirrored"}
+BFLOAT16 = {"policy_kwargs.circuit_kwargs.matmul_precision": "bfloat16"}
 QUICK = {"prior_updates": 1, "actor_warm_start": 0, "critic_warmup": 0}
 TD3_SIZES: dict[str, Any] = {"policy_kwargs": {"net_arch": [WIDTH, WIDTH]}, "batch_size": BATCH_SIZE}
 
@@ -88,14 +89,14 @@ def table(files: list[Path]) -> str:
 
 
 def updates(device: str, compiled: bool) -> Group:
-    """TD3's; the bare agent's and the shipped one's with every kind of settling, the paper's preset, and both presets with
+    """TD3's; the bare agent's and the shipped one's with every kind of settling, the paper's preset, and all three with
     products in bfloat16 where the processor has them."""
     kinds: dict[str, tuple[str, dict[str, Any]]] = {
         "tied sweep": ("scheduled", {"feedback": "tied"}),
         "learned sweep": ("scheduled", SWEEP),
         "iterative, default tolerance": ("iterative", SWEEP),
     }
-    shipped, paper = "shipped, learned sweep", "paper preset"
+    bare, shipped, paper = "bare, learned sweep", "shipped, learned sweep", "paper preset"
     settings = {
         f"{name}, {kind}": with_changes(keywords, {"settling": settling, "policy_kwargs.circuit_kwargs": circuits})
         for name, keywords in {"bare": {}, "shipped": preset(TASK, "actpc")}.items()
@@ -103,10 +104,10 @@ def updates(device: str, compiled: bool) -> Group:
     }
     settings[paper] = preset(TASK, "actpc_paper")
     if has_bfloat16():
-        low = {"policy_kwargs.circuit_kwargs.matmul_precision": "bfloat16"}
-        settings |= {f"{name}, bfloat16": with_changes(settings[name], low) for name in (shipped, paper)}
+        settings |= {f"{name}, bfloat16": with_changes(settings[name], BFLOAT16) for name in (bare, shipped, paper)}
     if compiled:
-        settings |= {f"{name}, compiled": {**settings[name], "compile": True} for name in settings if name.startswith(shipped)}
+        presets = [name for name in settings if name.startswith((shipped, paper))]
+        settings |= {f"{name}, compiled": {**settings[name], "compile": True} for name in presets}
     shared: dict[str, Any] = {"learning_starts": 10 * N_FILLED, "buffer_size": 10 * N_FILLED, "device": device, "seed": 0}
     entries = {"SB3 TD3 train()": _updater(TD3("MlpPolicy", TASK, **TD3_SIZES, **shared))}
     for name, keywords in settings.items():
@@ -150,18 +151,18 @@ def _products(circuit: NGCCircuit, batch: int, of_update: bool = False) -> Calla
     return products
 
 
-def training(device: str) -> list[Group]:
+def training(device: str, compiled: bool) -> list[Group]:
     """Every task's learners, one update for each environment step, batch and layers alike (SBX's where ``sbx-rl`` is
     installed); then TD3 and ActPC as each comes."""
     groups: list[Group] = []
     for task in TASKS:
-        groups.append((_learners(task, device), {f"SB3 TD3, {task}": f"SB3 TD3's time for a step of {task}"}))
+        groups.append((_learners(task, device, compiled), {f"SB3 TD3, {task}": f"SB3 TD3's time for a step of {task}"}))
         own = f"SB3 TD3's own defaults, {task}"
         groups.append((_learners_as_they_come(task, device, own), {own: f"their time for a step of {task}"}))
     return groups
 
 
-def _learners(task: str, device: str) -> Entries:
+def _learners(task: str, device: str, compiled: bool) -> Entries:
     shared: dict[str, Any] = {"learning_starts": 100, "buffer_size": 100 * N_FILLED, "seed": 0}
     same: dict[str, Any] = {"train_freq": 1, "gradient_steps": 1, **shared}
     bare: dict[str, Any] = {"policy_kwargs": {"circuit_kwargs": SWEEP}, "batch_size": BATCH_SIZE, **same}
@@ -171,6 +172,11 @@ def _learners(task: str, device: str) -> Entries:
         f"bare, learned sweep, {task}": ActPC("MlpPolicy", task, device=device, compile=False, **bare),
         f"shipped, {task}": ActPC(env=task, device=device, compile=False, **shipped),
     }
+    if has_bfloat16():
+        low = with_changes(shipped, BFLOAT16)
+        models[f"shipped, bfloat16, {task}"] = ActPC(env=task, device=device, compile=False, **low)
+        if compiled:
+            models[f"shipped, bfloat16, compiled, {task}"] = ActPC(env=task, device=device, compile=True, **low)
     if find_spec("sbx"):
         import sbx
 

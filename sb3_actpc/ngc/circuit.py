@@ -9,7 +9,7 @@ import torch as th
 from torch import nn
 
 from sb3_actpc.ngc.activations import ACTIVATIONS, get_activation
-from sb3_actpc.ngc.dynamics import DYNAMICS, ChainSettings, SettledState, SettlingChain
+from sb3_actpc.ngc.dynamics import DYNAMICS, ChainSettings, Rates, SettledState, SettlingChain
 from sb3_actpc.ngc.krylov import settle_krylov
 from sb3_actpc.ngc.plasticity import SYNAPTIC_SCALINGS, HebbianChanges, bound_columns_, hebbian_changes, mirrored, soft_bound_
 from sb3_actpc.ngc.products import MATMUL_PRECISIONS, check_matmul_precision
@@ -250,11 +250,21 @@ class NGCCircuit(nn.Module):
         if self.dynamics == "krylov":
             chain.n_steps = settle_krylov(chain, self.n_settling_steps, self.settling_tolerance)
             return chain.state()
-        rates = self.rates.tolist()[: self.n_hidden]
+        rates = self.layer_rates()
         for chain.n_steps in range(1, self.n_settling_steps + 1):
             chain.integrate(rates)
             chain.predict()
         return chain.state()
+
+    @property
+    def has_fixed_steps(self) -> bool:
+        """Whether settling takes the same steps whatever it settles: a sweep, or eq. 1."""
+        return self.settling == "scheduled" or self.dynamics == "state"
+
+    def layer_rates(self) -> Rates:
+        """β of every hidden layer, first layer first."""
+        rates = self.rates[: self.n_hidden]
+        return rates.unbind() if th.compiler.is_compiling() else rates.tolist()
 
     def chain(self, x: th.Tensor, memory: th.Tensor | None = None) -> SettlingChain:
         """The projected chain of this circuit's layers, to be clamped and settled; see :meth:`settle` for the shapes."""

@@ -98,7 +98,7 @@ def _settle_both(actor: NGCCircuit, critic: NGCCircuit, motor: SettlingChain, va
     motor.start_settling()
     if actor.dynamics == "krylov":
         return _sweep_repeatedly(actor, critic, motor, value)
-    value_rates, motor_rates = (circuit.rates.tolist()[: circuit.n_hidden] for circuit in (critic, actor))
+    value_rates, motor_rates = critic.layer_rates(), actor.layer_rates()
     to_action = critic.input_feedback()
     for step in range(critic.n_settling_steps):
         if step >= value.n_hidden:  # only now has the critic's first layer an error to pass on

@@ -1,5 +1,6 @@
 """Settling: how the latent states and error neurons of a circuit move while its synapses stand still."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -10,6 +11,9 @@ from sb3_actpc.ngc.products import add_product, multiply
 from sb3_actpc.ngc.synapses import Synapses, predict
 
 DYNAMICS = ("krylov", "state")
+
+# β of every hidden layer: numbers, or, in a compiled graph, 0-d tensors, so that rates that move ask for no other graph
+Rates = Sequence[float] | Sequence[th.Tensor]
 
 
 @dataclass
@@ -136,7 +140,7 @@ class SettlingChain:
             settings.activation.damp(signal, self.latents[layer], self.activations[layer])
         return signal
 
-    def integrate(self, rates: list[float]) -> None:
+    def integrate(self, rates: Rates) -> None:
         """One step of eq. 1 for every hidden layer that an error has reached; ``rates`` are the β, first layer first."""
         settings = self.settings
         self.lowest_reached = 1 if settings.leak else max(1, self.lowest_reached - 1)
@@ -146,8 +150,10 @@ class SettlingChain:
                 signal.sub_(self.latents[layer], alpha=settings.leak)
             if layer == 1:  # its prediction is constant: the error moves as the state does
                 error.lerp_(signal, rate)
-            else:
+            elif isinstance(rate, float):
                 self.latents[layer].add_(signal.sub_(error), alpha=rate)
+            else:
+                self.latents[layer].add_(signal.sub_(error).mul_(rate))
 
     def predict(self, output: bool = True) -> None:
         """

@@ -14,8 +14,7 @@ from sb3_actpc.actpc.compiled import ENOUGH_UPDATES, CompiledUpdate, compiled_up
 from tests.actpc.agents import make
 from tests.actpc.envs import demonstrations
 
-SWEEPING = {
-    "settling": "scheduled",
+PARTS = {
     "demonstrations": demonstrations(),
     "demonstration_fraction": 0.5,
     "target_policy_noise": 0.2,
@@ -24,21 +23,23 @@ SWEEPING = {
     "actor_warm_start": 5,
 }
 LENGTH = len(demonstrations().rewards) / demonstrations().n_episodes
+EQUATION_1 = {"dynamics": "state", "n_settling_steps": 3}
 LEARNED = {"feedback": "learned", "feedback_start": "mirrored", "weight_decay": 0.1}
 
 
-def agent(feedback=None, **keywords):
-    circuits = {"net_arch": [16, 16], "n_critics": 2, "memory_history": 2, "circuit_kwargs": feedback or LEARNED}
-    return make(policy_kwargs=circuits, **SWEEPING, **keywords)
+def agent(settling="scheduled", circuits=None, **keywords):
+    circuits = {"net_arch": [16, 16], "n_critics": 2, "memory_history": 2, "circuit_kwargs": circuits or LEARNED}
+    return make(settling=settling, policy_kwargs=circuits, **PARTS, **keywords)
 
 
 @pytest.mark.slow
-def test_compiled_updates_equal_eager_ones():
+@pytest.mark.parametrize(("settling", "circuits"), [("scheduled", LEARNED), ("iterative", EQUATION_1)])
+def test_compiled_updates_equal_eager_ones(settling, circuits):
     weights = []
     for compiled in (False, True):
         th.manual_seed(0)
         np.random.seed(0)
-        model = agent(compile=compiled)
+        model = agent(settling, circuits, compile=compiled)
         model.learn(60)
         start = {name: value.clone() for name, value in model.policy.state_dict().items()}
         assert (model._compiled is not None) == compiled
@@ -51,8 +52,9 @@ def test_compiled_updates_equal_eager_ones():
         assert th.allclose(eager, weights[1][name], atol=1e-5), name
 
 
-def test_auto_compiles_from_enough_updates_on_and_only_sweeps():
-    model = agent(compile="auto")
+@pytest.mark.parametrize(("settling", "circuits"), [("scheduled", LEARNED), ("iterative", EQUATION_1)])
+def test_auto_compiles_from_enough_updates_on(settling, circuits):
+    model = agent(settling, circuits, compile="auto")
     assert compiled_update(model, ENOUGH_UPDATES - 1) is None
     assert compiled_update(model, ENOUGH_UPDATES) is not None
     model.compile = False
@@ -132,7 +134,24 @@ def test_where_compiling_fails_auto_goes_on_eagerly_and_an_order_raises(monkeypa
     assert model._compiled is None and model._n_updates == eager._n_updates
 
 
-def test_iterative_circuits_are_not_compiled():
+def test_in_a_graph_rates_are_tensors_that_move_with_the_synapses(monkeypatch):
+    """As numbers they would be constants of the graph."""
+    circuit = agent("iterative", EQUATION_1).critic[0]
+    numbers = circuit.layer_rates()
+    monkeypatch.setattr(th.compiler, "is_compiling", lambda: True)
+    tensors = circuit.layer_rates()
+    assert numbers == [rate.item() for rate in tensors] and all(isinstance(rate, float) for rate in numbers)
+    x, target = th.randn(4, circuit.sizes[0]), th.randn(4, circuit.sizes[-1])
+    by_tensors = circuit.settle(x, target)
+    circuit.rates.mul_(0.5)
+    assert [rate.item() for rate in tensors] == [0.5 * rate for rate in numbers]
+    circuit.rates.mul_(2.0)
+    monkeypatch.undo()
+    for ours, theirs in zip(by_tensors.errors, circuit.settle(x, target).errors, strict=True):
+        assert th.allclose(ours, theirs, atol=1e-6)
+
+
+def test_circuits_that_stop_at_a_tolerance_are_not_compiled():
     with pytest.raises(ValueError, match="compile=True needs settling='scheduled'"):
         compiled_update(make(settling="iterative", compile=True), 1)
     with pytest.raises(ValueError, match="compile='fast'"):
