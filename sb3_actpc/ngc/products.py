@@ -52,7 +52,8 @@ def _is_wide(a: th.Tensor, b: th.Tensor) -> bool:
 def has_bfloat16() -> bool:
     """Whether this machine multiplies such numbers, and does not emulate it (where torch is too old to tell: no)."""
     names = "_is_avx512_bf16_supported", "_is_amx_tile_supported"
-    return th.cuda.is_available() or any(getattr(th.cpu, name, bool)() for name in names)
+    on_gpu = th.cuda.is_available() and th.cuda.is_bf16_supported(including_emulation=False)
+    return on_gpu or any(getattr(th.cpu, name, bool)() for name in names)
 
 
 def check_matmul_precision(chosen: str) -> None:
