@@ -712,6 +712,20 @@ MUTANTS = [
     Mutant("pressure goes as slowly as it comes", REGION, "FALL * unused", "RISE * unused", REGIONS),
     Mutant("normalised twice", AGENT, " and not is_normalised", "", "tests/actpc/test_agent.py -k normalises"),
     Mutant(
+        "compiled without the nudge",
+        "actpc/compiled.py",
+        "batch.memory, agent.policy.nudge)",
+        "batch.memory)",
+        "tests/actpc/test_compiled.py -k equal_eager",
+    ),
+    Mutant(
+        "compiled refresh has no weight",
+        "actpc/compiled.py",
+        "agent.refresh_weight * mine",
+        "mine",
+        "tests/actpc/test_compiled.py -k equal_eager",
+    ),
+    Mutant(
         "a failed compilation ends the run",
         "actpc/compiled.py",
         "if agent.compile is True:",

@@ -111,7 +111,7 @@ class CompiledUpdate:
         agent, actor = self.agent, self.agent.actor.circuit
         assert given.imitated is not None
         refresh = actor.hebbian_update(actor.settle(*given.imitated))
-        coupled = settle_coupled(actor, agent.critic.first(), batch.features, batch.memory)
+        coupled = settle_coupled(actor, agent.critic.first(), batch.features, batch.memory, agent.policy.nudge)
         pressure = actor.hebbian_update(coupled.actor)
         weight = agent._pressure_weight(coupled, batch)
         changes = [

@@ -27,19 +27,25 @@ EQUATION_1 = {"dynamics": "state", "n_settling_steps": 3}
 LEARNED = {"feedback": "learned", "feedback_start": "mirrored", "weight_decay": 0.1}
 
 
-def agent(settling="scheduled", circuits=None, **keywords):
-    circuits = {"net_arch": [16, 16], "n_critics": 2, "memory_history": 2, "circuit_kwargs": circuits or LEARNED}
-    return make(settling=settling, policy_kwargs=circuits, **PARTS, **keywords)
+def agent(settling="scheduled", circuits=None, nudge=None, **keywords):
+    policy = {"net_arch": [16, 16], "n_critics": 2, "memory_history": 2, "nudge": nudge, "circuit_kwargs": circuits or LEARNED}
+    return make(settling=settling, policy_kwargs=policy, refresh_weight=0.3, **PARTS, **keywords)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("settling", "circuits"), [("scheduled", LEARNED), ("iterative", EQUATION_1)])
-def test_compiled_updates_equal_eager_ones(settling, circuits):
+@pytest.mark.parametrize("is_compiled", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("settling", "circuits", "nudge"),
+    [("scheduled", LEARNED, None), ("iterative", EQUATION_1, 1.0), ("iterative", EQUATION_1, 0.1)],
+)
+def test_compiled_updates_equal_eager_ones(settling, circuits, nudge, is_compiled, monkeypatch):
+    """Fast: what would be compiled, as it stands."""
+    if not is_compiled:
+        monkeypatch.setattr(compiled_module.th, "compile", lambda function, **_: function)
     weights = []
     for compiled in (False, True):
         th.manual_seed(0)
         np.random.seed(0)
-        model = agent(settling, circuits, compile=compiled)
+        model = agent(settling, circuits, nudge, compile=compiled)
         model.learn(60)
         start = {name: value.clone() for name, value in model.policy.state_dict().items()}
         assert (model._compiled is not None) == compiled
