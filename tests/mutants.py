@@ -129,8 +129,8 @@ MUTANTS = [
     Mutant(
         "the memory's weight is left out of its change",
         PLASTICITY,
-        "[memory_weight * (error.t() @ memory)",
-        "[(error.t() @ memory)",
+        "memory_weight * (error.t() @ memory)",
+        "(error.t() @ memory)",
         CLOSED,
     ),
     Mutant(

@@ -38,7 +38,7 @@ from sb3_actpc.actpc.arguments import (
     checked,
 )
 from sb3_actpc.actpc.buffers import CombinedHerReplayBuffer, SignalReplay, combined_buffer_class, relabels
-from sb3_actpc.actpc.cloning import Cloning
+from sb3_actpc.actpc.cloning import Cloning, Imitated
 from sb3_actpc.actpc.compiled import CompiledUpdate, compiled_update, updates_per_step
 from sb3_actpc.actpc.demonstration_replay import DemonstrationReplay
 from sb3_actpc.actpc.diagnostics import Diagnostics
@@ -630,7 +630,7 @@ class ActPC(OffPolicyAlgorithm):
         size = self.refresh.ensemble_size
         return Cloning(circuit, self.policy.make_actor, self._sample_for_clones, self.actor_warm_start, size)
 
-    def _sample_for_clones(self, n: int) -> tuple[th.Tensor, th.Tensor, th.Tensor | None]:
+    def _sample_for_clones(self, n: int) -> Imitated:
         return self._sample_imitated(n, self.clone_noise)
 
     def _start_from(self, clone: NGCCircuit) -> None:
@@ -890,12 +890,18 @@ class ActPC(OffPolicyAlgorithm):
 
     def _update_actor(self, batch: Batch) -> None:
         """Motor-action circuit: pressure of the critic (line 19) plus refresh (line 26), in one step of the optimiser."""
-        changes = None
-        if self.refresh_weight and self._imitated():
-            changes = self._refresh_changes(len(batch.features))
+        imitated = self._sample_imitated(len(batch.features)) if self.refresh_weight and self._imitated() else None
+        changes = self._actor_changes(batch, imitated, self._n_updates > self.critic_warmup)
         if changes is not None:
+            self.actor.circuit.apply_changes(changes)
+
+    def _actor_changes(self, batch: Batch, imitated: Imitated | None, is_pressed: bool) -> HebbianChanges | None:
+        """Refresh of the ``imitated`` steps plus, after the warm-up, the critic's pressure; None without either."""
+        changes = None
+        if imitated is not None:
+            changes = self._refresh_changes(imitated)
             self.diagnostics.change_norms("refresh", changes.scale_(self.refresh_weight))
-        if self.actor_pressure and self._n_updates > self.critic_warmup:
+        if self.actor_pressure and is_pressed:
             coupled = settle_coupled(self.actor.circuit, self.critic.first(), batch.features, batch.memory, self.policy.nudge)
             pressure = self.actor.circuit.hebbian_update(coupled.actor)
             weight = self._pressure_weight(coupled, batch)
@@ -904,8 +910,7 @@ class ActPC(OffPolicyAlgorithm):
                 self.diagnostics.settled("actor", coupled.actor)
             self.diagnostics.change_norms("pressure", pressure.scale_(weight))
             changes = pressure if changes is None else changes.add_(pressure)
-        if changes is not None:
-            self.actor.circuit.apply_changes(changes)
+        return changes
 
     @property
     def pressure(self) -> float:
@@ -926,11 +931,15 @@ class ActPC(OffPolicyAlgorithm):
         """Policy circuit(s): settle on the bootstrapped targets (lines 21 and 22). Without pressure nobody asks them."""
         if not self.actor_pressure:
             return
-        inputs, targets = th.cat([batch.features, batch.actions], dim=1), self._critic_targets(batch)
-        for index, critic in enumerate(self.critic):
-            state = critic.settle(inputs, targets)
-            critic.apply_changes(critic.hebbian_update(state))
+        for critic, changes in zip(self.critic, self._critic_changes(batch, self._target_noise(batch)), strict=True):
+            critic.apply_changes(changes)
+
+    def _critic_changes(self, batch: Batch, noise: th.Tensor | None) -> list[HebbianChanges]:
+        inputs, targets = th.cat([batch.features, batch.actions], dim=1), self._critic_targets(batch, noise)
+        states = [critic.settle(inputs, targets) for critic in self.critic]
+        for index, state in enumerate(states):
             self.diagnostics.settled(f"critic.{index}" if index else "critic", state)
+        return [critic.hebbian_update(state) for critic, state in zip(self.critic, states, strict=True)]
 
     def _target_noise(self, batch: Batch) -> th.Tensor | None:
         """What is added to the target actor's actions, (B, A)."""
@@ -939,9 +948,8 @@ class ActPC(OffPolicyAlgorithm):
         bound = TARGET_NOISE_CLIP * self.target_policy_noise
         return (th.randn_like(batch.actions) * self.target_policy_noise).clamp(-bound, bound)
 
-    def _critic_targets(self, batch: Batch, noise: th.Tensor | None = None) -> th.Tensor:
+    def _critic_targets(self, batch: Batch, noise: th.Tensor | None) -> th.Tensor:
         """t = r + γ c, or r alone when terminal; one and the same reward for every action output, (B, A)."""
-        noise = self._target_noise(batch) if noise is None else noise
         if self.bootstrap == "literal":
             next_actions = batch.actions
         else:
@@ -955,11 +963,13 @@ class ActPC(OffPolicyAlgorithm):
 
     def _update_generator(self, batch: Batch) -> None:
         """World model: settle on the next observation (line 24). Without weight in the reward it has no role."""
-        if not self.alpha_ep:
-            return
+        if self.alpha_ep:
+            self.generator.apply_changes(self._generator_changes(batch))
+
+    def _generator_changes(self, batch: Batch) -> HebbianChanges:
         state = self.generator.settle(th.cat([batch.features, batch.actions], dim=1), batch.next_features, batch.memory)
-        self.generator.apply_changes(self.generator.hebbian_update(state))
         self.diagnostics.settled("generator", state)
+        return self.generator.hebbian_update(state)
 
     def _update_targets(self, tau: float) -> None:
         """Move the target circuits by ``tau`` (1 copies)."""
@@ -980,13 +990,13 @@ class ActPC(OffPolicyAlgorithm):
         own = [] if memory is None or memory.episodes is None else [memory.episodes]
         return own if self.expert is None else [self.expert.episodes, *own]
 
-    def _refresh_changes(self, n: int) -> HebbianChanges:
-        """Settle the actor on ``n`` imitated actions."""
-        state = self.actor.circuit.settle(*self._sample_imitated(n))
+    def _refresh_changes(self, imitated: Imitated) -> HebbianChanges:
+        """Settle the actor on imitated actions."""
+        state = self.actor.circuit.settle(*imitated)
         self.diagnostics.settled("actor", state)
         return self.actor.circuit.hebbian_update(state)
 
-    def _sample_imitated(self, n: int, noise: float = 0.0) -> tuple[th.Tensor, th.Tensor, th.Tensor | None]:
+    def _sample_imitated(self, n: int, noise: float = 0.0) -> Imitated:
         """Features, actions and working memory of ``n`` imitated steps; with noise, of steps between the demonstrations."""
         inputs, parts = self.inputs, self._imitated()
         room = self.room if noise else None

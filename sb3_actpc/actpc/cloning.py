@@ -17,8 +17,9 @@ RATES, BATCH_SIZE = (1e-3, 5e-5), 256  # a precise clone: what follows can only 
 
 TEACHING_NOISE = 0.1  # standard deviation of the noise where teachers are asked, on features as the circuits see them
 
-# n -> features (n, n_features), actions (n, A) and working memory of n imitated steps
-Sample = Callable[[int], tuple[th.Tensor, th.Tensor, th.Tensor | None]]
+# features (n, n_features), actions (n, A) and working memory of n imitated steps
+Imitated = tuple[th.Tensor, th.Tensor, th.Tensor | None]
+Sample = Callable[[int], Imitated]
 
 
 class Cloning:

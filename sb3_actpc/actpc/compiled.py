@@ -8,8 +8,9 @@ from typing import Any, NamedTuple
 import torch as th
 from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 
+from sb3_actpc.actpc.cloning import Imitated
 from sb3_actpc.actpc.features import Batch
-from sb3_actpc.ngc import HebbianChanges, settle_coupled
+from sb3_actpc.ngc import HebbianChanges
 
 # compiling takes one to three minutes on a CPU, and saves a quarter of an update's products and calls
 ENOUGH_UPDATES = 200_000
@@ -22,7 +23,7 @@ class _Given(NamedTuple):
     actor: Batch | None  # None where the actor waits
     critic: Batch
     generator: Batch
-    imitated: tuple[th.Tensor, th.Tensor, th.Tensor | None] | None  # features, actions, memory
+    imitated: Imitated | None
     target_noise: th.Tensor | None  # (B, A)
 
 
@@ -97,29 +98,11 @@ class CompiledUpdate:
         return True
 
     def _all_changes(self, given: _Given) -> list[tuple[list[th.Tensor], list[th.Tensor], list[th.Tensor]]]:
-        agent, batch = self.agent, given.critic
-        inputs, targets = th.cat([batch.features, batch.actions], dim=1), agent._critic_targets(batch, given.target_noise)
-        changes = [] if given.actor is None else [self._actor_changes(given.actor, given)]
-        changes += [critic.hebbian_update(critic.settle(inputs, targets)) for critic in agent.critic]
-        if agent.alpha_ep:
-            seen = given.generator
-            state = agent.generator.settle(th.cat([seen.features, seen.actions], dim=1), seen.next_features, seen.memory)
-            changes.append(agent.generator.hebbian_update(state))
+        agent = self.agent
+        changes = [] if given.actor is None else [agent._actor_changes(given.actor, given.imitated, is_pressed=True)]
+        changes += agent._critic_changes(given.critic, given.target_noise)
+        changes += [agent._generator_changes(given.generator)] if agent.alpha_ep else []
         return [(change.weights, change.biases, change.memory) for change in changes]
-
-    def _actor_changes(self, batch: Batch, given: _Given) -> HebbianChanges:
-        agent, actor = self.agent, self.agent.actor.circuit
-        assert given.imitated is not None
-        refresh = actor.hebbian_update(actor.settle(*given.imitated))
-        coupled = settle_coupled(actor, agent.critic.first(), batch.features, batch.memory, agent.policy.nudge)
-        pressure = actor.hebbian_update(coupled.actor)
-        weight = agent._pressure_weight(coupled, batch)
-        changes = [
-            agent.refresh_weight * mine + weight * theirs
-            for mine, theirs in zip(refresh.tensors(), pressure.tensors(), strict=True)
-        ]
-        n = len(refresh.weights)
-        return HebbianChanges(changes[:n], changes[n : 2 * n], changes[2 * n :])
 
 
 def compiled_update(agent: Any, total_timesteps: int) -> CompiledUpdate | None:

@@ -25,7 +25,7 @@ class Synapses(NamedTuple):
 
     def layer_biases(self, memory: th.Tensor | None, memory_weight: float) -> list[th.Tensor]:
         """
-        What every layer's prediction adds to W φ(z): b (n_out,), or with a memory b + α_m M m_t, (B, n_out).
+        What every layer's prediction adds to W φ(z): b (n_out,), or with a memory that counts b + α_m M m_t, (B, n_out).
 
         :raises ValueError: when a memory is missing, not wanted or of the wrong size
         """
@@ -33,7 +33,7 @@ class Synapses(NamedTuple):
         if (memory is not None) != bool(n_memory) or (memory is not None and memory.shape[1] != n_memory):
             found = "no memory" if memory is None else f"a memory of size {memory.shape[1]}"
             raise ValueError(f"this circuit has n_memory={n_memory} but was given {found}")
-        if memory is None:
+        if memory is None or not memory_weight:
             return self.biases
         return [
             th.addmm(bias, memory, weights.t(), alpha=memory_weight)

@@ -54,7 +54,7 @@ def test_the_critic_target_is_the_weighted_sum_of_the_three_parts_plus_the_boots
     assert th.allclose(batch.rewards, parts)
     next_inputs = th.cat([batch.next_features, model.actor_target.project(batch.next_features)], dim=1)
     bootstrap = model.gamma * (1 - batch.dones) * model.critic_target[0].project(next_inputs)
-    assert th.allclose(model._critic_targets(batch), parts + bootstrap, atol=1e-6)
+    assert th.allclose(model._critic_targets(batch, model._target_noise(batch)), parts + bootstrap, atol=1e-6)
     assert batch.dones.max() == 1.0  # terminal transitions were in the batch: their targets are the reward alone
 
 
@@ -359,7 +359,7 @@ def test_the_smallest_of_the_critics_bootstraps():
     inputs = th.cat([batch.next_features, model.actor_target.project(batch.next_features)], dim=1)
     smallest = th.stack([critic.project(inputs) for critic in model.critic_target]).min(0).values
     expected = batch.rewards + (1 - batch.dones) * model.gamma * smallest
-    assert th.allclose(model._critic_targets(batch), expected)
+    assert th.allclose(model._critic_targets(batch, model._target_noise(batch)), expected)
 
 
 def test_the_literal_bootstrap_values_the_action_taken():
@@ -367,16 +367,17 @@ def test_the_literal_bootstrap_values_the_action_taken():
     model.learn(40)
     batch = model._sample_batch(16)
     values = model.critic_target[0].project(th.cat([batch.next_features, batch.actions], dim=1))
-    assert th.allclose(model._critic_targets(batch), batch.rewards + (1 - batch.dones) * model.gamma * values)
+    expected = batch.rewards + (1 - batch.dones) * model.gamma * values
+    assert th.allclose(model._critic_targets(batch, model._target_noise(batch)), expected)
 
 
 def test_target_smoothing_is_bounded_noise(monkeypatch):
     """Of 0.04, bounded by 2.5 standard deviations: with huge noise every action is moved by 0.1, up or down."""
     model = make().learn(40)
     batch = model._sample_batch(16)
-    quiet = model._critic_targets(batch)
+    quiet = model._critic_targets(batch, model._target_noise(batch))
     model.target_policy_noise = 0.04
-    assert not th.allclose(quiet, model._critic_targets(batch))
+    assert not th.allclose(quiet, model._critic_targets(batch, model._target_noise(batch)))
     monkeypatch.setattr(th, "randn_like", lambda like: 1e6 * th.empty_like(like).normal_())
     next_actions = model.actor_target.project(batch.next_features)
     corners = [
@@ -384,7 +385,7 @@ def test_target_smoothing_is_bounded_noise(monkeypatch):
     ]
     possible = th.stack([model.critic_target.first().project(th.cat([batch.next_features, a], dim=1)) for a in corners])
     expected = batch.rewards + (1 - batch.dones) * model.gamma * possible
-    assert th.isclose(expected, model._critic_targets(batch), atol=1e-5).any(0).all()
+    assert th.isclose(expected, model._critic_targets(batch, model._target_noise(batch)), atol=1e-5).any(0).all()
 
 
 def test_the_prior_learns_from_the_demonstrations_and_then_stands_still():

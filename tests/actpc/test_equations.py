@@ -71,7 +71,7 @@ def test_the_bootstrapped_action_is_that_of_the_next_observation_with_the_memory
     assert (next_actions - forgetful).abs().max() > 1e-3
     values = model.critic_target[0].project(th.cat([batch.bootstrap_features, next_actions], dim=1))
     expected = batch.rewards + (1.0 - batch.dones) * model.gamma * values
-    th.testing.assert_close(model._critic_targets(batch), expected)
+    th.testing.assert_close(model._critic_targets(batch, model._target_noise(batch)), expected)
 
 
 def test_the_target_actor_begins_where_the_warm_start_ends():

@@ -22,7 +22,7 @@ def test_only_columns_beyond_the_bound_are_shrunk():
     th.testing.assert_close(weights, th.tensor([[0.6, 0.3], [0.8, 0.4]]))
 
 
-@pytest.mark.parametrize("memory_weight", [1.0, 0.25])
+@pytest.mark.parametrize("memory_weight", [1.0, 0.25, 0.0])
 def test_the_memorys_change_is_weighed_as_the_memory_is(memory_weight):
     """The prediction holds α_m M m, whose gradient by M is α_m e m^T."""
     error, memory = th.tensor([[1.0, -2.0], [3.0, 0.0]]), th.tensor([[2.0], [4.0]])

@@ -191,6 +191,9 @@ def test_working_memory_changes_its_own_synapses_and_the_output():
     assert not th.allclose(circuit.project(x, memory), circuit.project(x, 2 * memory))
     circuit.memory_weight = 0.0
     assert th.equal(circuit.project(x, memory), circuit.project(x, 2 * memory))
+    before = [m.clone() for m in circuit.memory_weights]
+    circuit.apply_changes(circuit.hebbian_update(circuit.settle(x, target, memory)))
+    assert all(map(th.equal, circuit.memory_weights, before))
 
 
 def test_mirroring_a_very_large_layer_ends_soon_and_still_points_the_right_way(monkeypatch):
