@@ -123,7 +123,8 @@ class ActPC(OffPolicyAlgorithm):
     :param n_steps: length of n-step returns; 1 by default where they cannot be had (hindsight, ``optimize_memory_usage``)
         or mean nothing (``bootstrap="literal"``)
     :param settling: "scheduled" (one ordered sweep of the errors, the zero-divergence schedule or Z-IL of the
-        predictive-coding literature) or "iterative" (the paper: K steps of eq. 1)
+        predictive-coding literature) or "iterative" (settle, then change; the paper's K steps
+        of eq. 1 with ``circuit_kwargs=dict(dynamics="state")``)
     :param exploration_noise: standard deviation of the Gaussian noise on the actions in [-1, 1]; with demonstrations at most
         their spread around the warm-started actor (0.02 at least), dimension by dimension. With a habit a noisy episode is
         followed by as many steps without. 0 for none (the paper)

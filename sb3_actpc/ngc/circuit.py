@@ -36,7 +36,7 @@ class NGCCircuit(nn.Module):
     :param hidden: sizes of the hidden layers, first to last; may be empty
     :param activation: φ of the hidden layers: relu6 (paper), relu, leaky_relu, elu, tanh or identity
     :param output_activation: g of the output layer, same choices
-    :param settling: "iterative" (``n_settling_steps`` steps of eq. 1, then one change) or "scheduled" (each layer's change is
+    :param settling: "iterative" (settle as ``dynamics`` says, then one change) or "scheduled" (each layer's change is
         taken when the error first reaches it, one ordered sweep; the zero-divergence schedule, Z-IL, of the predictive-coding
         literature; about K times cheaper). Scheduled with tied feedback is, numerically, the gradient of the output's loss;
         with learned error synapses it is where the error neurons rest under an infinitesimal error that is held (no W^T)
