@@ -64,6 +64,7 @@ from sb3_actpc.ngc import CoupledState, HebbianChanges, NGCCircuit, settle_coupl
 from sb3_actpc.utils.checks import Settings, check_finite, check_kind, named_in_errors
 
 SelfActPC = TypeVar("SelfActPC", bound="ActPC")
+Weighing = float | th.Tensor  # a weight: a number, or 0-d where an update is one graph, whose numbers are constants
 
 # of the mean absolute action-value that ``scale_pressure`` divides by: one paid step. Where nothing was paid yet, the critic's
 # noise must not be blown up to full strength
@@ -413,19 +414,22 @@ class ActPC(OffPolicyAlgorithm):
             return  # a trained agent acts without them; ``learn`` says what is missing
         assert isinstance(self.action_space, spaces.Box)
         self.expert = DemonstrationReplay(demonstrations, self.observation_space, self.action_space, self.memory_history)
-        # VecNormalize's observations are normalised already, and it knows nothing yet of what it will make of these
-        is_normalised = self._vec_normalize_env is not None and self._vec_normalize_env.norm_obs
-        if self.observation_normalization == "demonstrations" and not self.pretrained and not is_normalised:
+        if self.observation_normalization == "demonstrations" and not self.pretrained:
             self.actor.normalizer.begin()
-            self.actor.normalizer.fit(self._features_of(self.expert.episodes, np.arange(len(self.expert))))
+            if not self._normalises_observations():
+                self.actor.normalizer.fit(self._features_of(self.expert.episodes, np.arange(len(self.expert))))
+
+    def _normalises_observations(self) -> bool:
+        """Whether VecNormalize does; at first it knows nothing of what it will make of the demonstrations."""
+        return self._vec_normalize_env is not None and self._vec_normalize_env.norm_obs
 
     def _fit_to_bounds(self) -> None:
         """The mean and standard deviation of the lowest and the highest observation map them to -1 and 1."""
         if self.observation_normalization != "bounds":
             return
-        space, wrapper = self.observation_space, self._vec_normalize_env
+        space = self.observation_space
         bounds = np.stack([space.low, space.high]) if isinstance(space, spaces.Box) else np.full(1, np.inf)
-        if bounds.ndim != 2 or not np.all(np.abs(bounds) < LARGEST_BOUND) or (wrapper and wrapper.norm_obs):
+        if bounds.ndim != 2 or not np.all(np.abs(bounds) < LARGEST_BOUND) or self._normalises_observations():
             raise ValueError(
                 f"observation_normalization='bounds' needs a flat Box whose bounds are below {LARGEST_BOUND:g}, and no "
                 f"VecNormalize(norm_obs=True): observation_space={space}; where there are no bounds, use "
@@ -450,12 +454,17 @@ class ActPC(OffPolicyAlgorithm):
                 f"no demonstrations file at {self.demonstrations}, and learning needs it: put it back, or set "
                 "agent.demonstrations"
             )
+        if self.trials is not None and (self.expert is None or not self.actor_warm_start):
+            self.trials.n_clones = 0  # of nothing, or that learn nothing
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
-        """As in SB3. What a habit was paid in another environment is forgotten; ValueError where demonstrations do not fit."""
+        """As in SB3. What was paid in another environment, the habit's and the own episodes', is forgotten; ValueError where
+        demonstrations do not fit."""
         super().set_env(env, force_reset)
         if self.trials is not None:  # another environment may pay for other steps
             self.trials = self.trials.forgotten(self.n_envs)
+        if self.replay_buffer is not None:
+            self.replay_buffer.forget_own_episodes()
         if isinstance(self.replay_buffer, HerReplayBuffer):  # SB3 goes on paying by the old one
             assert self.env is not None
             self.replay_buffer.env = self.env
@@ -501,7 +510,7 @@ class ActPC(OffPolicyAlgorithm):
         self._follow_demonstrations()
         assert self.replay_buffer is not None
         # one discount and one length of returns for what is replayed and what is shown, of a loaded buffer too
-        self.replay_buffer.gamma, self.replay_buffer.n_steps = self.gamma, self.n_steps
+        self.replay_buffer.set_returns(self.n_steps, self.gamma)
         memory = self.replay_buffer.self_imitation
         if memory is not None:
             is_weighted = self.expert is not None and is_by_return([self.expert.episodes], self.refresh.weighting)
@@ -540,13 +549,14 @@ class ActPC(OffPolicyAlgorithm):
                 f"alpha_ext={self.alpha_ext:g} times the task's and alpha_ep={self.alpha_ep:g} times the epistemic signal",
                 stacklevel=5,
             )
-        n_updates, needed = round(self._total_timesteps * updates_per_step(self)), self.critic_warmup + CANDIDATE_AGE
+        n_steps, needed = self._total_timesteps - self.num_timesteps, self.critic_warmup + CANDIDATE_AGE
+        n_updates = self._n_updates + round(n_steps * updates_per_step(self))
         if updates_per_step(self) < 1.0 and self.trials is not None and self.actor_pressure and n_updates <= needed:
             every = self.train_freq.frequency if isinstance(self.train_freq, TrainFreq) else self.train_freq
             warnings.warn(
                 f"{self._total_timesteps} steps of n_envs={self.n_envs} with gradient_steps={self.gradient_steps} and "
-                f"train_freq={every} are {n_updates} updates, and nothing but clones can become the habit before {needed}: "
-                "gradient_steps=-1 makes as many updates as there are steps",
+                f"train_freq={every} make {n_updates} updates in all, and nothing but clones can become the habit before "
+                f"{needed}: gradient_steps=-1 makes as many updates as there are steps",
                 stacklevel=5,
             )
 
@@ -598,7 +608,7 @@ class ActPC(OffPolicyAlgorithm):
         n_prior = self.prior_updates - int(self.policy.n_prior_updates) if self.alpha_in else 0
         if self.expert is None or (self.pretrained and n_prior <= 0):
             return
-        if self._vec_normalize_env is not None and self._vec_normalize_env.norm_obs:
+        if self._normalises_observations():
             warnings.warn(
                 "VecNormalize's observation statistics drift under what is learned now, and observation_normalization="
                 "'demonstrations' is not used: use VecNormalize(norm_obs=False) with it",
@@ -628,6 +638,10 @@ class ActPC(OffPolicyAlgorithm):
 
     def _clone_into(self, circuit: NGCCircuit) -> Cloning:
         """What makes an actor's circuit a clone of whatever is imitated by now."""
+        if self.expert is not None and self._normalises_observations():  # which knows more by now than when it was measured
+            self.expert.room = None
+            for part in self._imitated():
+                part.neighbours = None
         size = self.refresh.ensemble_size
         return Cloning(circuit, self.policy.make_actor, self._sample_for_clones, self.actor_warm_start, size)
 
@@ -647,6 +661,8 @@ class ActPC(OffPolicyAlgorithm):
 
     def _update_prior(self, batch_size: int) -> None:
         assert self.expert is not None
+        for group in self.prior.optimizer.param_groups:  # a run before may have ended at another rate
+            group["lr"] = self.lr_schedule(1.0) * group["lr_scale"]
         batch = self.expert.sample(batch_size, self.inputs, self.reward_weights, self.gamma)
         state = self.prior.settle(batch.features, batch.next_features, batch.memory)
         self.prior.apply_changes(self.prior.hebbian_update(state))
@@ -892,20 +908,23 @@ class ActPC(OffPolicyAlgorithm):
     def _update_actor(self, batch: Batch) -> None:
         """Motor-action circuit: pressure of the critic (line 19) plus refresh (line 26), in one step of the optimiser."""
         imitated = self._sample_imitated(len(batch.features)) if self.refresh_weight and self._imitated() else None
-        changes = self._actor_changes(batch, imitated, self._n_updates > self.critic_warmup)
+        pressure = self.actor_pressure if self._n_updates > self.critic_warmup else 0.0
+        changes = self._actor_changes(batch, imitated, self.refresh_weight, pressure or None)
         if changes is not None:
             self.actor.circuit.apply_changes(changes)
 
-    def _actor_changes(self, batch: Batch, imitated: Imitated | None, is_pressed: bool) -> HebbianChanges | None:
-        """Refresh of the ``imitated`` steps plus, after the warm-up, the critic's pressure; None without either."""
+    def _actor_changes(
+        self, batch: Batch, imitated: Imitated | None, refresh_weight: Weighing, actor_pressure: Weighing | None
+    ) -> HebbianChanges | None:
+        """Refresh of the ``imitated`` steps plus, where it weighs something, the critic's pressure; None without either."""
         changes = None
         if imitated is not None:
             changes = self._refresh_changes(imitated)
-            self.diagnostics.change_norms("refresh", changes.scale_(self.refresh_weight))
-        if self.actor_pressure and is_pressed:
+            self.diagnostics.change_norms("refresh", changes.scale_(refresh_weight))
+        if actor_pressure is not None:
             coupled = settle_coupled(self.actor.circuit, self.critic.first(), batch.features, batch.memory, self.policy.nudge)
             pressure = self.actor.circuit.hebbian_update(coupled.actor)
-            weight = self._pressure_weight(coupled, batch)
+            weight = self._pressure_weight(coupled, batch, actor_pressure)
             self.diagnostics.coupled(coupled, pressure, batch.features, batch.memory)
             if changes is None:
                 self.diagnostics.settled("actor", coupled.actor)
@@ -919,9 +938,8 @@ class ActPC(OffPolicyAlgorithm):
         region = self.policy.trust_region
         return self.actor_pressure * (1.0 if region is None else float(region.multiplier))
 
-    def _pressure_weight(self, coupled: CoupledState, batch: Batch) -> float | th.Tensor:
+    def _pressure_weight(self, coupled: CoupledState, batch: Batch, weight: Weighing) -> Weighing:
         """As the trust region has it, and by option over the batch's mean absolute action-value."""
-        weight: float | th.Tensor = self.actor_pressure
         if self.policy.trust_region is not None and self.actor.habit is not None:
             habit_actions = self.actor.habit.project(batch.features, batch.memory)
             values = coupled.action_values.mean(1)

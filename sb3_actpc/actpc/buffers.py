@@ -90,9 +90,8 @@ class SignalReplay(ReplayBuffer):
         **kwargs: Any,
     ) -> None:
         super().__init__(*args, **kwargs)
-        if n_steps > 1 and self.optimize_memory_usage:
-            raise ValueError(f"n_steps={n_steps} does not work with optimize_memory_usage=True; use n_steps=1 or leave it out")
-        self.combined, self.history, self.n_steps, self.gamma = combined, history, n_steps, gamma
+        self.combined, self.history = combined, history
+        self.set_returns(n_steps, gamma)
         self.epistemic = np.zeros((self.buffer_size, self.n_envs), dtype=np.float32)
         self.instrumental = np.zeros((self.buffer_size, self.n_envs), dtype=np.float32)
         if self_imitation_size is None:
@@ -159,6 +158,20 @@ class SignalReplay(ReplayBuffer):
     def reset(self) -> None:
         super().reset()
         self._lengths[:] = 0
+
+    def set_returns(self, n_steps: int, gamma: float) -> None:
+        """
+        :param n_steps: length of the returns that are sampled
+        :param gamma: their discount
+        :raises ValueError: for several steps where they cannot be had
+        """
+        _check_n_steps(n_steps, type(self), self.optimize_memory_usage)
+        self.n_steps, self.gamma = n_steps, gamma
+
+    def forget_own_episodes(self) -> None:
+        """Those of the self-imitation memory: in another environment they would be paid otherwise."""
+        if self.self_imitation is not None:
+            self.self_imitation = SelfImitationMemory(self.self_imitation.capacity)
 
     # ------------------------------------------------------------------ checkpoints
 
@@ -385,6 +398,12 @@ def relabels(given: Any) -> bool:
     return isinstance(kind, type) and issubclass(kind, HerReplayBuffer)
 
 
+def _check_n_steps(n_steps: int, kind: type | None, optimize_memory_usage: bool = False) -> None:
+    for in_the_way, name in ((relabels(kind), "hindsight relabelling"), (optimize_memory_usage, "optimize_memory_usage=True")):
+        if in_the_way and n_steps > 1:
+            raise ValueError(f"n_steps={n_steps} does not work with {name}; use n_steps=1 or leave it out")
+
+
 def combined_buffer_class(
     given: type[ReplayBuffer] | str | None, observation_space: spaces.Space, n_steps: int = 1
 ) -> type[SignalReplay]:
@@ -395,8 +414,7 @@ def combined_buffer_class(
         given = _BY_NAME[given]
     if given is not None and not (isinstance(given, type) and issubclass(given, ReplayBuffer)):
         raise ValueError(f"replay_buffer_class={given!r} must be None or a subclass of SB3's ReplayBuffer")
-    if n_steps > 1 and relabels(given):
-        raise ValueError(f"n_steps={n_steps} does not work with hindsight relabelling; use n_steps=1")
+    _check_n_steps(n_steps, given)
     if given is None and isinstance(observation_space, spaces.Dict):
         return CombinedDictReplayBuffer
     if given is None:

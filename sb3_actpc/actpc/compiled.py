@@ -15,11 +15,13 @@ from sb3_actpc.ngc import HebbianChanges
 # compiling takes one to three minutes on a CPU, and saves a quarter of an update's products and calls
 ENOUGH_UPDATES = 200_000
 ASSUMED_LENGTH = 100  # of an episode, where none was shown
+MOST_GRAPHS = 64  # of all agents in a process together, each with two; torch gives up after eight
 
 
 class _Given(NamedTuple):
     """What an update starts from beside the synapses: tensors alone, so that other values need no other graph."""
 
+    weights: tuple[th.Tensor, th.Tensor]  # of refresh and pressure, 0-d
     actor: Batch | None  # None where the actor waits
     critic: Batch
     generator: Batch
@@ -39,7 +41,10 @@ class CompiledUpdate:
     """
 
     def __init__(self, agent: Any) -> None:
+        from torch._dynamo import config  # takes a second
+
         self.agent = agent
+        config.recompile_limit = max(config.recompile_limit, MOST_GRAPHS)
         self._changes = th.compile(self._all_changes, fullgraph=True, dynamic=False)
         self._has_warned = False
 
@@ -77,7 +82,8 @@ class CompiledUpdate:
         agent = self.agent
         # drawn in the order of the eager update
         imitated = None if actor is None else agent._sample_imitated(len(actor.features))
-        given = _Given(actor, critic, generator, imitated, agent._target_noise(critic))
+        refresh, pressure = (th.tensor(float(w), device=agent.device) for w in (agent.refresh_weight, agent.actor_pressure))
+        given = _Given((refresh, pressure), actor, critic, generator, imitated, agent._target_noise(critic))
         circuits = [*agent.critic, *([agent.generator] if agent.alpha_ep else [])]
         if actor is not None:
             circuits.insert(0, agent.actor.circuit)
@@ -99,7 +105,7 @@ class CompiledUpdate:
 
     def _all_changes(self, given: _Given) -> list[tuple[list[th.Tensor], list[th.Tensor], list[th.Tensor]]]:
         agent = self.agent
-        changes = [] if given.actor is None else [agent._actor_changes(given.actor, given.imitated, is_pressed=True)]
+        changes = [] if given.actor is None else [agent._actor_changes(given.actor, given.imitated, *given.weights)]
         changes += agent._critic_changes(given.critic, given.target_noise)
         changes += [agent._generator_changes(given.generator)] if agent.alpha_ep else []
         return [(change.weights, change.biases, change.memory) for change in changes]

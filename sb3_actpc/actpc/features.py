@@ -100,7 +100,8 @@ class CircuitInputs:
         if history is None or mask is None:
             return None
         flat = map_observations(lambda tensor: tensor.flatten(0, 1), history)
-        return self.features(flat).view(*mask.shape, -1) * mask[:, :, None]
+        features = self.features(flat)
+        return features.view(*mask.shape, features.shape[1]) * mask[:, :, None]
 
     def memory(self, history: TensorObservations | None, mask: th.Tensor | None) -> th.Tensor | None:
         """m_t, (B, n_memory), or None without a working memory; for the parameters see :meth:`past_features`."""

@@ -649,6 +649,79 @@ def test_what_vec_normalize_normalises_is_not_normalised_again(norm_obs, fitted)
     assert np.allclose(features, env.normalize_obs(shown), atol=1e-5) != fitted
 
 
+def test_an_environment_that_normalises_takes_the_place_of_the_demonstrations_fit():
+    model = imitating()
+    assert float(model.actor.normalizer.mean.abs().max()) > 0.0
+    model.set_env(VecNormalize(DummyVecEnv([CountingEnv])))
+    assert th.equal(model.actor.normalizer.mean, th.zeros(3))
+
+
+def test_the_room_between_demonstrations_is_measured_anew_by_what_vec_normalize_knows_by_then():
+    """Before it has seen a step, and again whenever a clone is made: else a resumed run would find another room."""
+    for norm_obs in (True, False):
+        env = VecNormalize(DummyVecEnv([CountingEnv]), norm_obs=norm_obs)
+        model = imitating(env, refresh_kwargs={"noise": 1.0})
+        model._sample_for_clones(8)
+        early = model.room.step
+        env.obs_rms = VecNormalize(DummyVecEnv([CountingEnv])).obs_rms
+        env.obs_rms.update(100.0 * np.random.default_rng(0).normal(size=(1000, 3)))
+        model._clone_into(model.policy.make_actor())
+        assert (model.expert.episodes.neighbours is None) == norm_obs
+        assert (model.room.step < 0.1 * early) == norm_obs and (model.room.step == early) != norm_obs
+
+
+def test_a_batch_of_demonstrations_alone_has_a_memory_too():
+    model = imitating(demonstration_fraction=1.0, policy_kwargs={"memory_history": 2})
+    assert model.learn(60).num_timesteps == 60 and model._n_updates > 0
+
+
+def test_a_prior_that_begins_later_learns_at_the_schedules_first_rate():
+    model = make(learning_rate=lambda left: 1e-2 * left, demonstrations=demonstrations(), alpha_in=0.0).learn(60)
+    before = weights_of(model.prior)
+    model.alpha_in = 1.0
+    model.pretrain()
+    assert max(float((a - b).abs().max()) for a, b in zip(before, weights_of(model.prior), strict=True)) > 1e-3
+
+
+def test_another_environment_forgets_the_own_episodes_as_it_forgets_what_the_habit_was_paid():
+    model = imitating(DummyVecEnv([lambda: CountingEnv(returns=(50.0,))]), learning_starts=0)
+    model.learn(60)
+    memory = model.replay_buffer.self_imitation
+    assert memory.best_return == 50.0
+    model.set_env(DummyVecEnv([lambda: CountingEnv(returns=(1.0,))]))
+    assert (
+        model.replay_buffer.self_imitation.best_return == 0.0
+        and model.replay_buffer.self_imitation.capacity == memory.capacity
+    )
+    model.learn(60, reset_num_timesteps=False)
+    assert model.trials.imitated_return < 10.0
+
+
+@pytest.mark.parametrize("changes", [{"demonstrations": None, "demonstration_fraction": 0.0}, {"actor_warm_start": 0}])
+def test_without_what_clones_are_made_of_none_are_due(changes):
+    model = imitating(DummyVecEnv([lambda: CountingEnv(returns=(0.0,))]))
+    model.learn(60)
+    assert model.trials.n_clones > 0
+    for name, value in {**changes, "actor_warm_start": 0, "observation_normalization": "none"}.items():
+        setattr(model, name, value)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        model.learn(60, reset_num_timesteps=False)
+    assert model.trials.n_clones == 0
+
+
+def test_several_steps_set_later_are_refused_where_they_cannot_be_had():
+    env = DummyVecEnv([lambda: BitFlippingEnv(n_bits=3, continuous=True)])
+    model = ActPC("MultiInputPolicy", env, replay_buffer_class="HerReplayBuffer", learning_starts=1)
+    model.n_steps = 3
+    with pytest.raises(ValueError, match="n_steps=3 does not work with hindsight"):
+        model.learn(20)
+    model = make(optimize_memory_usage=True, alpha_ep=0.0, replay_buffer_kwargs={"handle_timeout_termination": False})
+    model.n_steps = 3
+    with pytest.raises(ValueError, match="n_steps=3 does not work with optimize_memory_usage=True"):
+        model.learn(20)
+
+
 def test_observations_are_normalised_by_the_demonstrations_and_do_not_drift():
     data = demonstrations()
     model = make(demonstrations=data, observation_normalization="demonstrations")
@@ -983,8 +1056,13 @@ def test_a_run_with_too_few_updates_to_prove_anything_says_so(keywords, n_envs, 
         warnings.simplefilter("always")
         model.learn(100)
     said = [str(one.message) for one in said if "gradient_steps" in str(one.message)]
-    how = f"100 steps of n_envs={n_envs} with gradient_steps=1 and train_freq={keywords.get('train_freq', 1)} are 25 updates"
+    how = f"100 steps of n_envs={n_envs} with gradient_steps=1 and train_freq={keywords.get('train_freq', 1)} make 25 updates"
     assert bool(said) == warns and all(how in one for one in said)
+    model._n_updates = 1000  # what was made before counts
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        model.learn(100, reset_num_timesteps=False)
+    assert not any("gradient_steps" in str(one.message) for one in said)
 
 
 def test_an_action_that_cannot_vary_is_named_with_its_dimension():

@@ -114,6 +114,33 @@ def test_updates_that_were_to_be_compiled_and_cannot_be_are_named_once(keywords,
         make(compile="auto", alpha_in=0.0, **keywords).learn(60)
 
 
+def test_weights_that_are_annealed_ask_for_no_other_graph(monkeypatch):
+    real, graphs = th.compile, []
+
+    def counted(graph, inputs):
+        graphs.append(graph)
+        return graph.forward
+
+    monkeypatch.setattr(
+        compiled_module.th, "compile", lambda function, **keywords: real(function, backend=counted, **keywords)
+    )
+    model = agent(compile=True)
+    model.learn(60)
+    n_graphs = len(graphs)
+    assert n_graphs > 0
+    for weight in (0.9, 0.8, 0.7):
+        model.refresh_weight = model.actor_pressure = weight
+        model.learn(4, reset_num_timesteps=False)
+    assert len(graphs) == n_graphs
+
+
+def test_agents_of_many_sizes_have_their_graphs_in_one_process():
+    from torch._dynamo import config
+
+    CompiledUpdate(agent())
+    assert config.recompile_limit >= 64
+
+
 def test_without_a_compiler_updates_stay_eager(monkeypatch):
     monkeypatch.setattr("sb3_actpc.actpc.compiled._has_compiler", lambda: False)
     model, said = agent(compile=True), []
