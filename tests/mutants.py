@@ -345,18 +345,16 @@ MUTANTS = [
     Mutant(
         "pressure from the first update on",
         AGENT,
-        "if self.actor_pressure and self._n_updates > self.critic_warmup",
-        "if self.actor_pressure",
+        "self.actor_pressure if self._n_updates > self.critic_warmup else 0.0",
+        "self.actor_pressure",
         f"{LEARNS} -k warmup",
     ),
-    Mutant(
-        "the weight of refresh is ignored", AGENT, "changes.scale_(self.refresh_weight)", "changes", f"{LEARNS} -k refresh"
-    ),
+    Mutant("the weight of refresh is ignored", AGENT, "changes.scale_(refresh_weight)", "changes", f"{LEARNS} -k refresh"),
     Mutant(
         "the weight of the pressure is ignored",
         AGENT,
-        "weight: float | th.Tensor = self.actor_pressure",
-        "weight: float | th.Tensor = 1.0",
+        "_pressure_weight(coupled, batch, actor_pressure)",
+        "_pressure_weight(coupled, batch, 1.0)",
         EQUATIONS,
     ),
     Mutant(
@@ -616,7 +614,7 @@ MUTANTS = [
     Mutant("a given noise is ignored", AGENT, "return self.refresh.noise if", "return 1.0 if", f"{ROOMS} -k without_a_word"),
     Mutant("clones imitate without noise", AGENT, "_imitated(n, self.clone_noise)", "_imitated(n)", f"{HABIT} -k noise"),
     Mutant(
-        "the learning actor is blurred", AGENT, "n: int, noise: float = 0.0) -> t", "n: int, noise: float = 0.5) -> t", HABIT
+        "the learning actor is blurred", AGENT, "n: int, noise: float = 0.0) -> I", "n: int, noise: float = 0.5) -> I", HABIT
     ),
     Mutant(
         "one teacher for all", CLONING, "self.teachers.append(self.make_circuit())", "self.teachers.append(self.clone)", CLONES
@@ -710,20 +708,12 @@ MUTANTS = [
     Mutant("a small spread is as small a unit", REGION, "spread.clamp(SMALLEST_UNIT, 1.0)", "spread", REGIONS),
     Mutant("lost states count as well", REGION, "(squares * weights).mean()", "squares.mean() * weights.mean()", REGIONS),
     Mutant("pressure goes as slowly as it comes", REGION, "FALL * unused", "RISE * unused", REGIONS),
-    Mutant("normalised twice", AGENT, " and not is_normalised", "", "tests/actpc/test_agent.py -k normalises"),
     Mutant(
-        "compiled without the nudge",
-        "actpc/compiled.py",
-        "batch.memory, agent.policy.nudge)",
-        "batch.memory)",
-        "tests/actpc/test_compiled.py -k equal_eager",
-    ),
-    Mutant(
-        "compiled refresh has no weight",
-        "actpc/compiled.py",
-        "agent.refresh_weight * mine",
-        "mine",
-        "tests/actpc/test_compiled.py -k equal_eager",
+        "normalised twice",
+        AGENT,
+        "if not self._normalises_observations():",
+        "if True:",
+        "tests/actpc/test_agent.py -k normalises",
     ),
     Mutant(
         "weights are constants of a graph",
@@ -856,8 +846,8 @@ MUTANTS = [
     Mutant(
         "what was before the episode is remembered",
         FEATURES,
-        ".view(*mask.shape, -1) * mask[:, :, None]",
-        ".view(*mask.shape, -1)",
+        ".view(*mask.shape, features.shape[1]) * mask[:, :, None]",
+        ".view(*mask.shape, features.shape[1])",
         f"{LEARNS} -k memory",
     ),
     Mutant("the running maximum starts at 0", SIGNALS, "self.maximum = 1.0", "self.maximum = 1e-9", f"{LEARNS} -k maximum"),
