@@ -299,6 +299,7 @@ class ActPC(OffPolicyAlgorithm):
         self._has_bar = False  # whether learning shows its progress
         if _init_setup_model:
             self._setup_model()
+            self._check_learning_rates()
 
     # ------------------------------------------------------------------ setting up
 
@@ -324,7 +325,8 @@ class ActPC(OffPolicyAlgorithm):
         if self.policy.habit:
             clones = self.refresh.n_clones - 1 if self.demonstrations is not None and self.actor_warm_start else 0
             # of a loaded agent, whose environment may be another: what it paid is forgotten
-            self.trials = (self.trials or Trials(1)).forgotten(self.n_envs)
+            goes_on = self.trials is not None and self._last_obs is not None
+            self.trials = (self.trials or Trials(1)).forgotten(self.n_envs, goes_on)
             self.trials.n_clones = min(self.trials.n_clones, clones)
         self._setup_demonstrations()
         self._fit_to_bounds()
@@ -341,13 +343,16 @@ class ActPC(OffPolicyAlgorithm):
         kwargs = {**self.policy_kwargs, "circuit_kwargs": {**given, "settling": self.settling}}
         policy = self.policy_class(self.observation_space, self.action_space, self.lr_schedule, **kwargs)
         assert isinstance(policy, ActPCPolicy)
-        for name, settings in policy.kwargs_of.items():  # a loaded policy has no schedule: it need not learn
+        return policy
+
+    def _check_learning_rates(self) -> None:
+        """:raises ValueError: where a circuit's own rate would be a multiple of 0; a loaded agent that only acts may be so"""
+        for name, settings in self.policy.kwargs_of.items():
             own = (settings or {}).get("learning_rate")
             if own and not self.lr_schedule(1.0):
                 raise ValueError(
                     f"{name}_kwargs has learning_rate={own}, a multiple of the agent's, which begins at 0: begin above"
                 )
-        return policy
 
     def _make_replay_buffer(self) -> SignalReplay:
         kind = combined_buffer_class(self.replay_buffer_class, self.observation_space, self.n_steps)
@@ -462,7 +467,7 @@ class ActPC(OffPolicyAlgorithm):
         demonstrations do not fit."""
         super().set_env(env, force_reset)
         if self.trials is not None:  # another environment may pay for other steps
-            self.trials = self.trials.forgotten(self.n_envs)
+            self.trials = self.trials.forgotten(self.n_envs, goes_on=not force_reset)
         if self.replay_buffer is not None:
             self.replay_buffer.forget_own_episodes()
         if isinstance(self.replay_buffer, HerReplayBuffer):  # SB3 goes on paying by the old one
@@ -498,6 +503,7 @@ class ActPC(OffPolicyAlgorithm):
         progress_bar: bool = False,
     ) -> tuple[int, BaseCallback]:
         self._check_generator()
+        self._check_learning_rates()
         if reset_num_timesteps or self._last_obs is None:  # SB3 resets the environments
             self._rollout_state: tuple[np.ndarray, ...] | None = None
             self._rollout_starts = np.ones(self.n_envs, dtype=bool)

@@ -136,8 +136,14 @@ class LOGO(LearnsFromDemonstrations, TRPO):
         assert isinstance(self.action_space, spaces.Box)
         flat = [buffer.to_torch(buffer.swap_and_flatten(a)).float() for a in (buffer.observations, buffer.actions)]
         # the environment gets actions cut to its bounds, and so does the discriminator, or it would know the agent by them
-        low, high = (buffer.to_torch(bound.reshape(1, -1)) for bound in (self.action_space.low, self.action_space.high))
+        bounds = self.action_space.low, self.action_space.high
+        low, high = (buffer.to_torch(bound.reshape(1, -1)).float() for bound in bounds)
         seen = th.cat([flat[0].reshape(shape), flat[1].reshape(shape).clamp(low, high)], dim=1)
+        if self._vec_normalize_env is not None:  # the buffer's observations are normalised, as they were seen
+            n = flat[0][0].numel()
+            rows = shown[:, :n].cpu().numpy().reshape(-1, *(self.observation_space.shape or ()))
+            normalised = np.asarray(self._vec_normalize_env.normalize_obs(rows), dtype=np.float32).reshape(len(shown), n)
+            shown = th.cat([th.as_tensor(normalised, device=self.device), shown[:, n:]], dim=1)
         self._train_discriminator(seen, shown)
         with th.no_grad():
             # -log D, with D the sigmoid of the output

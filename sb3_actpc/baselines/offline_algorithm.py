@@ -122,13 +122,13 @@ class OfflineAlgorithm(LearnsFromDemonstrations):
         self: SelfOffline,
         total_timesteps: int,
         callback: MaybeCallback = None,
-        log_interval: int = 1000,
+        log_interval: int | None = 1000,
         tb_log_name: str | None = None,
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
     ) -> SelfOffline:
         """As SB3's: ``total_timesteps`` are gradient steps, callbacks are called after each, and ``log_interval`` of them
-        lie between two lines of the log."""
+        lie between two lines of the log (None: no log)."""
         if self.env is None:
             raise ValueError(f"{type(self).__name__} was loaded without an environment: set_env() first")
         name = tb_log_name or type(self).__name__
@@ -138,7 +138,7 @@ class OfflineAlgorithm(LearnsFromDemonstrations):
             self._update_current_progress_remaining(self.num_timesteps, total)
             self.train()
             self.num_timesteps += 1
-            if self._n_updates % log_interval == 0:
+            if log_interval is not None and self._n_updates % log_interval == 0:
                 self.logger.dump(self.num_timesteps)
             # what callbacks look for after a step of the environment: there was none
             nothing = np.empty(0, dtype=bool)

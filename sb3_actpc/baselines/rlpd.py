@@ -5,6 +5,7 @@ from typing import Any, ClassVar
 import torch as th
 from stable_baselines3 import SAC
 from stable_baselines3.common.policies import BasePolicy, ContinuousCritic
+from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor, create_mlp
 from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.sac.policies import SACPolicy
@@ -20,7 +21,7 @@ class LayerNormCritic(ContinuousCritic):
         super().__init__(*args, **kwargs)
         self.n_drawn: int | None = None  # of the critics, how many answer; None for all
         net_arch, activation = kwargs["net_arch"], kwargs.get("activation_fn", nn.ReLU)
-        n_inputs = kwargs["features_dim"] + int(self.action_space.shape[0])  # type: ignore[index]
+        n_inputs = kwargs["features_dim"] + get_action_dim(self.action_space)
         for index in range(self.n_critics):
             layers = create_mlp(n_inputs, 1, net_arch, activation, post_linear_modules=[nn.LayerNorm])
             self.q_networks[index] = nn.Sequential(*layers)

@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sb3_actpc.envs import ROBOSUITE_IDS, SPARSE_MUJOCO_IDS, sparse_env_id
+from sb3_actpc.envs import ROBOSUITE_IDS, SPARSE_IDS, SPARSE_MUJOCO_IDS, sparse_env_id
 from sb3_actpc.utils.files import folder_name
 
 if TYPE_CHECKING:
@@ -104,7 +104,8 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _collect(args: argparse.Namespace) -> int:
-    args.env = sparse_env_id(args.env)  # what is recorded in it serves the goal task
+    known = sparse_env_id(args.env.rpartition(":")[2])  # what is recorded in it serves the goal task
+    args.env = known if known in SPARSE_IDS else args.env
     demonstrator = args.demonstrator or ("scripted" if args.env in ROBOSUITE_IDS else "trained")
     if demonstrator == "trained" and (args.proficiency is not None or args.obs is not None):
         raise ValueError("--proficiency and --obs are for scripted demonstrators of robosuite tasks: leave them out")
@@ -195,7 +196,7 @@ def command_line(args: argparse.Namespace, options: Sequence[str]) -> str:
         if value is True:
             words.append("--" + option)
         elif value is not None and value is not False and value != []:
-            values = value if isinstance(value, list) else [f"{value:g}" if option == "steps" else value]
+            values = value if isinstance(value, list) else [int(value) if option == "steps" else value]
             words += ["--" + option.replace("_", "-"), *map(str, values)]
     return shlex.join(words)
 

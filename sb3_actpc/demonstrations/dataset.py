@@ -6,6 +6,7 @@ import dataclasses
 import json
 import os
 import re
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,15 +18,14 @@ from gymnasium import spaces
 
 from sb3_actpc.demonstrations.minari import read_minari, write_minari
 from sb3_actpc.demonstrations.npz import read_npz, write_npz
-from sb3_actpc.demonstrations.recording import env_name, record_episodes, trajectory_columns
-from sb3_actpc.demonstrations.rows import field_error, flat_size, unchained_indices
+from sb3_actpc.demonstrations.recording import env_name, record_episodes, time_limit, trajectory_columns
+from sb3_actpc.demonstrations.rows import field_error, flat_size, outside_bounds, unchained_indices
 from sb3_actpc.envs import SPARSE_IDS
 
 if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecEnv
 
 DATA_FOLDER = Path(__file__).resolve().parents[1] / "data"
-ACTION_TOLERANCE = 1e-4
 # the fields with one row for each transition
 COLUMNS = ("observations", "actions", "next_observations", "rewards", "terminations", "dense_rewards")
 
@@ -188,10 +188,18 @@ class Demonstrations:
     ) -> Demonstrations:
         """Take over trajectories of the ``imitation`` library, or objects like them, recorded in ``env_id``: each has ``obs``
         (n + 1 rows), ``acts`` (n rows), ``infos`` (or None), ``terminal``, and perhaps ``rews``; where it has none, the last
-        step is paid ``final_reward`` and all others 0. A last info with ``TimeLimit.truncated`` is no termination;
-        ``dense_reward`` in every info is kept. Dict observations need the environment's ``observation_space``. ValueError when
-        something needed is missing, or does not fit together."""
-        columns = [trajectory_columns(trajectory, observation_space, final_reward) for trajectory in trajectories]
+        step is paid ``final_reward`` and all others 0. A last info with ``TimeLimit.truncated`` is no termination; without
+        infos (``rollout(exclude_infos=True)``, its default) an episode as long as ``env_id``'s time limit has none, with a
+        warning where no limit is known. ``dense_reward`` in every info is kept. Dict observations need the environment's
+        ``observation_space``. ValueError when something needed is missing, or does not fit together."""
+        limit = time_limit(env_id)
+        if limit is None and any(one.infos is None and one.terminal for one in trajectories):
+            warnings.warn(
+                f"trajectories without infos, of {env_id}, whose time limit is not known: all their ends count as "
+                "terminations; keep the infos, imitation's rollout(..., exclude_infos=False), where some are time limits",
+                stacklevel=2,
+            )
+        columns = [trajectory_columns(one, observation_space, final_reward, limit) for one in trajectories]
         return cls.from_episodes(columns, env_id, source="trajectories")
 
     @classmethod
@@ -244,17 +252,18 @@ class Demonstrations:
             raise self._error("actions", "a Box action space", repr(action_space))
         if self.actions.shape[1] != flat_size(action_space):
             raise self._error("actions", f"{flat_size(action_space)} values a row", f"{self.actions.shape[1]}")
-        low, high, actions = action_space.low.ravel(), action_space.high.ravel(), self.actions.astype(np.float64)
-        outside = (actions < low - ACTION_TOLERANCE) | (actions > high + ACTION_TOLERANCE)
+        outside = outside_bounds(self.actions, action_space)
         if outside.any():
             row, column = (int(index) for index in np.argwhere(outside)[0])
-            expected = f"values in [{low[column]}, {high[column]}] in column {column}"
+            low, high = action_space.low.ravel()[column], action_space.high.ravel()[column]
+            expected = f"values in [{low}, {high}] in column {column}"
             raise self._error("actions", expected, f"{self.actions[row, column]} at transition {row}")
 
     def rewarded_by(self, env: VecEnv) -> Demonstrations:
         """The same transitions with the rewards that ``env`` gives for them, under its own condition and threshold, by its
-        method ``demonstrated_rewards(demonstrations)``, which this package's MuJoCo tasks have; without one, as recorded."""
-        if not env.has_attr("demonstrated_rewards"):
+        method ``demonstrated_rewards(demonstrations)``, which this package's MuJoCo tasks have; without one, or where a
+        ``gymnasium.RewardWrapper`` has the last word, as recorded."""
+        if not env.has_attr("demonstrated_rewards") or env.env_is_wrapped(gym.RewardWrapper, indices=[0])[0]:
             return self
         return dataclasses.replace(self, rewards=env.env_method("demonstrated_rewards", self, indices=[0])[0])
 

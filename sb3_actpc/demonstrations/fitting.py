@@ -11,7 +11,7 @@ from gymnasium import spaces
 
 from sb3_actpc.demonstrations.dataset import DATA_FOLDER, Demonstrations, base_name
 from sb3_actpc.demonstrations.rows import box_paths, join_observations, split_observations
-from sb3_actpc.envs import SPARSE_MUJOCO_IDS, dense_env_id
+from sb3_actpc.envs import SPARSE_MUJOCO_IDS, dense_env_id, sparse_env_id
 
 if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecEnv, VecTransposeImage
@@ -54,20 +54,22 @@ def fit_demonstrations(
     spaces, paid as it pays (None where there is none yet); the first ``n_episodes`` alone, or ``n_transitions``, None for all.
     Those of the dense base task of a sparse one (such as Minari's ``mujoco/hopper/expert-v0``) fit too. FileNotFoundError when
     there is no such file, ValueError when they are damaged, fewer than asked for, or of another task."""
-    demonstrations = resolve(source, observation_space)
+    has_goals = env is not None and env.has_attr("goal_demonstrations")
+    demonstrations = resolve(source, None if has_goals else observation_space)  # they may be of the task without goals
     try:
         demonstrations = demonstrations.select(n_episodes, n_transitions)
     except ValueError as error:
         raise ValueError(f"n_demonstrations={n_episodes}, n_demonstration_transitions={n_transitions}: {error}") from error
     env_id = None
     if env is not None:
-        if env.has_attr("goal_demonstrations"):
-            demonstrations = env.env_method("goal_demonstrations", demonstrations, indices=[0])[0]
         spec = env.get_attr("spec", indices=0)[0] if env.has_attr("spec") else None
         env_id = None if spec is None else spec.id
-        if env_id in SPARSE_MUJOCO_IDS and base_name(dense_env_id(env_id)) == base_name(demonstrations.env_id):
+        paid_id = "" if env_id is None else sparse_env_id(env_id)
+        if paid_id in SPARSE_MUJOCO_IDS and base_name(dense_env_id(paid_id)) == base_name(demonstrations.env_id):
             sparse_id = f"Sparse{demonstrations.env_id.rpartition(':')[2]}"  # which then pays them anew
             demonstrations = dataclasses.replace(demonstrations, env_id=sparse_id, dense_rewards=demonstrations.rewards)
+        if has_goals:
+            demonstrations = env.env_method("goal_demonstrations", demonstrations, indices=[0])[0]
     try:
         demonstrations.check(observation_space, action_space, env_id)
     except ValueError as error:

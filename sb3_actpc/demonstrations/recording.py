@@ -2,13 +2,14 @@
 
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from sb3_actpc.demonstrations.rows import box_paths, join_observations, transition_columns
+from sb3_actpc.demonstrations.rows import box_paths, join_observations, outside_bounds, transition_columns
 from sb3_actpc.utils.extras import installed_version
 
 Columns = dict[str, np.ndarray]
@@ -76,10 +77,20 @@ def env_name(env: gym.Env[Any, Any]) -> str:
     return env.spec.id if env.spec is not None else type(env.unwrapped).__name__
 
 
+def time_limit(env_id: str) -> int | None:
+    """After how many steps Gymnasium cuts the episodes of a registered environment; None where that is not known."""
+    spec = gym.registry.get(env_id.rpartition(":")[2])
+    return None if spec is None else spec.max_episode_steps
+
+
 def trajectory_columns(
-    trajectory: Any, observation_space: spaces.Space[Any] | None = None, final_reward: float | None = None
+    trajectory: Any,
+    observation_space: spaces.Space[Any] | None = None,
+    final_reward: float | None = None,
+    limit: int | None = None,
 ) -> Columns:
-    """The columns of a trajectory, see ``Demonstrations.from_trajectories``; ValueError when something needed is missing."""
+    """The columns of a trajectory, see ``Demonstrations.from_trajectories``; without infos one of ``limit`` steps was cut.
+    ValueError when something needed is missing."""
     observations = trajectory.obs.unwrap() if hasattr(trajectory.obs, "unwrap") else trajectory.obs
     if isinstance(observations, Mapping) and observation_space is None:
         raise ValueError("trajectories with dict observations need observation_space: give the environment's")
@@ -92,7 +103,8 @@ def trajectory_columns(
             raise ValueError("trajectories without rews need final_reward, the reward of each one's last step (1.0, say)")
         rewards = np.append(np.zeros(n_steps - 1), final_reward)
     columns |= {"rewards": np.asarray(rewards), "terminations": np.zeros(n_steps, dtype=bool)}
-    columns["terminations"][-1] = trajectory.terminal and not infos[-1].get("TimeLimit.truncated", False)
+    was_cut = n_steps == limit if trajectory.infos is None else infos[-1].get("TimeLimit.truncated", False)
+    columns["terminations"][-1] = trajectory.terminal and not was_cut
     if all("dense_reward" in info for info in infos):
         columns["dense_rewards"] = np.array([info["dense_reward"] for info in infos])
     return columns
@@ -123,16 +135,22 @@ def _play(act: Callable[[Any, bool], np.ndarray], env: gym.Env[Any, Any], seed: 
     """One episode as columns, and its last info."""
     rows: list[tuple[Any, ...]] = []
     observation, info = env.reset(seed=seed)
+    flat = partial(spaces.utils.flatten, env.observation_space)  # a copy: the environment may go on writing on what it gave
+    row = flat(observation)
     done = False
     while not done:
         action = act(observation, not rows)
         if np.shape(action) != env.action_space.shape:
             wanted = f"{env_name(env)} takes {env.action_space.shape}: return an array of that shape"
             raise ValueError(f"the demonstrator gives an action of shape {np.shape(action)}, {wanted}")
-        next_observation, reward, terminated, truncated, info = env.step(action)
-        flat = (spaces.utils.flatten(env.observation_space, value) for value in (observation, next_observation))
-        rows.append((*flat, np.ravel(action), reward, terminated, info.get("dense_reward", reward)))
-        observation, done = next_observation, terminated or truncated
+        shown = np.array(action).ravel()  # a copy: environment and demonstrator may write on theirs
+        if isinstance(env.action_space, spaces.Box) and outside_bounds(shown, env.action_space).any():
+            wanted = f"{env_name(env)} takes {env.action_space}: clip it (numpy.clip)"
+            raise ValueError(f"the demonstrator gives the action {shown} at step {len(rows)}, {wanted}")
+        observation, reward, terminated, truncated, info = env.step(action)
+        next_row = flat(observation)
+        rows.append((row, next_row, shown, reward, terminated, info.get("dense_reward", reward)))
+        row, done = next_row, terminated or truncated
     names = ("observations", "next_observations", "actions", "rewards", "terminations", "dense_rewards")
     columns = {name: np.asarray(values, dtype=np.float32) for name, values in zip(names, zip(*rows, strict=True), strict=True)}
     return {**columns, "terminations": columns["terminations"].astype(bool)}, info

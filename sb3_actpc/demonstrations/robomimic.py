@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 
 from sb3_actpc.demonstrations import hdf5
-from sb3_actpc.demonstrations.dataset import ACTION_TOLERANCE, Demonstrations
+from sb3_actpc.demonstrations.dataset import Demonstrations
 from sb3_actpc.demonstrations.recording import Columns, Report, silent
+from sb3_actpc.demonstrations.rows import ACTION_TOLERANCE
 from sb3_actpc.envs.robosuite_layouts import ACTION_DIM, OBSERVATIONS, PROPRIOCEPTION, RobosuiteTask, robosuite_task
 from sb3_actpc.utils.extras import import_extra
 from sb3_actpc.utils.files import atomic_write

@@ -5,6 +5,8 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
+ACTION_TOLERANCE = 1e-4  # by which actions may leave their bounds
+
 
 def field_error(source: str, name: str, expected: str, found: str) -> ValueError:
     """The error to raise for a field of demonstrations from a file or data set (or an empty text)."""
@@ -28,6 +30,15 @@ def box_paths(space: spaces.Space[Any]) -> list[list[str]]:
     if not isinstance(space, spaces.Box):
         raise ValueError(f"demonstrations need Box observations or a Dict of Boxes, found {space!r}")
     return [[]]
+
+
+def outside_bounds(actions: Any, space: spaces.Box) -> np.ndarray:
+    """Which numbers of actions (..., action_dim) lie outside the bounds, by more than ``ACTION_TOLERANCE`` and what float32
+    rounds away; shaped as they are."""
+    low, high = (bound.ravel().astype(np.float64) for bound in (space.low, space.high))
+    room_low, room_high = (ACTION_TOLERANCE + np.finfo(np.float32).eps * np.abs(bound) for bound in (low, high))
+    values = np.asarray(actions, dtype=np.float64)
+    return (values < low - room_low) | (values > high + room_high)
 
 
 def split_observations(space: spaces.Space[Any], rows: np.ndarray) -> Any:

@@ -54,11 +54,13 @@ class GoalTask(gym.ObservationWrapper[Any, np.ndarray, Any]):
 
     def goal_demonstrations(self, demonstrations: Demonstrations) -> Demonstrations:
         """Recorded transitions of the sparse task as transitions of this one, each observation the flattened dictionary, paid
-        by :meth:`compute_reward`; those of this one as they are. ValueError when the recording does not tell what was
-        achieved."""
+        by :meth:`compute_reward`; those of this one, and of others, as they are. ValueError when the recording does not tell
+        what was achieved."""
         spec = self.spec
         env_id = demonstrations.env_id if spec is None else spec.id
-        if demonstrations.env_id.rpartition("-v")[0] == env_id.rpartition("-v")[0]:
+        recorded, own = (name.rpartition(":")[2].rpartition("-v")[0] for name in (demonstrations.env_id, env_id))
+        fits = demonstrations.observations.shape[1:] == self.env.observation_space.shape
+        if recorded != own.replace("Goal", "Sparse", 1) or not fits:
             return demonstrations
         rows, next_rows = self._demonstrated_rows(demonstrations)
         rewards = self.compute_reward(next_rows["achieved_goal"], next_rows["desired_goal"], None)

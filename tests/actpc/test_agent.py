@@ -212,6 +212,18 @@ def test_an_own_learning_rate_beside_a_schedule_from_zero_is_refused():
         make(learning_rate=lambda left: 1e-3 * (1.0 - left), policy_kwargs={"critic_kwargs": {"learning_rate": 1e-3}})
 
 
+def test_an_agent_with_own_rates_is_loaded_to_play_without_a_schedule(tmp_path):
+    """As rl-zoo3 loads it; learning needs one."""
+    model = make(policy_kwargs={"critic_kwargs": {"learning_rate": 1e-3}})
+    model.save(tmp_path / "agent")
+    nothing, shown = {"learning_rate": 0.0, "lr_schedule": lambda _: 0.0}, np.ones((2, 3), np.float32)
+    loaded = ActPC.load(tmp_path / "agent", custom_objects=nothing)
+    assert np.array_equal(loaded.predict(shown)[0], model.predict(shown)[0])
+    loaded.set_env(model.env)
+    with pytest.raises(ValueError, match=r"critic_kwargs has learning_rate=0\.001.*begin above"):
+        loaded.learn(10)
+
+
 def test_circuits_that_cannot_settle_as_one_are_refused_before_anything_is_learned():
     with pytest.raises(ValueError, match="actor settling='iterative' and critic settling='scheduled' must agree"):
         make(policy_kwargs={"actor_kwargs": {"settling": "iterative"}})

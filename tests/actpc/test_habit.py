@@ -850,6 +850,17 @@ def test_another_environment_may_pay_otherwise():
     assert not differ(habit, weights_of(model.actor.habit))
 
 
+@pytest.mark.parametrize("force_reset", [True, False])
+def test_an_episode_that_goes_on_in_another_environment_counts_for_nothing(tmp_path, force_reset):
+    model = imitating().learn(60)
+    assert model.trials.lengths == [2], "the second step of an episode"
+    model.save(tmp_path / "agent")
+    skipped = [] if force_reset else [0]
+    assert ActPC.load(tmp_path / "agent", env=DummyVecEnv([CountingEnv]), force_reset=force_reset).trials.skipped == skipped
+    model.set_env(model.env, force_reset)
+    assert model.trials.skipped == skipped
+
+
 def test_a_loaded_agent_tries_as_many_clones_as_are_left_and_asked_for(tmp_path):
     model = imitating(refresh_kwargs={"n_clones": 4})
     model.pretrain()

@@ -11,6 +11,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecNormalize
 
@@ -79,6 +80,16 @@ def test_a_step_is_a_gradient_step_and_the_environment_stands_still() -> None:
     assert vec_env.get_attr("_elapsed_steps") == [0]
     model.learn(3, reset_num_timesteps=False)
     assert model.num_timesteps == 10
+
+
+def test_no_log_interval_is_no_log(monkeypatch: pytest.MonkeyPatch) -> None:
+    model = make()
+    dumped: list[int] = []
+    monkeypatch.setattr(Logger, "dump", lambda _, step=0: dumped.append(step))
+    assert model.learn(4, log_interval=None).num_timesteps == 4
+    assert not dumped
+    model.learn(4, log_interval=2)
+    assert dumped == [2, 4]
 
 
 def test_demonstrated_observations_have_mean_zero_and_standard_deviation_one() -> None:

@@ -2,12 +2,14 @@
 
 import copy
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
 from sb3_contrib import TRPO
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_actpc.baselines import LOGO
 from sb3_actpc.baselines.logo import Guidance
@@ -43,6 +45,26 @@ def test_the_discriminator_learns_who_acted() -> None:
     seen, theirs = th.tensor([[1.0, 0.0, 0.0, 0.0]]), th.tensor([[1.0, 0.0, 0.0, 2.0]])
     reward = th.nn.functional.softplus(-model.discriminator(th.cat([seen, theirs]))).flatten()
     assert reward[1] > reward[0]  # -log D: worth more where it takes the agent for the demonstrators
+
+
+def test_the_discriminator_sees_demonstrations_normalised_as_the_agents_observations() -> None:
+    """The discriminator could else tell them by their scale."""
+    shown = record("Pendulum-v1", 4, 16)
+    env = VecNormalize(make_vec_env("Pendulum-v1", n_envs=2, seed=5), norm_reward=False)
+    model = LOGO("MlpPolicy", env, demonstrations=shown, discriminator_net_arch=[16], **SMALL)
+    given: list[np.ndarray] = []
+    model._train_discriminator = lambda seen, theirs: given.append(theirs.cpu().numpy())
+    model.learn(128)
+    assert given[-1][:, :3] == pytest.approx(env.normalize_obs(shown.observations), abs=1e-5)
+    assert np.array_equal(given[-1][:, 3:], shown.actions)
+
+
+def test_bounds_in_float64_are_no_obstacle() -> None:
+    env = gym.make("Pendulum-v1")
+    env.action_space = gym.spaces.Box(-2.0, 2.0, (1,), np.float64)
+    model = LOGO("MlpPolicy", env, demonstrations=record("Pendulum-v1", 4, 16), discriminator_net_arch=[16], **SMALL)
+    model.learn(64)
+    assert "train/discriminator_accuracy" in model.logger.name_to_value
 
 
 def test_the_guidance_step_climbs_its_objective_within_its_trust_region(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,5 +1,7 @@
 """SAC in the way of RLPD: layer-normalised critics, two of them drawn for each target, half of the batch demonstrated."""
 
+import gymnasium as gym
+import numpy as np
 import pytest
 import torch as th
 from torch import nn
@@ -49,6 +51,23 @@ def test_it_plays_the_same_after_loading_and_resumes_bit_for_bit(tmp_path) -> No
     observation = straight.env.reset()
     assert (straight.predict(observation, deterministic=True)[0] == loaded.predict(observation, deterministic=True)[0]).all()
     assert loaded.critic_target.n_drawn == 2
+
+
+class InRows(gym.ActionWrapper):
+    """Takes its actions in a matrix."""
+
+    def __init__(self, env: gym.Env) -> None:
+        super().__init__(env)
+        self.action_space = gym.spaces.Box(-2.0, 2.0, (1, 2), np.float32)
+
+    def action(self, action: np.ndarray) -> np.ndarray:
+        return action.ravel()[:1]
+
+
+def test_actions_of_any_shape_are_taken_whole() -> None:
+    model = RLPD("MlpPolicy", InRows(gym.make("Pendulum-v1")), policy_kwargs={"net_arch": [8]}, **SMALL).learn(12)
+    assert model.critic.q_networks[0][0].in_features == 3 + 2
+    assert model._n_updates == 4
 
 
 def test_more_target_critics_than_critics_are_refused() -> None:

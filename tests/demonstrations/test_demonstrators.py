@@ -75,6 +75,12 @@ def test_every_task_is_learned_by_its_dense_base_task(algo: str) -> None:
         assert run.demonstrations == "none"
 
 
+def test_ids_with_this_packages_module_are_the_same_tasks() -> None:
+    assert demonstrator_run("sb3_actpc:SparseHopper-v5").env == "Hopper-v5"
+    with pytest.raises(ValueError, match="env_id='sb3_actpc:SparseLift-v0' has no dense reward to learn by"):
+        demonstrator_run("sb3_actpc:SparseLift-v0")
+
+
 def test_the_default_training_is_2000_full_episodes() -> None:
     assert demonstrator_run("SparseHalfCheetah-v5").n_timesteps == 2_000_000
     assert demonstrator_run("GoalReacher-v4").n_timesteps == 100_000
@@ -174,11 +180,11 @@ class TestCommand:
     ) -> None:
         monkeypatch.setattr(demonstrators, "train_demonstrator", lambda *_: Demonstrator(Reaching(), 7, -3.0))
         output = tmp_path / "reacher.npz"
-        words = ["collect", "--env", "SparseReacher-v5", "--episodes", "2", "--output", str(output)]
-        assert run_demos(*words, "--stochastic", "--steps", "1e5") == 0
+        words = ["collect", "--env", "sb3_actpc:SparseReacher-v5", "--episodes", "2", "--output", str(output)]
+        assert run_demos(*words, "--stochastic", "--steps", "1234567") == 0
         shown = Demonstrations.load(output)
         command = shown.metadata["command"]
-        assert command.startswith("sb3-actpc demos collect --env SparseReacher-v5 --algo ppo --steps 100000 --stochastic")
+        assert command.startswith("sb3-actpc demos collect --env SparseReacher-v5 --algo ppo --steps 1234567 --stochastic")
         assert str(tmp_path) not in command
         capsys.readouterr()
         assert run_demos("info", str(output)) == 0

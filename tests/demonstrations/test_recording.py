@@ -11,6 +11,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_actpc.demonstrations import Demonstrations, fit_demonstrations
+from tests.recordings import record
 
 
 class Corridor(gym.Env[Any, Any]):
@@ -124,6 +125,39 @@ def test_dict_observations_are_flattened_in_the_order_of_their_space() -> None:
     assert shown.observations[2].tolist() == list(expected)
 
 
+class WritesOn(Corridor):
+    """Shows one array, on which it goes on writing, as it does on the actions that it is given."""
+
+    def observe(self) -> Any:
+        self.__dict__.setdefault("shown", np.zeros(2, np.float32))[:] = self.episode, self.t
+        return self.shown
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        action[:] = -9.0
+        return super().step(action)
+
+
+def test_rows_are_copies_of_what_environment_and_demonstrator_write_on() -> None:
+    held = np.zeros(1, np.float32)
+
+    def act(observation: np.ndarray) -> np.ndarray:
+        held[:] = observation[1] / 4
+        return held
+
+    shown = Demonstrations.record(act, WritesOn(), 1, only_successes=False)
+    assert shown.observations[:, 1].tolist() == [0, 1, 2, 3]
+    assert shown.next_observations[:, 1].tolist() == [1, 2, 3, 4]
+    assert shown.actions.ravel().tolist() == [0, 0.25, 0.5, 0.75]
+
+
+def test_an_action_out_of_bounds_is_refused_where_it_is_made() -> None:
+    def act(observation: np.ndarray) -> np.ndarray:
+        return np.full(1, observation[1], np.float32)
+
+    with pytest.raises(ValueError, match=r"gives the action \[3\.\] at step 3, Corridor takes Box\(-2.0, 2.0.*clip it"):
+        Demonstrations.record(act, Corridor(), 1, only_successes=False)
+
+
 def test_a_model_sees_observations_as_its_vec_normalize_shows_them() -> None:
     env = VecNormalize(DummyVecEnv([lambda: Corridor()]))
     model = PPO("MlpPolicy", env, n_steps=8, batch_size=8, n_epochs=1, device="cpu", seed=0).learn(16)
@@ -149,7 +183,6 @@ def test_sampled_actions_differ_and_deterministic_ones_do_not() -> None:
         ({"n_episodes": 0}, "n_episodes=0 must be at least 1"),
         ({"env": "CartPole-v1"}, "Box action space, found Discrete"),
         ({"env": 3}, "env must be a Gymnasium environment or the id of one, found 3"),
-        ({"demonstrator": lambda _: np.array([5.0])}, "'actions': expected values in .*5.0"),
     ],
 )
 def test_wrong_arguments_are_named(change: dict[str, Any], message: str) -> None:
@@ -209,7 +242,7 @@ class DictObs:
 class TestTrajectories:
     def test_of_the_imitation_library(self) -> None:
         observations = np.arange(8.0).reshape(4, 2)
-        ended = Trajectory(observations, np.ones((3, 1)), None, True, np.array([0.0, 0.0, 1.0]))
+        ended = Trajectory(observations, np.ones((3, 1)), [{}] * 3, True, np.array([0.0, 0.0, 1.0]))
         cut = Trajectory(observations, np.ones((3, 1)), [{}, {}, {"TimeLimit.truncated": True}], True, np.zeros(3))
         shown = Demonstrations.from_trajectories([ended, cut], "Named-v0")
         assert shown.observations.tolist() == [[0, 1], [2, 3], [4, 5]] * 2
@@ -218,6 +251,16 @@ class TestTrajectories:
         assert shown.rewards.tolist() == [0, 0, 1, 0, 0, 0]
         assert shown.dense_rewards is None
 
+    def test_without_infos_the_registered_time_limit_tells_what_was_cut(self) -> None:
+        """imitation's rollout drops the infos, and calls cut episodes terminal."""
+        lengths = (50, 49)  # the Reacher's limit, and one less
+        told = [Trajectory(np.zeros((n + 1, 10)), np.zeros((n, 2)), None, True, np.zeros(n)) for n in lengths]
+        shown = Demonstrations.from_trajectories(told, "gymnasium:Reacher-v5")
+        assert shown.terminations[[49, 98]].tolist() == [False, True]
+        with pytest.warns(UserWarning, match="of Named-v0, whose time limit is not known.*exclude_infos=False"):
+            assert Demonstrations.from_trajectories(told, "Named-v0").terminations[[49, 98]].all()
+
+    @pytest.mark.filterwarnings("error")
     def test_a_fragment_does_not_terminate(self) -> None:
         fragment = Trajectory(np.zeros((3, 2)), np.zeros((2, 1)), None, False, np.zeros(2))
         assert not Demonstrations.from_trajectories([fragment], "Named-v0").terminations.any()
@@ -232,7 +275,7 @@ class TestTrajectories:
 
     def test_dict_observations_need_a_space(self) -> None:
         parts = DictObs({"goal": np.full((3, 1), 9.0), "state": np.arange(6.0).reshape(3, 2)})
-        trajectory = Trajectory(parts, np.zeros((2, 1)), None, True, np.zeros(2))
+        trajectory = Trajectory(parts, np.zeros((2, 1)), None, False, np.zeros(2))
         with pytest.raises(ValueError, match="need observation_space"):
             Demonstrations.from_trajectories([trajectory], "Named-v0")
         space = Corridor(is_dict=True).observation_space
@@ -242,7 +285,9 @@ class TestTrajectories:
 
     def test_a_missing_observation_is_noticed(self) -> None:
         with pytest.raises(ValueError, match="2 actions must have 3 observations, found 2"):
-            Demonstrations.from_trajectories([Trajectory(np.zeros((2, 2)), np.zeros((2, 1)), None, True, np.zeros(2))], "A-v0")
+            Demonstrations.from_trajectories(
+                [Trajectory(np.zeros((2, 2)), np.zeros((2, 1)), None, False, np.zeros(2))], "A-v0"
+            )
 
 
 def test_demonstrations_of_the_dense_base_task_fit_the_sparse_one() -> None:
@@ -258,4 +303,22 @@ def test_demonstrations_of_the_dense_base_task_fit_the_sparse_one() -> None:
         paid = [sparse.step(action)[1] for action in shown.actions]
     assert fitted.rewards.tolist() == paid and 0 < sum(paid) < len(paid)
     assert np.array_equal(fitted.dense_rewards, shown.rewards)
+    env.close()
+
+
+@pytest.mark.parametrize("recorded_id", ["Hopper-v5", "SparseHopper-v5"])
+def test_demonstrations_of_either_task_without_goals_fit_the_goal_task(recorded_id: str) -> None:
+    shown = record(recorded_id)
+    env = DummyVecEnv([lambda: gym.make("GoalHopper-v5")])
+    fitted = fit_demonstrations(shown, env, env.observation_space, env.action_space)
+    assert fitted.env_id == "GoalHopper-v5" and fitted.observations.shape == (len(shown), 13)
+    env.close()
+
+
+@pytest.mark.parametrize("recorded_id", ["SparseWalker2d-v5", "Walker2d-v5"])
+def test_another_tasks_demonstrations_are_named_by_the_goal_task(recorded_id: str) -> None:
+    """The Walker2d's rows are as long as the HalfCheetah's."""
+    env = DummyVecEnv([lambda: gym.make("GoalHalfCheetah-v5")])
+    with pytest.raises(ValueError, match=rf"{recorded_id}"):
+        fit_demonstrations(record(recorded_id), env, env.observation_space, env.action_space)
     env.close()

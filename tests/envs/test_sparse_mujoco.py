@@ -348,6 +348,23 @@ def test_demonstrations_of_a_task_without_conditions_keep_their_rewards() -> Non
     env.close()
 
 
+def test_demonstrations_keep_their_rewards_under_a_wrapper_that_pays() -> None:
+    """The environment's own method does not know what the wrapper makes of a reward."""
+    recorded = record("SparseHopper-v5", 1)
+    env = make_vec_env("SparseHopper-v5", wrapper_class=gym.wrappers.TransformReward, wrapper_kwargs={"func": lambda r: r - 1})
+    assert recorded.rewarded_by(env) is recorded
+    env.close()
+
+
+def test_demonstrations_of_a_reacher_that_is_shown_otherwise_keep_their_rewards() -> None:
+    recorded = record("SparseReacher-v5", 1)
+    rows = recorded.observations[:, :8]
+    cut = dataclasses.replace(recorded, observations=rows, next_observations=rows)
+    env = make_vec_env("SparseReacher-v5")
+    assert np.array_equal(cut.rewarded_by(env).rewards, recorded.rewards)
+    env.close()
+
+
 @pytest.mark.parametrize("env_id", SPARSE_MUJOCO_IDS)
 def test_the_demonstrator_is_drawn_where_it_was(env_id: str) -> None:
     """Angles and travelled distance; the Swimmer's and the start's sideways position are in no recording."""
