@@ -17,8 +17,8 @@ The YAML file, named from the Markdown file's folder, says for each name what st
 What a row or a column says is added to what the table says, the row last; a text alone is the variant of a row and the task of
 a column. ``from``, ``task``, ``variant``, ``settings``, ``seed`` and ``planned_steps`` choose runs, ``cell`` says what is
 written of them: columns of ``results.csv`` with a format, which give the mean over the seeds, or with ``each``, ``min``,
-``max`` or ``std`` before it, as in ``{dense_return:each .0f}``; ``{n}``, the number of seeds; ``{paper}``, what the paper
-gives for the algorithm; and ``{score}``, which stands for what ``score`` says. A cell without runs is empty; † marks one with
+``max``, ``std`` or ``interval`` (the mean's, of 95 %) before it, as in ``{dense_return:each .0f}``; ``{n}``, the number of
+seeds; ``{paper}``, what the paper gives for the algorithm; and ``{score}``, which stands for what ``score`` says. A cell without runs is empty; † marks one with
 runs from a source tree with uncommitted changes. The variants ``demonstrators``, ``random`` and ``paper:ALGO`` are known
 everywhere.
 """
@@ -36,6 +36,7 @@ from sb3_actpc.experiments.report.figures import reference_lines
 from sb3_actpc.experiments.report.page import UNDEFINED, markdown, number
 from sb3_actpc.experiments.report.references import measure_of, paper_results
 from sb3_actpc.experiments.report.results import load_results
+from sb3_actpc.experiments.report.statistics import mean_interval
 from sb3_actpc.utils.files import atomic_write
 
 _MARKER = re.compile(r"(<!-- table: (\S+) (\S+) -->\n).*?(<!-- /table -->)", re.DOTALL)
@@ -83,8 +84,11 @@ class _OverSeeds:
 
     def __format__(self, form: str) -> str:
         how, _, form = form.rpartition(" ")
-        if how not in ("", "each", "min", "max", "std"):
-            raise ValueError(f"unknown {how!r} in a format: each, min, max, std, or nothing for the mean")
+        if how not in ("", "each", "min", "max", "std", "interval"):
+            raise ValueError(f"unknown {how!r} in a format: each, min, max, std, interval, or nothing for the mean")
+        if how == "interval":
+            bounds = [number(float(bound), form) for bound in mean_interval(self.values.to_numpy())[1:]]
+            return "" if UNDEFINED in bounds else "[{}, {}]".format(*bounds)
         values = self.values if how == "each" else [self.values.agg(how or "mean", skipna=False)]
         return ", ".join(number(value, form) for value in values)
 
@@ -118,7 +122,7 @@ def _cell(spec: dict[str, Any], folder: Path) -> str:
     fields: dict[str, Any] = {name: _OverSeeds(runs[name]) for name in map(str, runs.select_dtypes("number"))}
     fields["n"] = _OverSeeds(runs["algorithm"].notna().groupby(runs["task"]).sum().replace(0, np.nan))
     fields["score"] = spec.get("score", "").format(**fields)
-    text = re.sub(rf"(\s*\(|, | x ){UNDEFINED}\)?", "", spec["cell"].format(**fields))  # what is not known is left out
+    text = re.sub(rf"(\s*\(|, | x ){UNDEFINED}\)?", "", spec["cell"].format(**fields)).strip()  # what is not known is left out
     return "" if text == UNDEFINED else f"{text} †" if runs["dirty"].any() else text
 
 

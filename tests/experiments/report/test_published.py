@@ -64,6 +64,12 @@ def test_other_figures_than_the_mean(folder: Path) -> None:
     )
 
 
+def test_an_interval_of_the_mean_is_students(folder: Path) -> None:
+    """Two seeds, 200 ± 100 (standard error) times t's 12.706; a single one has none."""
+    row = lines(folder, "ActPC: actpc", "{dense_return:.0f} {dense_return:interval .0f}")[2]
+    assert row == "| ActPC | 200 [-1071, 1471] | -4 |"
+
+
 def test_a_row_says_more_than_a_column_and_runs_of_a_changed_source_tree_are_marked(folder: Path) -> None:
     table = lines(folder, "TD3: {variant: td3, cell: '{score}, {steps:,.0f}'}, ActPC: actpc")
     assert lines(folder, "ActPC: actpc, d: demonstrators", "{dense_return:.0f} x {n:.0f}")[2:] == [
