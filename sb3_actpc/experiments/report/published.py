@@ -14,13 +14,13 @@ The YAML file, named from the Markdown file's folder, says for each name what st
       score: "{dense_return:.0f} ({sparse_return:.0f})"
       cell: "{score}, {steps:,.0f}"
 
-What a row or a column says is added to what the table says, the row last; a text alone is the variant of a row and the task of
-a column. ``from``, ``task``, ``variant``, ``settings``, ``seed`` and ``planned_steps`` choose runs, ``cell`` says what is
+What a row or a column says is added to what the table says, the row last; a text alone is the variant of a row and the task
+of a column. ``from``, ``task``, ``variant``, ``settings``, ``seed`` and ``planned_steps`` choose runs, ``cell`` says what is
 written of them: columns of ``results.csv`` with a format, which give the mean over the seeds, or with ``each``, ``min``,
 ``max``, ``std`` or ``interval`` (the mean's, of 95 %) before it, as in ``{dense_return:each .0f}``; ``{n}``, the number of
-seeds; ``{paper}``, what the paper gives for the algorithm; and ``{score}``, which stands for what ``score`` says. A cell without runs is empty; † marks one with
-runs from a source tree with uncommitted changes. The variants ``demonstrators``, ``random`` and ``paper:ALGO`` are known
-everywhere.
+seeds; ``{paper}``, what the paper gives for the algorithm; and ``{score}``, which stands for what ``score`` says. A cell
+without runs is empty; † marks one with runs from a source tree with uncommitted changes. The variants ``demonstrators``,
+``random`` and ``paper:ALGO`` are known everywhere.
 """
 
 import re
