@@ -2,17 +2,20 @@
 
 import math
 import random
+import sys
 import types
-from collections import OrderedDict, defaultdict, deque
-from collections.abc import Callable, Mapping
-from contextlib import suppress
-from enum import Enum
+import zlib
+from collections import Counter, OrderedDict, defaultdict, deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from enum import Enum, Flag
 from typing import Any
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
+from gymnasium.wrappers import utils as gymnasium_utils
 from stable_baselines3.common.monitor import ResultsWriter
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.running_mean_std import RunningMeanStd
@@ -22,11 +25,16 @@ _NOT_NUMBERS = {"nan": math.nan, "inf": math.inf, "-inf": -math.inf}
 _ARRAY_KINDS = "biuf"
 _BIT_GENERATORS = ("MT19937", "PCG64", "Philox")
 # what a value of these types holds is made anew by the constructors, or never changes
-_LEFT_ALONE: tuple[type, ...] = (type, np.dtype, th.device, Enum, EnvSpec, ResultsWriter)
+_LEFT_ALONE: tuple[type, ...] = (type, np.dtype, th.device, EnvSpec, ResultsWriter)
 _LEFT_ALONE += (types.FunctionType, types.MethodType, types.BuiltinFunctionType, types.ModuleType)
 _LEFT_ALONE_NAMES = ("mujoco._structs.MjModel", "gymnasium.envs.mujoco.mujoco_rendering.MujocoRenderer")
 # objects whose attributes are written one by one into an object of the same class that is there already
-_TRANSPARENT: tuple[type, ...] = (RunningMeanStd, StackedObservations, ActionNoise)
+_TRANSPARENT: tuple[type, ...] = (RunningMeanStd, gymnasium_utils.RunningMeanStd, StackedObservations, ActionNoise)
+_DICTS: dict[type, str] = {dict: "dict", OrderedDict: "ordered", Counter: "counter", defaultdict: "default"}
+# of an environment: two attributes may hold one of these, and what changes in one then changes in the other
+_SHARED: tuple[type, ...] = (np.ndarray, th.Tensor, list, dict, deque, set, *_TRANSPARENT)
+_SHARED += (np.random.Generator, np.random.RandomState, random.Random)
+_FACTORIES: dict[str, Any] = {f"builtins.{kind.__name__}": kind for kind in (int, float, bool, str, list, dict, set, tuple)}
 
 
 class OpaqueValue(ValueError):
@@ -36,30 +44,74 @@ class OpaqueValue(ValueError):
         super().__init__(f"{where}: a {type(value).__module__}.{type(value).__qualname__} cannot be stored as plain data")
 
 
+class LostValue(ValueError):
+    """A stored value of an environment that cannot be made from what is there now."""
+
+
 class Encoder:
     """Turns values into JSON; the arrays and tensors in them are collected beside it.
 
-    Kinds: None, bool, int, float, str, list, tuple, dict, deque, set, bytes, NumPy scalars and arrays of numbers, tensors,
-    NumPy's and Python's random generators, spaces (their generators), and objects of a few known classes.
+    Kinds: None, bool, int, float, str, list, tuple, dict, deque, set, bytes, members of enumerations, NumPy scalars and arrays
+    of numbers, tensors, NumPy's and Python's random generators, spaces (their generators), and objects of a few known classes.
+    Functions and classes go by their names: the new environment must hold the same.
     """
 
     def __init__(self) -> None:
         self.arrays: dict[str, np.ndarray] = {}
         self.tensors: dict[str, th.Tensor] = {}
         self._open: set[int] = set()
+        self._layers: Sequence[Any] | None = None  # while one environment is written
+        self._met: dict[int, tuple[Any, Any, int]] = {}  # by id its values that may be shared, what was written, a number
+        self._owners: list[np.ndarray] = []  # its arrays of their own memory
+        self._views: list[np.ndarray] = []  # and those of another's
+        self._memory: list[np.ndarray] = []  # the arrays of its simulators
+
+    @contextmanager
+    def environment(self, layers: Sequence[Any]) -> Iterator[None]:
+        """While one environment of these layers is written: what it holds twice is written once and then referred to, and
+        layers and their methods go by their places."""
+        self._layers = layers
+        try:
+            yield
+        finally:
+            self._layers, self._met, self._owners, self._views, self._memory = None, {}, [], [], []
+
+    def encode_alone(self, value: Any, where: str) -> Any:
+        """As :meth:`encode`; after an OpaqueValue nothing refers to parts of it."""
+        before = dict(self._met)
+        try:
+            return self.encode(value, where)
+        except OpaqueValue:
+            self._met = before
+            raise
+
+    def add_memory(self, arrays: Mapping[str, np.ndarray], where: str) -> None:
+        """The memory of a simulator, whose views no other attribute may hold: they would become copies."""
+        self._memory += arrays.values()
+        for view in self._views:
+            self._check_memory(view, where)
 
     def encode(self, value: Any, where: str) -> Any:
         """JSON of a value; its path names the arrays in it. OpaqueValue when it, or something in it, is of another kind or
         contains itself."""
+        if isinstance(value, Enum):
+            kind, name = type(value), value.value if isinstance(value, Flag) else value.name  # of flags together
+            return {"enum": kind.__qualname__, "module": kind.__module__, "member": name}
         if value is None or isinstance(value, (bool, str)) or type(value) is int:
             return value
         if type(value) is float:
             return value if math.isfinite(value) else {"number": str(value)}
+        if id(value) in self._met:
+            return self._refer(value)
         if isinstance(value, (np.ndarray, np.generic, th.Tensor)):
-            return self._array(value, where)
-        if isinstance(value, (list, tuple, deque, set, dict)):
-            return self._container(value, where)
-        return self._object(value, where)
+            node = self._array(value, where)
+        elif isinstance(value, (list, tuple, deque, set, frozenset, dict)):
+            node = self._container(value, where)
+        else:
+            node = self._object(value, where)
+        if self._layers is not None and isinstance(value, _SHARED):
+            self._met[id(value)] = value, node, len(self._met)
+        return node
 
     def encode_some(self, values: Mapping[str, Any], where: str) -> dict[str, Any]:
         """JSON of those values that can be stored, by name; the others are for their owner to make anew."""
@@ -68,6 +120,22 @@ class Encoder:
             with suppress(OpaqueValue):
                 stored[name] = self.encode(value, f"{where}.{name}")
         return stored
+
+    def _refer(self, value: Any) -> dict[str, Any]:
+        """To what was written before, which gets its number where it is the first time."""
+        _, node, number = self._met[id(value)]
+        if isinstance(node, dict):
+            node["as"] = number
+        elif node[:1] != [{"as": number}]:
+            node.insert(0, {"as": number})
+        return {"same": number, "kind": "list" if isinstance(node, list) else next(iter(node))}
+
+    def _check_memory(self, value: np.ndarray, where: str) -> None:
+        """OpaqueValue where an array and another one are views of the same memory."""
+        owners = self._owners if value.base is not None else []
+        others = [*self._memory, *(other for other in (*self._views, *owners) if other is not value)]
+        if any(np.shares_memory(value, other) for other in others):
+            raise OpaqueValue(f"{where}, which shares memory with another array", value)
 
     def _array(self, value: np.ndarray | np.generic | th.Tensor, where: str) -> dict[str, Any]:
         if isinstance(value, th.Tensor):
@@ -78,6 +146,9 @@ class Encoder:
             return {"empty": list(value.shape)}
         if value.dtype.kind not in _ARRAY_KINDS or value.dtype.itemsize > 8:
             raise OpaqueValue(where, value)
+        if self._layers is not None and isinstance(value, np.ndarray):
+            self._check_memory(value, where)
+            (self._owners if value.base is None else self._views).append(value)
         name = f"{where}#{len(self.arrays)}"
         self.arrays[name] = np.asarray(value)
         return {"scalar" if isinstance(value, np.generic) else "array": name}
@@ -88,9 +159,7 @@ class Encoder:
         self._open.add(id(value))
         try:
             if isinstance(value, dict):
-                kind = "ordered" if type(value) is OrderedDict else "dict"
-                pairs = value.items()
-                return {kind: [[self.encode(key, where), self.encode(part, f"{where}.{key}")] for key, part in pairs]}
+                return self._mapping(value, where)
             parts = [self.encode(part, f"{where}.{index}") for index, part in enumerate(value)]
         finally:
             self._open.discard(id(value))
@@ -98,7 +167,16 @@ class Encoder:
             return {"deque": parts, "maxlen": value.maxlen}
         if isinstance(value, tuple) and hasattr(value, "_fields"):
             raise OpaqueValue(where, value)
-        return parts if isinstance(value, list) else {"tuple" if isinstance(value, tuple) else "set": parts}
+        if isinstance(value, list):
+            return parts
+        return {"tuple" if isinstance(value, tuple) else "set" if isinstance(value, set) else "frozenset": parts}
+
+    def _mapping(self, value: dict[Any, Any], where: str) -> dict[str, Any]:
+        if type(value) not in _DICTS and self._layers is not None:
+            raise OpaqueValue(where, value)
+        pairs = [[self.encode(key, where), self.encode(part, f"{where}.{key}")] for key, part in value.items()]
+        factory = {"factory": self.encode(value.default_factory, where)} if isinstance(value, defaultdict) else {}
+        return {_DICTS.get(type(value), "dict"): pairs, **factory}
 
     def _object(self, value: Any, where: str) -> dict[str, Any]:
         if isinstance(value, np.random.Generator):
@@ -113,11 +191,25 @@ class Encoder:
             generators = [part._np_random for part in _subspaces(value)]  # None where it has not been used
             states = [None if one is None else dict(one.bit_generator.state) for one in generators]
             return {"space": self.encode(states, where)}
-        if isinstance(value, _LEFT_ALONE) or f"{type(value).__module__}.{type(value).__qualname__}" in _LEFT_ALONE_NAMES:
-            return {"left": type(value).__qualname__}
         if isinstance(value, _TRANSPARENT):
             return {"object": type(value).__qualname__, "attributes": self.encode(vars(value), where)}
+        return self._named(value, where)
+
+    def _named(self, value: Any, where: str) -> dict[str, Any]:
+        """What goes by a place or a name."""
+        place = self._place(value)
+        if place is not None:
+            return {"layer": place}
+        if isinstance(value, types.MethodType):
+            owner, name = value.__self__, getattr(value, "__name__", "")
+            if self._place(owner) is not None and getattr(type(owner), name, None) is value.__func__:
+                return {"method": name, "of": self._place(owner)}
+        if isinstance(value, _LEFT_ALONE) or f"{type(value).__module__}.{type(value).__qualname__}" in _LEFT_ALONE_NAMES:
+            return {"left": type(value).__qualname__, "name": _name_of(value)}
         raise OpaqueValue(where, value)
+
+    def _place(self, value: Any) -> int | None:
+        return next((place for place, layer in enumerate(self._layers or ()) if layer is value), None)
 
 
 class Decoder:
@@ -125,6 +217,19 @@ class Decoder:
 
     def __init__(self, arrays: Mapping[str, np.ndarray], tensors: Mapping[str, th.Tensor]) -> None:
         self.arrays, self.tensors = arrays, tensors
+        self._layers: Sequence[Any] | None = None
+        self._met: dict[int, Any] = {}
+        self._used: set[int] = set()  # generators that have been given a state
+
+    @contextmanager
+    def environment(self, layers: Sequence[Any]) -> Iterator[None]:
+        """While an environment is put back that was written as one, of these layers, None where one is another; there a value
+        that cannot be made raises LostValue. Elsewhere what is there now stays."""
+        self._layers, self._met, self._used = layers, {}, set()
+        try:
+            yield
+        finally:
+            self._layers, self._met, self._used = None, {}, set()
 
     def decode(self, node: Any, existing: Any = None) -> Any:
         """The value of JSON that :meth:`Encoder.encode` returned, new where it can be; of ``existing``, the value that is
@@ -133,61 +238,132 @@ class Decoder:
         if not isinstance(node, (dict, list)):
             return node
         if isinstance(node, list):
-            old = existing if isinstance(existing, list) else []
-            return [self.decode(part, old[index] if index < len(old) else None) for index, part in enumerate(node)]
+            mark = node[0] if node and isinstance(node[0], dict) and node[0].keys() == {"as"} else {}
+            value: Any = self._parts(node[len(mark) :], existing)
+        else:
+            mark, value = node, self._made(node, existing)
+        if "as" in mark:
+            self._met[mark["as"]] = value
+        return value
+
+    def _made(self, node: dict[str, Any], existing: Any) -> Any:
         kind = str(next(iter(node), ""))
-        if kind == "left":
-            return existing
         if kind in _PLAIN_KINDS:
             return _PLAIN_KINDS[kind](self, node)
-        method = getattr(self, f"_{kind}", None) if not kind.startswith("_") else None
+        method = getattr(self, f"_decode_{kind}", None)
         if method is None:
             raise ValueError(f"a value of the unknown kind {kind!r} is stored: the file was written by another version")
         return method(node, existing)
 
-    def _dict(self, node: dict[str, Any], existing: Any) -> dict[Any, Any]:
+    def _parts(self, nodes: list[Any], existing: Any) -> list[Any]:
+        old = list(existing) if isinstance(existing, (list, tuple, deque)) else []
+        return [self.decode(part, old[index] if index < len(old) else None) for index, part in enumerate(nodes)]
+
+    def _pairs(self, nodes: list[Any], existing: Any) -> dict[Any, Any]:
         old = existing if isinstance(existing, dict) else {}
         new = {}
-        for key_node, part in node["dict"]:
+        for key_node, part in nodes:
             key = self.decode(key_node)
             new[key] = self.decode(part, old.get(key))
-        if isinstance(existing, defaultdict):
+        return new
+
+    def _lose(self, reason: str, existing: Any) -> Any:
+        if self._layers is not None:
+            raise LostValue(reason)
+        return existing
+
+    def _unused(self, existing: Any, kind: type) -> Any:
+        """A generator that is there now, or None: where it is of another kind, or two hold it now that were not the same."""
+        if not isinstance(existing, kind) or id(existing) in self._used:
+            return None
+        if self._layers is not None:
+            self._used.add(id(existing))
+        return existing
+
+    def _decode_same(self, node: dict[str, Any], existing: Any) -> Any:
+        if node["same"] not in self._met:
+            return self._lose("it was held by something else, too, which cannot be restored", existing)
+        return self._met[node["same"]]
+
+    def _decode_left(self, node: dict[str, Any], existing: Any) -> Any:
+        kind, name = type(existing).__qualname__, _name_of(existing)
+        if kind == node["left"] and node.get("name", name) == name:
+            return existing
+        stored = node.get("name") or f"a {node['left']}"
+        return self._lose(f"it was {stored}, and is {name or f'a {kind}'} when made anew", existing)
+
+    def _decode_layer(self, node: dict[str, Any], existing: Any) -> Any:
+        layer = dict(enumerate(self._layers or ())).get(node["layer"])
+        return self._lose("it was an environment that is another now", existing) if layer is None else layer
+
+    def _decode_method(self, node: dict[str, Any], existing: Any) -> Any:
+        layer = self._decode_layer({"layer": node["of"]}, existing)
+        function = getattr(type(layer), node["method"], None)
+        if not isinstance(function, types.FunctionType):
+            return self._lose(f"it was the method {node['method']}, which is not there now", existing)
+        return types.MethodType(function, layer)
+
+    def _decode_enum(self, node: dict[str, Any], existing: Any) -> Any:
+        kind, member = _find_enum(node["module"], node["enum"], existing), node["member"]
+        with suppress(KeyError, ValueError, TypeError):
+            return kind(member) if issubclass(kind, Flag) else kind[member]
+        return self._lose(f"it was {node['enum']}.{member}, which is not there now", existing)
+
+    def _decode_tuple(self, node: dict[str, Any], existing: Any) -> tuple[Any, ...]:
+        return tuple(self._parts(node["tuple"], existing))
+
+    def _decode_deque(self, node: dict[str, Any], existing: Any) -> deque[Any]:
+        return deque(self._parts(node["deque"], existing), maxlen=node["maxlen"])
+
+    def _decode_dict(self, node: dict[str, Any], existing: Any) -> dict[Any, Any]:
+        new = self._pairs(node["dict"], existing)
+        if isinstance(existing, defaultdict):  # of a checkpoint that did not tell them apart
             existing.clear()
             existing.update(new)
             return existing
         return new
 
-    def _ordered(self, node: dict[str, Any], existing: Any) -> OrderedDict[Any, Any]:
-        return OrderedDict(self._dict({"dict": node["ordered"]}, existing))
+    def _decode_ordered(self, node: dict[str, Any], existing: Any) -> OrderedDict[Any, Any]:
+        return OrderedDict(self._pairs(node["ordered"], existing))
 
-    def _generator(self, node: dict[str, Any], existing: Any) -> np.random.Generator:
+    def _decode_counter(self, node: dict[str, Any], existing: Any) -> Counter[Any]:
+        return Counter(self._pairs(node["counter"], existing))
+
+    def _decode_default(self, node: dict[str, Any], existing: Any) -> defaultdict[Any, Any]:
+        factory = node["factory"]
+        known = _FACTORIES.get(str(factory.get("name"))) if isinstance(factory, dict) else None
+        made = known or self.decode(factory, getattr(existing, "default_factory", None))
+        return defaultdict(made, self._pairs(node["default"], existing))
+
+    def _decode_generator(self, node: dict[str, Any], existing: Any) -> np.random.Generator:
         state = self.decode(node["generator"])
         name = state["bit_generator"]
-        if not isinstance(existing, np.random.Generator) or type(existing.bit_generator).__name__ != name:
+        existing = self._unused(existing, np.random.Generator)
+        if existing is None or type(existing.bit_generator).__name__ != name:
             if name not in _BIT_GENERATORS:
                 raise ValueError(f"the generator {name!r} is unknown; expected one of {sorted(_BIT_GENERATORS)}")
             existing = np.random.Generator(getattr(np.random, name)())
         existing.bit_generator.state = state
         return existing
 
-    def _random_state(self, node: dict[str, Any], existing: Any) -> np.random.RandomState:
-        made = existing if isinstance(existing, np.random.RandomState) else np.random.RandomState()
+    def _decode_random_state(self, node: dict[str, Any], existing: Any) -> np.random.RandomState:
+        made: np.random.RandomState = self._unused(existing, np.random.RandomState) or np.random.RandomState()
         made.set_state(self.decode(node["random_state"]))
         return made
 
-    def _random(self, node: dict[str, Any], existing: Any) -> random.Random:
-        made = existing if isinstance(existing, random.Random) else random.Random()
+    def _decode_random(self, node: dict[str, Any], existing: Any) -> random.Random:
+        made: random.Random = self._unused(existing, random.Random) or random.Random()
         made.setstate(self.decode(node["random"]))
         return made
 
-    def _space(self, node: dict[str, Any], existing: Any) -> Any:
+    def _decode_space(self, node: dict[str, Any], existing: Any) -> Any:
         if isinstance(existing, spaces.Space):
             for part, state in zip(_subspaces(existing), self.decode(node["space"]), strict=True):
                 if state is not None:
                     part.np_random.bit_generator.state = state
         return existing
 
-    def _object(self, node: dict[str, Any], existing: Any) -> Any:
+    def _decode_object(self, node: dict[str, Any], existing: Any) -> Any:
         if type(existing).__qualname__ != node["object"]:
             found = type(existing).__qualname__
             raise ValueError(f"expected a {node['object']}, found a {found}: make it as it was made before")
@@ -202,9 +378,8 @@ _PLAIN_KINDS: dict[str, Callable[[Decoder, dict[str, Any]], Any]] = {
     "scalar": lambda decoder, node: decoder.arrays[node["scalar"]][()],
     "tensor": lambda decoder, node: decoder.tensors[node["tensor"]].clone(),
     "empty": lambda decoder, node: np.empty(node["empty"], dtype=object),
-    "tuple": lambda decoder, node: tuple(decoder.decode(part) for part in node["tuple"]),
     "set": lambda decoder, node: {decoder.decode(part) for part in node["set"]},
-    "deque": lambda decoder, node: deque((decoder.decode(part) for part in node["deque"]), maxlen=node["maxlen"]),
+    "frozenset": lambda decoder, node: frozenset(decoder.decode(part) for part in node["frozenset"]),
     "bytes": lambda decoder, node: bytes.fromhex(node["bytes"]),
 }
 
@@ -214,3 +389,27 @@ def _subspaces(space: spaces.Space) -> list[spaces.Space]:
     parts: Any = space.spaces if isinstance(space, (spaces.Dict, spaces.Tuple, spaces.OneOf)) else ()
     parts = parts.values() if isinstance(space, spaces.Dict) else parts
     return [space, *(inner for part in parts for inner in _subspaces(part))]
+
+
+def _name_of(thing: Any) -> str | None:
+    """What a function, a class or a module goes by, None for others; for a function within another, with what it does."""
+    if isinstance(thing, types.ModuleType):
+        return thing.__name__
+    if not isinstance(thing, (type, types.FunctionType, types.MethodType, types.BuiltinFunctionType)):
+        return None
+    name = f"{getattr(thing, '__module__', None)}.{getattr(thing, '__qualname__', '')}"
+    code = getattr(thing, "__code__", None)
+    if code is None or "<" not in name:
+        return name
+    constants = [one for one in code.co_consts if isinstance(one, (int, float, str, bytes))]
+    return f"{name}#{zlib.crc32(repr((code.co_code, code.co_names, constants)).encode()):08x}"
+
+
+def _find_enum(module: str, name: str, existing: Any) -> Any:
+    """An enumeration of a module that has been imported, or the one of the value that is there now; None without one."""
+    found: Any = type(existing)
+    if (found.__module__, found.__qualname__) != (module, name):
+        found = sys.modules.get(module)
+        for part in name.split("."):
+            found = getattr(found, "__dict__", {}).get(part)
+    return found if isinstance(found, type) and issubclass(found, Enum) else None

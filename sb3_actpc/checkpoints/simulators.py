@@ -5,9 +5,10 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper
 
-from sb3_actpc.checkpoints.encoding import Decoder, Encoder, OpaqueValue
+from sb3_actpc.checkpoints.encoding import Decoder, Encoder, LostValue, OpaqueValue
 
 # what the constructors make anew, and the time of the clock
 _SKIPPED = {"venv", "env", "class_attributes", "results_writer", "obs_spaces", "metadata", "_metadata", "spec", "_cached_spec"}
@@ -92,10 +93,11 @@ def restore_vec_env(env: VecEnv, record: dict[str, Any], decoder: Decoder) -> li
     for index, entry in enumerate(record["envs"]):
         one = innermost.envs[index] if isinstance(innermost, DummyVecEnv) else None
         reason = entry.get("reason") or _layers_mismatch(one, entry)
+        reasons = [reason] if reason else []
         if one is not None:
-            restore_env(one, entry, decoder, generators_only=reason is not None)
-        if reason is not None:
-            lost.append((index, reason))
+            reasons += _restore_layers(one, entry, decoder, starts_again=bool(reasons))
+        if reasons:
+            lost.append((index, "; ".join(reasons)))
     for wrapper, entry in zip(wrappers, record["wrappers"], strict=True):
         for name, node in entry["attributes"].items():
             set_attribute(wrapper, name, node, decoder)
@@ -105,25 +107,26 @@ def restore_vec_env(env: VecEnv, record: dict[str, Any], decoder: Decoder) -> li
 
 def capture_env(env: gym.Env[Any, Any], encoder: Encoder, where: str) -> dict[str, Any]:
     """The state of one environment, its wrappers and the environments that it holds as JSON, ``where`` being its path in the
-    checkpoint; with a "reason" where it cannot be stored."""
+    checkpoint; with a "reason" where it cannot be stored, and the numbers of the layers that are "lost"."""
     layers = _named_layers(env)
-    places = {id(layer): depth for depth, (_, layer) in enumerate(layers)}
-    record: dict[str, Any] = {"classes": [name for name, _ in layers], "layers": []}
-    for depth, (_, layer) in enumerate(layers):
-        attributes: dict[str, Any] = {}
-        for name, value in _layer_values(layer).items():
-            path = f"{where}.{depth}.{name}"
-            try:
-                if id(value) in places:
-                    attributes[name] = {"layer": places[id(value)]}
-                elif type(value).__name__ == "MjData" and type(value).__module__.startswith("mujoco"):
-                    attributes[name] = {"physics": encoder.encode(capture_physics(value.model, value), path)}
-                else:
-                    attributes[name] = encoder.encode(value, path)
-            except OpaqueValue as error:
-                record.setdefault("reason", str(error))
-        record["layers"].append(attributes)
-    return record
+    record: dict[str, Any] = {"classes": [name for name, _ in layers], "layers": [], "lost": []}
+    reasons = []
+    with encoder.environment([layer for _, layer in layers]):
+        for depth, (_, layer) in enumerate(layers):
+            attributes: dict[str, Any] = {}
+            record["layers"].append(attributes)
+            for name, value in _layer_values(layer).items():
+                path = f"{where}.{depth}.{name}"
+                try:
+                    if type(value).__name__ == "MjData" and type(value).__module__.startswith("mujoco"):
+                        attributes[name] = {"physics": encoder.encode(capture_physics(value.model, value), path)}
+                        encoder.add_memory(_physics_arrays(value), path)
+                    else:
+                        attributes[name] = encoder.encode_alone(value, path)
+                except OpaqueValue as error:
+                    reasons.append(str(error))
+                    record["lost"] = sorted({*record["lost"], depth})
+    return {**record, "reason": "; ".join(reasons)} if reasons else record
 
 
 def _layer_values(layer: gym.Env[Any, Any]) -> dict[str, Any]:
@@ -141,28 +144,47 @@ def _layers_mismatch(env: gym.Env[Any, Any] | None, entry: dict[str, Any]) -> st
     return f"it is made of {classes}, the checkpoint's of {entry.get('classes')}"
 
 
-def restore_env(env: gym.Env[Any, Any], entry: dict[str, Any], decoder: Decoder, generators_only: bool = False) -> None:
-    """Put back what :func:`capture_env` returned into an environment made as the captured one was, or the random generators
-    alone, where it has the same layer in the same place. ValueError when all of it is wanted and the layers differ."""
+def restore_env(env: gym.Env[Any, Any], entry: dict[str, Any], decoder: Decoder) -> None:
+    """Put back what :func:`capture_env` returned into an environment made as the captured one was. ValueError when the layers
+    differ, or something in them."""
     mismatch = _layers_mismatch(env, entry)
-    if mismatch and not generators_only:
-        raise ValueError(f"the environment cannot be set into the middle of an episode: {mismatch}")
-    layers, stored = _named_layers(env), zip(entry.get("classes", []), entry.get("layers", []), strict=True)
-    for (kind, layer), (stored_kind, attributes) in zip(layers, stored, strict=False):
-        if kind != stored_kind:
-            continue
-        for name, node in attributes.items():
-            if generators_only and not (isinstance(node, dict) and _GENERATORS & node.keys()):
-                continue
-            if name == _OWN_STATE:
-                layer.restore_checkpoint_state(decoder.decode(node))  # type: ignore[attr-defined]
-            elif isinstance(node, dict) and "layer" in node:
-                setattr(layer, name, layers[node["layer"]][1])
-            elif isinstance(node, dict) and "physics" in node:
-                data = getattr(layer, name)
-                restore_physics(data.model, data, decoder.decode(node["physics"]))
-            else:
-                set_attribute(layer, name, node, decoder)
+    reasons = [mismatch] if mismatch else _restore_layers(env, entry, decoder)
+    if reasons:
+        raise ValueError(f"the environment cannot be set into the middle of an episode: {'; '.join(reasons)}")
+
+
+def _restore_layers(env: gym.Env[Any, Any], entry: dict[str, Any], decoder: Decoder, starts_again: bool = False) -> list[str]:
+    """Put back what can be, and return what cannot. Where the episode ``starts_again`` that is each layer of the same class in
+    the same place that was stored whole, its physics left out, and of the others the random generators alone."""
+    layers, stored, reasons = _named_layers(env), entry.get("classes", []), []
+    present = [layer if [kind] == stored[place : place + 1] else None for place, (kind, layer) in enumerate(layers)]
+    lost = entry.get("lost", range(len(stored))) if "reason" in entry else ()
+    with decoder.environment(present):
+        for place, (layer, attributes) in enumerate(zip(present, entry.get("layers", []), strict=False)):
+            for name, node in attributes.items() if layer is not None else ():
+                kinds = {*node, node.get("kind")} if isinstance(node, dict) else set()
+                if (place in lost and not _GENERATORS & kinds) or (starts_again and "physics" in kinds):
+                    continue
+                try:
+                    _restore_attribute(layer, name, node, decoder)
+                except LostValue as error:
+                    reasons.append(f"{type(layer).__qualname__}.{name}: {error}")
+    for layer in present if starts_again or reasons else ():
+        if isinstance(layer, Monitor):
+            layer.needs_reset = True
+    if lost:
+        reasons.append(f"of {', '.join(stored[place] for place in lost)} the random generators alone go on")
+    return reasons
+
+
+def _restore_attribute(layer: Any, name: str, node: Any, decoder: Decoder) -> None:
+    if name == _OWN_STATE:
+        layer.restore_checkpoint_state(decoder.decode(node))
+    elif isinstance(node, dict) and "physics" in node:
+        data = getattr(layer, name)
+        restore_physics(data.model, data, decoder.decode(node["physics"]))
+    else:
+        set_attribute(layer, name, node, decoder)
 
 
 def set_attribute(owner: Any, name: str, node: Any, decoder: Decoder) -> None:
