@@ -17,7 +17,14 @@ from sb3_actpc.checkpoints.bundle import Report, find_bundle, list_bundles, warn
 from sb3_actpc.checkpoints.interrupts import StopSignals, TrainingStopped
 from sb3_actpc.checkpoints.settings import constructor_settings
 from sb3_actpc.checkpoints.simulators import env_name
-from sb3_actpc.checkpoints.state import Restored, capture_model, describe_model, restore_learning, restore_model
+from sb3_actpc.checkpoints.state import (
+    Restored,
+    callback_arguments,
+    capture_model,
+    describe_model,
+    restore_learning,
+    restore_model,
+)
 from sb3_actpc.utils.checks import check_finite
 
 
@@ -64,6 +71,7 @@ class CheckpointCallback(BaseCallback):
         self.report, self.restored = report, restored
         self.signals = StopSignals()
         self._others: list[BaseCallback] = []
+        self._made_with: dict[int, dict[str, str]] = {}  # what these were made with, by their ids
         self._env_id = ""
         self._last_saved = 0
 
@@ -78,7 +86,7 @@ class CheckpointCallback(BaseCallback):
         manifest = describe_model(model, self._env_id or env_name(self.training_env))
         manifest["settings"] = constructor_settings(model)
         with write_bundle(self.folder, model.num_timesteps, self.keep, manifest) as writer:
-            capture_model(model, self._others, writer)
+            capture_model(model, self._others, self._made_with, writer)
         self._last_saved = model.num_timesteps
         path = list_bundles(self.folder)[-1]
         if self.verbose:
@@ -126,12 +134,14 @@ class CheckpointCallback(BaseCallback):
     def _follow(self, callback: Any) -> None:
         """Take note of the task and of the callbacks beside this one."""
         self._env_id = env_name(self.training_env)
-        self._others = [one for one in callback_tree(callback) if one is not self]
+        others = [one for one in callback_tree(callback) if one is not self]
+        self._made_with = {id(one): self._made_with.get(id(one)) or callback_arguments(one) for one in others}
+        self._others = others
 
     def _resume(self) -> None:
         restored, self.restored = self.restored, None
         if restored is not None:
-            restore_learning(restored, self._others, self.report)
+            restore_learning(restored, self._others, self._made_with, self.report)
 
     def _resume_or_stop(self) -> None:
         self._resume()

@@ -1,9 +1,11 @@
 """What a checkpoint holds of an SB3 algorithm, and how it is put back."""
 
+import hashlib
 import inspect
+import json
 import random
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,7 +24,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_actpc.checkpoints.bundle import Bundle, BundleWriter, Report
-from sb3_actpc.checkpoints.encoding import Decoder, Encoder
+from sb3_actpc.checkpoints.encoding import Decoder, Encoder, OpaqueValue
 from sb3_actpc.checkpoints.simulators import capture_vec_env, env_name, restore_vec_env, set_attribute, vec_env_layers
 from sb3_actpc.utils.extras import installed_version
 
@@ -45,23 +47,26 @@ _BUFFER_CURSORS = ("pos", "full", "_current_ep_start")
 _NOISE_MATRICES = ("exploration_mat", "exploration_matrices")  # of SB3's state-dependent exploration
 _CALLBACK_SKIPPED = {"model", "locals", "globals", "parent", "callback", "callbacks", "logger"}
 _LOGGER_VALUES = ("name_to_value", "name_to_count", "name_to_excluded")
+# by the callback's id, what the attributes were made with that are named as arguments of its constructor
+MadeWith = Mapping[int, Mapping[str, str]]
 _RECORDED_PACKAGES = ("sb3-actpc", "stable-baselines3", "torch", "gymnasium", "mujoco", "numpy", "safetensors")
 
 
 @dataclass
 class Restored:
     """An agent that a checkpoint was put back into, and what can only be put back once ``learn`` has begun: the
-    checkpoint's plain values, and what decodes them."""
+    checkpoint's plain values, what decodes them, and whether the episodes that had begun start again."""
 
     model: BaseAlgorithm
     state: dict[str, Any]
     decoder: Decoder
+    starts_again: bool = False
 
 
 # ------------------------------------------------------------------ writing
 
 
-def capture_model(model: BaseAlgorithm, callbacks: Sequence[BaseCallback], writer: BundleWriter) -> None:
+def capture_model(model: BaseAlgorithm, callbacks: Sequence[BaseCallback], made_with: MadeWith, writer: BundleWriter) -> None:
     """Write everything that the rest of the training depends on, between two rollouts, or between two updates before the
     first; ValueError when a weight is not finite."""
     check_weights(model)
@@ -77,7 +82,7 @@ def capture_model(model: BaseAlgorithm, callbacks: Sequence[BaseCallback], write
         "env": capture_vec_env(model.env, encoder, "env"),
         "buffer": None if buffer is None else _capture_buffer(buffer, encoder, writer),
         "own": encoder.encode(own_state(model), "own"),
-        "callbacks": [[name, _capture_callback(callback, encoder, name)] for name, callback in named(callbacks)],
+        "callbacks": [[name, _capture_callback(one, encoder, name, made_with[id(one)])] for name, one in named(callbacks)],
         "logger": _capture_logger(model, encoder),
     }
     tensors = {name: tensor.cpu().contiguous().clone() for name, tensor in encoder.tensors.items()}
@@ -228,7 +233,24 @@ def _cut_running_episodes(buffer: ReplayBuffer) -> None:
 # ------------------------------------------------------------------ callbacks and logger
 
 
-def _capture_callback(callback: BaseCallback, encoder: Encoder, where: str) -> dict[str, Any]:
+def callback_arguments(callback: BaseCallback) -> dict[str, str]:
+    """A digest of each attribute that is named as an argument of the constructor, where it can be stored."""
+    digests = {}
+    for name in inspect.signature(type(callback).__init__).parameters.keys() & vars(callback).keys() - _CALLBACK_SKIPPED:
+        encoder = Encoder()
+        try:
+            node = encoder.encode(vars(callback)[name], name)
+        except OpaqueValue:
+            continue
+        digest = hashlib.sha256(json.dumps(node).encode())
+        parts: list[Any] = [*encoder.arrays.values(), *encoder.tensors.values()]
+        for part in parts:
+            digest.update(f"{part.dtype} {part.shape} {part.tolist()}".encode())
+        digests[name] = digest.hexdigest()
+    return digests
+
+
+def _capture_callback(callback: BaseCallback, encoder: Encoder, where: str, made_with: Mapping[str, str]) -> dict[str, Any]:
     if hasattr(callback, "checkpoint_state"):
         return {"own": encoder.encode(own_state(callback), where)}
     envs = {name: value for name, value in vars(callback).items() if isinstance(value, VecEnv)}
@@ -236,16 +258,24 @@ def _capture_callback(callback: BaseCallback, encoder: Encoder, where: str) -> d
     kept = {name: value for name, value in vars(callback).items() if name not in left_out}
     return {
         "attributes": encoder.encode_some(kept, where),  # of bars, figures and open files the new callback has its own
+        "changed": {
+            name: [made_with[name], encoder.encode(vars(callback)[name], f"{where}.{name}")]
+            for name, digest in callback_arguments(callback).items()
+            if made_with.get(name, digest) != digest
+        },
         "envs": {name: capture_vec_env(env, encoder, f"{where}.{name}") for name, env in envs.items()},
     }
 
 
-def _restore_callback(callback: BaseCallback, record: dict[str, Any], decoder: Decoder) -> None:
+def _restore_callback(callback: BaseCallback, record: dict[str, Any], decoder: Decoder, made_with: Mapping[str, str]) -> None:
     if "own" in record:
         callback.restore_checkpoint_state(decoder.decode(record["own"]))  # type: ignore[attr-defined]
         return
     for name, node in record["attributes"].items():
         set_attribute(callback, name, node, decoder)
+    for name, (argument, node) in record.get("changed", {}).items():
+        if made_with.get(name) == argument:  # else what is asked for now counts
+            set_attribute(callback, name, node, decoder)
     for name, env_record in record["envs"].items():
         restore_vec_env(vars(callback)[name], env_record, decoder)
 
@@ -308,17 +338,19 @@ def restore_model(model: BaseAlgorithm, bundle: Bundle, report: Report) -> Resto
     _restore_random(model, state, decoder)
     if lost:
         _start_episodes_again(model, lost, report)
-    return Restored(model, state, decoder)
+    return Restored(model, state, decoder, bool(lost))
 
 
-def restore_learning(restored: Restored, callbacks: Sequence[BaseCallback], report: Report) -> None:
+def restore_learning(restored: Restored, callbacks: Sequence[BaseCallback], made_with: MadeWith, report: Report) -> None:
     """Put back what the beginning of ``learn`` has changed or made: callbacks, logger, action noise, generators. A line is
-    reported for each callback without a match."""
+    reported for each callback without a match. Callbacks with ``cut_running_episodes`` are told where episodes start again."""
     model, state, decoder = restored.model, restored.state, restored.decoder
     present = dict(named(callbacks))
     for name, record in state["callbacks"]:
         if name in present:
-            _restore_callback(present[name], record, decoder)
+            _restore_callback(present[name], record, decoder, made_with[id(present[name])])
+            if restored.starts_again and hasattr(present[name], "cut_running_episodes"):
+                present[name].cut_running_episodes()  # type: ignore[attr-defined]
         elif "own" in record:
             report(f"the checkpoint holds the state of a callback {name}, which is not used now")
     if state["logger"] is not None:

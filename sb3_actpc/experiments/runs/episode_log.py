@@ -77,6 +77,10 @@ class EpisodeLog(CsvCallback):
     def _on_training_start(self) -> None:
         self.dense_returns = [0.0] * self.training_env.num_envs
 
+    def cut_running_episodes(self) -> None:
+        """The episodes begun will not be finished: a resumed run starts them again."""
+        self.dense_returns = [0.0] * len(self.dense_returns)
+
     def _on_step(self) -> bool:
         self.actions = zlib.crc32(np.ascontiguousarray(self.locals["actions"]).tobytes(), self.actions)
         for index, info in enumerate(self.locals["infos"]):
