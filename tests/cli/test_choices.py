@@ -1,7 +1,9 @@
 """What a user may choose on the command line: steps, settings, own environments, more steps, TensorBoard."""
 
 import json
+import os
 import shutil
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -10,8 +12,10 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from stable_baselines3 import TD3
+from stable_baselines3.common.callbacks import BaseCallback
 
 import sb3_actpc
+from sb3_actpc.checkpoints import TrainingStopped
 from sb3_actpc.cli import main
 from sb3_actpc.demonstrations import Demonstrations
 from sb3_actpc.experiments.runs import Run, finish_run
@@ -44,6 +48,19 @@ class Own(gym.Env):
 
 gym.register("Own-v0", Own)
 """
+
+
+class StopAt(BaseCallback):
+    """Tells its own process to stop."""
+
+    def __init__(self, step: int) -> None:
+        super().__init__()
+        self.step = step
+
+    def _on_step(self) -> bool:
+        if self.num_timesteps == self.step:
+            os.kill(os.getpid(), signal.SIGTERM)
+        return True
 
 
 def test_the_package_is_the_command() -> None:
@@ -170,6 +187,25 @@ def test_bringing_a_run_to_its_end_begins_goes_on_or_does_nothing() -> None:
     assert "40 steps from step 20" in lines[0]
     with pytest.raises(ValueError, match="mine holds another run"):
         finish_run(Run(**{**run.model_dump(), "settings": {"gamma": 0.5}}))
+
+
+def test_a_stopped_run_gets_the_steps_that_it_is_to_have_now() -> None:
+    """As a finished one does; fewer than it began with are none of its own."""
+    run = Run(env=ENV_ID, algo="td3", preset="small.yml", demonstrations="none", steps=40, output="mine", progress=False)
+    for steps, end in ((60, 60), (80, 80), (20, 80)):
+        Path("mine/result.json").unlink(missing_ok=True)
+        if steps == 60:
+            with pytest.raises(TrainingStopped):
+                finish_run(run, callbacks=[StopAt(10)])
+        assert finish_run(Run(**{**run.model_dump(), "n_timesteps": steps}))["timesteps"] == end
+    assert finish_run(run)["timesteps"] == 80
+
+
+def test_a_folder_of_another_kept_agent_is_refused() -> None:
+    run = Run(env=ENV_ID, algo="td3", preset="small.yml", demonstrations="none", steps=20, output="mine", progress=False)
+    assert finish_run(run)["timesteps"] == 20
+    with pytest.raises(ValueError, match=r"another run, with keep=last and not best: .*or give the old keep"):
+        finish_run(Run(**{**run.model_dump(), "keep": "best"}))
 
 
 def test_training_ends_at_the_return_that_was_aimed_at_with_the_best_agent() -> None:

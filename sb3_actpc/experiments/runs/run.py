@@ -101,7 +101,7 @@ def resume_run(
 
 def finish_run(run: Run, report: Report = silent, callbacks: Sequence[BaseCallback] = ()) -> dict[str, Any]:
     """Bring a run with its folder (``output``) to its end, whatever has become of it: begun now, gone on with from its newest
-    whole checkpoint, given more steps when it ended with fewer, or left alone when it is done. The caller holds the folder.
+    whole checkpoint, given more steps when it was to have fewer, or left alone when it is done. The caller holds the folder.
     See :func:`train_run`; ValueError also when the folder holds another run."""
     check_env_id(run.env, run.gym_packages)
     run, folder = resolve(run), run.folder
@@ -115,20 +115,22 @@ def finish_run(run: Run, report: Report = silent, callbacks: Sequence[BaseCallba
         (folder / CONFIG).unlink()
     if stored is not None and _content(stored) != _content(run):
         raise ValueError(f"{folder} holds another run, of other settings: choose another folder")
-    if stored is not None and stored.target_return != run.target_return:
-        raise ValueError(
-            f"{folder} holds another run, with target_return={stored.target_return} and not {run.target_return}: remove it, "
-            "choose another folder (--output; of `demos collect` --work-dir), or give the old target"
-        )
+    for name in ("target_return", "keep") if stored is not None else ():
+        old, new = getattr(stored, name), getattr(run, name)
+        if old != new:
+            raise ValueError(
+                f"{folder} holds another run, with {name}={old} and not {new}: remove it, choose another folder (--output; of "
+                f"`demos collect` --work-dir), or give the old {name}"
+            )
+    more = 0 if stored is None else (run.n_timesteps or 0) - (stored.n_timesteps or 0)
     if stored is not None and (folder / RESULT).is_file():
-        more = (run.n_timesteps or 0) - (stored.n_timesteps or 0)
         result = read_result(folder)
         if more <= 0 or (run.target_return is not None and result["dense_return"] >= run.target_return):
             return {**result, "folder": str(folder)}
         return resume_run(folder, report, run.progress, callbacks, more, is_held=True)
     if stored is not None and list_bundles(folder / CHECKPOINTS):
         try:
-            return resume_run(folder, report, run.progress, callbacks, is_held=True)
+            return resume_run(folder, report, run.progress, callbacks, max(more, 0), is_held=True)
         except DamagedCheckpoint as error:
             report(f"{error}: the run starts again")
     shutil.rmtree(folder / CHECKPOINTS, ignore_errors=True)
