@@ -55,6 +55,7 @@ AGENT, POLICIES, FEATURES = (f"actpc/{name}.py" for name in ("actpc", "policies"
 SIGNALS, SHOWN = "actpc/reward_signals.py", "actpc/demonstration_replay.py"
 BUFFERS, IMITATION = "actpc/buffers.py", "actpc/self_imitation.py"
 SIMULATORS, RESUMES = "checkpoints/simulators.py", "tests/checkpoints/test_exact_resume.py"
+ENCODING, HELD = "checkpoints/encoding.py", "tests/checkpoints/test_environments.py"
 CLONING, CLONES = "actpc/cloning.py", "tests/actpc/test_cloning.py"
 ROOM, ROOMS = "actpc/room.py", "tests/actpc/test_room.py"
 LEARNS, STORES = "tests/actpc/test_agent.py", "tests/actpc/test_buffers.py"
@@ -689,18 +690,92 @@ MUTANTS = [
     ),
     Mutant(
         "the simulator in use is forgotten",
-        SIMULATORS,
-        'setattr(layer, name, layers[node["layer"]][1])',
-        "pass",
+        ENCODING,
+        "existing) if layer is None else layer",
+        "existing) if layer is None else existing",
         f"{RESUMES} -k held",
     ),
-    Mutant("any simulator for any other", SIMULATORS, "if kind != stored_kind:", "if False:", f"{RESUMES} -k cannot"),
+    Mutant(
+        "any simulator for any other",
+        SIMULATORS,
+        "layer if [kind] == stored[place : place + 1] else None for",
+        "layer for",
+        f"{RESUMES} -k cannot",
+    ),
     Mutant(
         "examined in another simulator",
         SIMULATORS,
-        "if mismatch and not generators_only:",
-        "if False:",
+        "[mismatch] if mismatch else ",
+        "",
         "tests/experiments/test_examination.py -k held",
+    ),
+    Mutant("the first member of all", ENCODING, "else kind[member]", "else existing", f"{HELD} -k members"),
+    Mutant(
+        "the first method of all",
+        ENCODING,
+        "return types.MethodType(function, layer)",
+        "return existing",
+        f"{HELD} -k methods",
+    ),
+    Mutant(
+        "any function for any other",
+        ENCODING,
+        'node.get("name", name) == name:',
+        "True:",
+        f"{HELD} -k calls_for_code",
+    ),
+    Mutant("statistics lost", ENCODING, "gymnasium_utils.RunningMeanStd, ", "", f"{HELD} -k statistics"),
+    Mutant(
+        "one layer lost, all lost",
+        SIMULATORS,
+        'entry.get("lost", range(len(stored)))',
+        "range(len(stored))",
+        f"{HELD} -k beside",
+    ),
+    Mutant(
+        "a counter that is none",
+        ENCODING,
+        'return Counter(self._pairs(node["counter"], existing))',
+        'return self._pairs(node["counter"], existing)',
+        f"{HELD} -k dictionaries",
+    ),
+    Mutant("held twice, made twice", ENCODING, "if id(value) in self._met:", "if False:", f"{HELD} -k twice"),
+    Mutant("views become copies", ENCODING, "np.shares_memory(value, other)", "False", f"{HELD} -k memory"),
+    Mutant("one generator for two", ENCODING, " or id(existing) in self._used", "", f"{HELD} -k generator"),
+    Mutant(
+        "a return from two episodes",
+        "experiments/runs/episode_log.py",
+        "self.dense_returns = [0.0] * len(self.dense_returns)",
+        "pass",
+        f"{HELD} -k lost_beginning",
+    ),
+    Mutant(
+        "the argument of before",
+        "checkpoints/state.py",
+        "if made_with.get(name) == argument:",
+        "if True:",
+        "tests/checkpoints/test_callbacks.py",
+    ),
+    Mutant(
+        "arguments do not change",
+        "checkpoints/state.py",
+        "if made_with.get(name, digest) != digest",
+        "if False",
+        "tests/checkpoints/test_callbacks.py",
+    ),
+    Mutant(
+        "no more steps for a stopped run",
+        "experiments/runs/run.py",
+        "max(more, 0), is_held=True",
+        "0, is_held=True",
+        "tests/cli/test_choices.py -k stopped_run",
+    ),
+    Mutant(
+        "the best agent is the last",
+        "experiments/runs/run.py",
+        '("target_return", "keep")',
+        '("target_return",)',
+        "tests/cli/test_choices.py -k kept_agent",
     ),
     Mutant("changes lie crosswise", "ngc/products.py", ".t().contiguous()", ".t()", "tests/ngc/test_products.py -k shape"),
     Mutant("noise where there is no room", AGENT, " and self.room.is_wide", "", f"{ROOMS} -k without_a_word"),
