@@ -524,6 +524,34 @@ MUTANTS = [
         "tests/demonstrations/test_recording.py -k registered_time_limit",
     ),
     Mutant(
+        "demonstrations are weighed by default",
+        "envs/sparse_mujoco.py",
+        "return min(velocities, key=lambda one: float(np.abs(one - observed).mean()))",
+        "return velocities[0]",
+        "tests/envs/test_sparse_mujoco.py -k reward_weighs",
+    ),
+    Mutant(
+        "demonstrations are weighed as here",
+        "envs/sparse_mujoco.py",
+        "return min(velocities, key=lambda one: float(np.abs(one - observed).mean()))",
+        "return velocities[1]",
+        "tests/envs/test_sparse_mujoco.py -k reward_weighs",
+    ),
+    Mutant(
+        "given rates travel with the synapses",
+        CIRCUIT,
+        "persistent=self._keep_rates",
+        "persistent=True",
+        "tests/ngc/test_settling.py -k another_way",
+    ),
+    Mutant(
+        "adapted rates do not follow what is loaded",
+        CIRCUIT,
+        "if circuit._follows_loaded:",
+        "if False:",
+        "tests/ngc/test_settling.py -k another_way",
+    ),
+    Mutant(
         "demonstrations are paid by the task beneath a wrapper",
         "demonstrations/dataset.py",
         " or env.env_is_wrapped(gym.RewardWrapper, indices=[0])[0]",
@@ -1169,8 +1197,8 @@ MUTANTS = [
     Mutant(
         "a fallen robot's last step is healthy",
         SPARSE,
-        "healthy = healthy * ~demonstrations.terminations",
-        "healthy = healthy * 1.0",
+        'healthy_reward * ~(demonstrations.terminations & demonstrations.env_id.endswith("v5"))',
+        "healthy_reward * 1.0",
         f"{TASKS} -k demonstrat",
     ),
     Mutant(

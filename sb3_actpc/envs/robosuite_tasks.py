@@ -10,6 +10,7 @@ step); the random numbers are Gymnasium's.
 """
 
 import logging
+import numbers
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -71,13 +72,13 @@ class SparseRobosuiteEnv(gym.Env[np.ndarray, np.ndarray], utils.EzPickle):
         self.task: RobosuiteTask = robosuite_task(self.env_id)
         self._layout = self.task.layout(obs)
         for name, value in (("horizon", horizon), ("width", width), ("height", height)):
-            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+            if isinstance(value, bool) or not isinstance(value, numbers.Integral) or value < 1:
                 raise ValueError(f"{name}={value!r} must be a whole number of at least 1: give one, or leave it out")
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode={render_mode!r} is not available: choose 'rgb_array' or None")
         utils.EzPickle.__init__(self, obs, horizon, render_mode, camera, width, height)
-        self.obs, self.horizon, self.render_mode, self.camera = obs, horizon, render_mode, camera
-        self.width, self.height = width, height
+        self.obs, self.horizon, self.render_mode, self.camera = obs, int(horizon), render_mode, camera
+        self.width, self.height = int(width), int(height)
         self.observation_space = spaces.Box(-np.inf, np.inf, (self.task.obs_dim(obs),), np.float32)
         self.action_space = spaces.Box(-1.0, 1.0, (ACTION_DIM,), np.float32)
         self._simulation = make_simulation(self.task.name)

@@ -14,6 +14,7 @@ keywords are unchanged. The base task's reward is ``info["dense_reward"]``. Time
 
 from __future__ import annotations
 
+import inspect
 import math
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -29,13 +30,14 @@ if TYPE_CHECKING:
     from sb3_actpc.demonstrations.dataset import Demonstrations
 
 LOCOMOTION_CONDITIONS: tuple[str, ...] = ("displacement", "forward")
+_NUMBERS = (int, float, np.integer, np.floating)
 
 
 def _check_threshold(threshold: float | None, default: float, meaning: str, *, allow_zero: bool = False) -> float:
     """The threshold in use; ValueError if it is not a positive finite number, or with ``allow_zero`` 0."""
     if threshold is None:
         return default
-    is_number = isinstance(threshold, int | float) and not isinstance(threshold, bool)
+    is_number = isinstance(threshold, _NUMBERS) and not isinstance(threshold, bool)
     if not is_number or not (0.0 < threshold < math.inf or (allow_zero and threshold == 0.0)):
         kind = "finite number of at least 0" if allow_zero else "positive finite number"
         raise ValueError(f"threshold={threshold!r} must be a {kind} ({meaning}): give one, or None for {default}")
@@ -89,7 +91,7 @@ class SparseReacherEnv(_SparseMujocoEnv):
                 f"condition={kwargs['condition']!r} is not allowed here, the Reacher has one condition: leave it out, "
                 "`threshold` is its distance"
             )
-        if isinstance(miss_reward, bool) or not isinstance(miss_reward, int | float) or not -math.inf < miss_reward < 1.0:
+        if isinstance(miss_reward, bool) or not isinstance(miss_reward, _NUMBERS) or not -math.inf < miss_reward < 1.0:
             raise ValueError(f"miss_reward={miss_reward!r} must be a finite number below 1: give 0.0, or -1.0 for baselines")
         self.threshold = _check_threshold(threshold, self.default_threshold, "metres from the target")
         self.miss_reward = float(miss_reward)
@@ -161,8 +163,8 @@ class SparseLocomotionEnv(_SparseMujocoEnv):
         return observation, info
 
     def demonstrated_rewards(self, demonstrations: Demonstrations) -> np.ndarray:
-        """From the forward velocity within the base task's reward, with its default weights; the recorded ones where
-        ``dense_rewards`` is None."""
+        """From the forward velocity within the base task's reward, with its default weights or this environment's; the
+        recorded ones where ``dense_rewards`` is None."""
         if demonstrations.dense_rewards is None:
             return demonstrations.rewards
         velocities = self._demonstrated_velocities(demonstrations)
@@ -172,7 +174,7 @@ class SparseLocomotionEnv(_SparseMujocoEnv):
 
     def demonstrated_positions(self, demonstrations: Demonstrations) -> np.ndarray:
         """The observed positions, and the distance travelled along x (the Swimmer's y, not observed either, stays 0); needs
-        ``dense_rewards`` under the base task's default weights."""
+        ``dense_rewards`` under the base task's default weights, or this environment's."""
         assert self.model is not None
         positions = np.zeros((len(demonstrations), self.model.nq))
         positions[:, 0] = self._travelled(self._demonstrated_velocities(demonstrations), demonstrations)
@@ -186,19 +188,37 @@ class SparseLocomotionEnv(_SparseMujocoEnv):
         return np.concatenate([np.cumsum(velocities[start:end]) * self.dt for start, end in bounds])
 
     def _demonstrated_velocities(self, demonstrations: Demonstrations) -> np.ndarray:
-        """Forward velocities in metres per second, (N,) float64: the base reward without control cost and health."""
-        assert demonstrations.dense_rewards is not None
-        costs = self._ctrl_cost_weight * np.square(demonstrations.actions, dtype=np.float64).sum(axis=1)
-        healthy = getattr(self, "_healthy_reward", 0.0)
-        if demonstrations.env_id.endswith("v5"):  # -v4 pays it also on the step that falls
-            healthy = healthy * ~demonstrations.terminations
-        return (demonstrations.dense_rewards + costs - healthy) / self._forward_reward_weight
+        """Forward velocities in metres per second, (N,) float64: the base reward without control cost and health, weighed by
+        default or as here, whichever agrees better with the velocities that are observed."""
+        assert self.model is not None
+        base: Any = next(kind for kind in type(self).__mro__ if kind.__module__.startswith("gymnasium"))
+        arguments = inspect.signature(base.__init__).parameters
+        default = {name: arguments[name].default for name in _REWARD_WEIGHTS if name in arguments}
+        weighed = [default, {name: getattr(self, f"_{name}") for name in default}]
+        velocities = [_velocities(demonstrations, **weights) for weights in weighed]
+        if demonstrations.next_observations.shape[1:] != self.observation_space.shape:  # a wrapper shows something else
+            return velocities[0]
+        observed = demonstrations.next_observations[:, -self.model.nv]  # at the end of a step; Hopper and Walker2d clip it
+        return min(velocities, key=lambda one: float(np.abs(one - observed).mean()))
 
     def _sparse_reward(self, info: dict[str, Any]) -> tuple[float, bool]:
         is_far = bool(self.data.qpos[0] - self._start_x > self.distance)
         self._has_passed = self._has_passed or is_far
         is_paid = is_far if self.condition == "displacement" else bool(info["x_velocity"] > self.velocity)
         return float(is_paid), self._has_passed
+
+
+_REWARD_WEIGHTS = ("forward_reward_weight", "ctrl_cost_weight", "healthy_reward")
+
+
+def _velocities(
+    demonstrations: Demonstrations, forward_reward_weight: float, ctrl_cost_weight: float, healthy_reward: float = 0.0
+) -> np.ndarray:
+    assert demonstrations.dense_rewards is not None
+    costs = ctrl_cost_weight * np.square(demonstrations.actions, dtype=np.float64).sum(axis=1)
+    # -v4 pays health also on the step that falls
+    healthy = healthy_reward * ~(demonstrations.terminations & demonstrations.env_id.endswith("v5"))
+    return (demonstrations.dense_rewards + costs - healthy) / forward_reward_weight
 
 
 # metres, of LOGO's benchmark, and metres per second, our choice: the paper gives none. Of the steps of uniformly random

@@ -53,7 +53,7 @@ class NGCCircuit(nn.Module):
     :param feedback_rate: γ_e, learning rate of E over that of W (the paper: below 1). At 1 both take the same steps, from any
         optimiser that works element by element, so that without ``synaptic_scaling`` the gap E - W^T never grows
     :param derivative_free: leave out φ' in the state update (appendix)
-    :param synaptic_scaling: "none", "soft_bound" (no synapse passes ±``weight_bound``) or "column_norm" (no column of W,
+    :param synaptic_scaling: "none", "soft_bound" (none of W and E passes ±``weight_bound``) or "column_norm" (no column of W,
         and none of E^T, has a norm above ``weight_bound``); acts on the step after the optimiser
     :param weight_bound: the bound of ``synaptic_scaling``
     :param weight_decay: λ: before every change W, M and E shrink by 1 - ηλ (η the learning rate, as in AdamW); biases do not.
@@ -176,15 +176,29 @@ class NGCCircuit(nn.Module):
         self.synapses = Synapses(*map(list, (self.weights, self.biases, self.memory_weights, self.feedback_weights)))
 
     def _create_rates(self) -> None:
-        self.register_buffer("rates", th.zeros(max(1, self.n_hidden)))
         moves_by_rates = self.settling == "iterative" and self.dynamics != "krylov"
         self._keep_rates = moves_by_rates and self.settling_rate == "auto" and self.n_hidden > 0
+        self._follows_loaded = False
+        self.register_load_state_dict_post_hook(_follow_loaded)
+        # others are the constructor's, and do not travel with the synapses
+        self.register_buffer("rates", th.zeros(max(1, self.n_hidden)), persistent=self._keep_rates)
         if self._keep_rates:
             for name, matrix in self._coupling_matrices():
                 self.register_buffer(name, th.nn.functional.normalize(th.ones(matrix.shape[1]), dim=0))
             self.update_settling_rates(n_iterations=30)
         elif self.settling_rate != "auto":
             self.rates.fill_(float(self.settling_rate))
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
+        """Also synapses of a circuit that settles in another way: rates that are adapted follow from them."""
+        adapted = [prefix + name for name in ("rates", *(name for name, _ in self._coupling_matrices()))]
+        if not self._keep_rates:
+            for name in adapted:
+                state_dict.pop(name, None)
+        self._follows_loaded = self._keep_rates and not state_dict.keys() >= set(adapted)
+        if self._follows_loaded:
+            state_dict.update({name: getattr(self, name.removeprefix(prefix)) for name in adapted})
+        super()._load_from_state_dict(state_dict, prefix, *args)
 
     def mirror_feedback(self) -> None:
         """
@@ -386,6 +400,11 @@ class NGCCircuit(nn.Module):
         forward = norms[: self.n_hidden].tolist()
         feedback = norms[self.n_hidden :].tolist() or [self.feedback_scale * norm for norm in forward]
         self.rates.copy_(th.tensor(settling_rates(forward, feedback)))
+
+
+def _follow_loaded(circuit: NGCCircuit, _: Any) -> None:
+    if circuit._follows_loaded:
+        circuit.update_settling_rates(n_iterations=30)
 
 
 def _uniform(n_out: int, n_in: int, fan_in: int) -> nn.Parameter:

@@ -265,7 +265,7 @@ def test_a_wrong_keyword_is_named_with_what_is_allowed(kwargs: dict[str, Any], m
 
 
 def test_an_environment_survives_pickling() -> None:
-    env = gym.make("SparsePickPlaceCan-v0", horizon=7).unwrapped
+    env = gym.make("SparsePickPlaceCan-v0", horizon=np.int64(7)).unwrapped
     copy = pickle.loads(pickle.dumps(env))
     np.testing.assert_array_equal(env.reset(seed=8)[0], copy.reset(seed=8)[0])
     assert copy.horizon == 7

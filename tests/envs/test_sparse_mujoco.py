@@ -3,6 +3,7 @@
 import dataclasses
 import pickle
 import warnings
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -264,6 +265,8 @@ def test_bad_reacher_keywords_name_the_value_and_the_fix(env_id: str) -> None:
     for miss_reward in (1.0, float("-inf"), float("nan"), "no", False):
         with pytest.raises(ValueError, match=r"miss_reward=.* must be a finite number below 1: give"):
             gym.make(env_id, miss_reward=miss_reward)
+    env = gym.make(env_id, threshold=np.float32(0.5), miss_reward=np.int64(-1)).unwrapped
+    assert (env.threshold, env.miss_reward) == (0.5, -1.0) and type(env.miss_reward) is float
 
 
 @pytest.mark.parametrize("env_id", SPARSE_MUJOCO_IDS)
@@ -332,6 +335,28 @@ def test_demonstrations_recorded_under_one_condition_are_paid_as_live_under_anot
         assert np.array_equal(rewarded.rewards, live.rewards)
         assert 0 < rewarded.rewards.sum() < len(rewarded)
         assert rewarded.observations is recorded.observations
+
+
+@pytest.mark.parametrize(
+    ("env_id", "weights"),
+    [
+        ("SparseHalfCheetah-v5", {"ctrl_cost_weight": 1.0}),
+        ("SparseHalfCheetah-v5", {"forward_reward_weight": 2.0}),
+        ("SparseHopper-v5", {"healthy_reward": 0.0}),
+        ("SparseSwimmer-v5", {"ctrl_cost_weight": 1.0}),
+    ],
+)
+@pytest.mark.parametrize("is_own", [False, True])
+def test_demonstrations_are_paid_as_live_whatever_the_base_tasks_reward_weighs(
+    env_id: str, weights: Any, is_own: bool
+) -> None:
+    """Recorded with the default weights, or with the environment's own."""
+    options = {"condition": "forward", "threshold": 0.1}
+    recorded, live = record(env_id, 5, 50, **(weights if is_own else {})), record(env_id, 5, 50, **options)
+    env = make_vec_env(env_id, env_kwargs={**options, **weights})
+    assert np.array_equal(recorded.rewarded_by(env).rewards, live.rewards)
+    assert 0 < live.rewards.sum() < len(live)
+    env.close()
 
 
 def test_demonstrations_without_dense_rewards_keep_their_own() -> None:

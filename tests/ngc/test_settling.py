@@ -218,3 +218,31 @@ def test_a_missing_or_unwanted_memory_is_named():
         circuit.settle(x, target)
     with pytest.raises(ValueError, match="n_memory=0 but was given a memory of size 4"):
         make()[0].settle(x, target, th.zeros(7, 4, dtype=x.dtype))
+
+
+@pytest.mark.parametrize("feedback", ["tied", "learned"])
+def test_synapses_go_into_a_circuit_that_settles_in_another_way(feedback):
+    """Given rates are the constructor's, adapted ones follow from the synapses."""
+    ways = {
+        "sweep": {"settling": "scheduled"},
+        "krylov": {"dynamics": "krylov"},
+        "given": {"dynamics": "state", "settling_rate": 0.05},
+        "adapted": {"dynamics": "state"},
+    }
+    for name, way in ways.items():
+        circuit = NGCCircuit(4, 2, [8, 6], feedback=feedback, **way)
+        for weights in circuit.synapses.weights:
+            weights.mul_(30.0)
+        if name == "adapted":
+            circuit.update_settling_rates(n_iterations=30)
+        for other, other_way in ways.items():
+            loaded = NGCCircuit(4, 2, [8, 6], feedback=feedback, **other_way)
+            before = loaded.rates.clone()
+            loaded.load_state_dict(circuit.state_dict())
+            assert all(map(th.equal, loaded.synapses.weights, circuit.synapses.weights))
+            if other != "adapted":
+                assert th.equal(loaded.rates, before)
+            elif name == other:
+                assert th.equal(loaded.rates, circuit.rates)
+            else:
+                assert (loaded.rates < before).all()  # of larger synapses
