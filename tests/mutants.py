@@ -66,6 +66,7 @@ HABIT, TRIALS = "tests/actpc/test_habit.py", "actpc/habit.py"
 REGIONS, REGION = "tests/actpc/test_trust_region.py", "actpc/trust_region.py"
 CLOSED, EQUATIONS = "tests/ngc/test_closed_forms.py", "tests/actpc/test_equations.py"
 TASKS = "tests/envs/test_sparse_mujoco.py"
+PRESETS, TABLE = "experiments/runs/presets.py", "tests/experiments/comparison/test_table.py"
 SCORES, STABLE = (f"tests/experiments/report/test_{name}.py" for name in ("statistics", "r_stability"))
 
 MUTANTS = [
@@ -1255,6 +1256,7 @@ MUTANTS = [
         "else:",
         "tests/baselines/test_bc.py -k evaluated",
     ),
+    Mutant("a preset's noise stays", PRESETS, " or name in CAN_BE_NONE", "", f"{TABLE} -k left_out"),
     Mutant(
         "a file's own variant is not known by its name",
         "experiments/comparison/plan.py",

@@ -13,7 +13,7 @@ from stable_baselines3.common.env_checker import check_env as sb3_check_env
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
-from sb3_actpc.envs import SPARSE_MUJOCO_IDS, dense_env_id, register_envs
+from sb3_actpc.envs import SPARSE_MUJOCO_IDS, dense_env_id, register_envs, sparse_env_id
 from tests.recordings import record
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*out of date.*", "ignore:.*infinity.*")
@@ -311,6 +311,12 @@ def test_registering_again_changes_nothing() -> None:
     before = {env_id: gym.spec(env_id) for env_id in SPARSE_MUJOCO_IDS}
     register_envs()
     assert {env_id: gym.spec(env_id) for env_id in SPARSE_MUJOCO_IDS} == before
+
+
+def test_ids_with_a_module_are_the_same_tasks() -> None:
+    assert sparse_env_id("sb3_actpc.envs:GoalHopper-v5") == "sb3_actpc.envs:SparseHopper-v5"
+    assert sparse_env_id("Goals:Other-v0") == "Goals:Other-v0"
+    assert dense_env_id("sb3_actpc.envs:SparseHopper-v5") == "Hopper-v5"  # which is Gymnasium's
 
 
 def test_dense_env_id_names_the_base_task_or_lists_the_known_ids() -> None:

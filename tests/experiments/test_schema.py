@@ -97,6 +97,8 @@ def test_what_is_said_comes_before_the_preset_and_later_before_earlier() -> None
     run = resolve(Run(env="Pendulum-v1", preset="p.yml", steps=5, settings={"tau": 0.2, "noise_type": None}))
     assert (run.n_timesteps, run.settings, run.noise_type) == (5, {"gamma": 0.9, "tau": 0.2}, None)
     assert (run.eval_freq, run.checkpoint_freq) == (1, 1)
+    quiet = resolve(Run(env="Pendulum-v1", preset="p.yml", noise_type=None))  # None, where it is said, comes before it too
+    assert (quiet.noise_type, quiet.noise_std) == (None, None)
 
 
 def test_a_dotted_key_changes_one_value_of_a_mapping() -> None:

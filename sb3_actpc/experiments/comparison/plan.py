@@ -9,7 +9,7 @@ from sb3_actpc.demonstrations import fit_demonstrations
 from sb3_actpc.experiments.comparison.variants import ablation_variants, find_variant, parse_variant, part_of_run
 from sb3_actpc.experiments.runs import Run, resolve
 from sb3_actpc.experiments.runs.environments import check_env_id, make_train_env
-from sb3_actpc.experiments.runs.presets import read_yaml
+from sb3_actpc.experiments.runs.presets import CAN_BE_NONE, read_yaml
 from sb3_actpc.experiments.runs.schema import Count, Schema, Seed, merged
 from sb3_actpc.utils.files import folder_name
 
@@ -31,11 +31,11 @@ def read_comparison(given: Mapping[str, Any]) -> Comparison:
     """:param given: ``envs`` (ids, or mappings with ``env`` and other keys of a :class:`~sb3_actpc.experiments.runs.Run`),
         ``algos`` (names, or mappings: see :func:`~sb3_actpc.experiments.comparison.variants.parse_variant`), ``ablate`` (true
         adds the ablations), ``seeds``, ``first_seed``, ``output``, and keys of a run that hold for all. Values of None count
-        as not given
+        as not given, but for ``noise_type`` and ``normalize``, where they leave the preset's out
     :return: the comparison
     :raises ValueError: when a key is unknown or a value is wrong
     """
-    given = {str(key): value for key, value in given.items() if value is not None}
+    given = {str(key): value for key, value in given.items() if value is not None or key in CAN_BE_NONE}
     own = {key: given.pop(key) for key in OWN_KEYS if key in given}
     shared = part_of_run({"eval_episodes": 10, "continuable": False, **given}, OWN_KEYS)
     variants = [parse_variant(entry) for entry in _list(own, "algos")]

@@ -29,6 +29,7 @@ from sb3_actpc.utils.preset_files import preset_path
 
 # keys of a preset, as rl-zoo3 has them, that are not the algorithm's
 RUN_KEYS = ("n_timesteps", "n_envs", "policy", "env_kwargs", "noise_type", "noise_std", "normalize")
+CAN_BE_NONE = ("noise_type", "noise_std", "normalize")  # None, where a run says it, leaves the preset's out
 _ACTIVATIONS: dict[str, type[nn.Module]] = {"relu": nn.ReLU, "tanh": nn.Tanh, "elu": nn.ELU, "leaky_relu": nn.LeakyReLU}
 
 
@@ -74,11 +75,12 @@ def resolve(run: Run) -> Run:
     if not run.env:
         raise ValueError("env is missing: give a Gymnasium id, such as SparseHopper-v5")
     algorithm = load_algorithm(run.algo)
-    is_noise_chosen = "noise_type" in run.settings  # None leaves the preset's out
+    is_noise_chosen = "noise_type" in {*run.settings, *run.model_fields_set}
     settings = with_changes(load_preset(run.preset or run.algo, run.env), run.settings)
     entries = {name: settings.pop(name, None) for name in RUN_KEYS}
     preset = Run(**{name: value for name, value in entries.items() if value is not None})
-    chosen = {name: getattr(run, name) for name in run.model_fields_set - {"settings"} if getattr(run, name) is not None}
+    said = {name: getattr(run, name) for name in run.model_fields_set - {"settings"}}
+    chosen = {name: value for name, value in said.items() if value is not None or name in CAN_BE_NONE}
     run = Run(**merged(preset, Run(**chosen)))
     if run.n_timesteps is None:
         raise ValueError(f"n_timesteps is neither in the preset {run.preset_name!r} nor given: give --steps")

@@ -91,7 +91,7 @@ class Schema(BaseModel):
 class Run(Schema):
     """One training run, or a part of what is said about it; ValueError, in one line that names the value, when one is wrong.
     What is None is by default the preset's, if it can say so, and is filled in by
-    :func:`~sb3_actpc.experiments.runs.presets.resolve`."""
+    :func:`~sb3_actpc.experiments.runs.presets.resolve`; None that is said for ``noise_type`` or ``normalize`` is none."""
 
     env: str = ""  # Gymnasium id of the task
     algo: Annotated[str, AfterValidator(known_algorithm)] = "actpc"  # key of ``ALGORITHMS``

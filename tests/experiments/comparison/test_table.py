@@ -106,6 +106,17 @@ def test_variants_and_tasks_of_a_file_have_settings_of_their_own() -> None:
     assert {key: runs[1].settings[key] for key in ("actor_pressure", "gamma")} == {"actor_pressure": 0.0, "gamma": 0.5}
 
 
+def test_what_a_preset_says_can_be_left_out() -> None:
+    """In all runs, those of a task, and those of a variant, which otherwise would be another's twin."""
+    plain = {"name": "plain", "algo": "ppo", "normalize": False}
+    given: dict[str, Any] = {"envs": ["Pendulum-v1"], "algos": ["ppo", plain], "demonstrations": "none"}
+    assert [run.normalize for run in plan(**given)] == [{"gamma": 0.99}, None]
+    assert [run.normalize for run in plan(**{**given, "algos": ["ppo"], "normalize": False})] == [None]
+    quiet = {"env": "SparseHopper-v5", "noise_type": None}
+    assert [run.noise_type for run in plan(envs=[quiet], algos=["td3"])] == [None]
+    assert [run.noise_type for run in plan(algos=["td3"], noise_type=None)] == [None]
+
+
 def test_an_algorithm_can_be_chosen_by_the_name_that_a_file_gives_it(capsys: pytest.CaptureFixture[str]) -> None:
     own = {"base": "refresh_alone", "name": "slow", "steps": 20}
     content = {"envs": ["SparseReacher-v5"], "algos": [own], "n_timesteps": 70}
@@ -139,6 +150,8 @@ def test_ablate_adds_the_base_and_the_ablations() -> None:
 def test_a_variant_on_another_version_of_the_task_stands_beside_the_others() -> None:
     [run] = plan(envs=["SparseHopper-v5"], algos=["her"])
     assert (run.task, run.env) == ("SparseHopper-v5", "GoalHopper-v5")
+    [named] = plan(envs=["sb3_actpc.envs:SparseHopper-v5"], algos=["her"])  # with the same demonstrations
+    assert named.env == "sb3_actpc.envs:GoalHopper-v5" and named.demonstrations_sha256 == run.demonstrations_sha256
 
 
 @pytest.mark.parametrize(

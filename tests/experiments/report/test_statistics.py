@@ -93,6 +93,7 @@ def test_random_actions_score_nothing_and_the_demonstrators_one() -> None:
     for task in ("HalfCheetah", "Hopper", "Reacher", "Swimmer", "Walker2d"):
         committed = reference_score(f"Sparse{task}-v5")
         assert committed is not None and committed.demonstrators > committed.random
+        assert reference_score(f"sb3_actpc.envs:Sparse{task}-v5") == committed
     assert reference_score("Unknown-v0") is None
 
 
