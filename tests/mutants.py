@@ -1258,6 +1258,13 @@ MUTANTS = [
     ),
     Mutant("a preset's noise stays", PRESETS, " or name in CAN_BE_NONE", "", f"{TABLE} -k left_out"),
     Mutant(
+        "a goal task with a module has no demonstrations",
+        "envs/__init__.py",
+        "if name in GOAL_MUJOCO_IDS",
+        "if env_id in GOAL_MUJOCO_IDS",
+        TABLE,
+    ),
+    Mutant(
         "a file's own variant is not known by its name",
         "experiments/comparison/plan.py",
         "own.get(name, name) for name",

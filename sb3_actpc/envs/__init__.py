@@ -35,8 +35,10 @@ def register_envs() -> None:
 
 
 def sparse_env_id(env_id: str) -> str:
-    """Id of the sparse task behind a goal task: ``SparseHopper-v5`` of ``GoalHopper-v5``; another id is returned as it is."""
-    return env_id.replace("Goal", "Sparse", 1) if env_id in GOAL_MUJOCO_IDS else env_id
+    """Id of the sparse task behind a goal task: ``SparseHopper-v5`` of ``GoalHopper-v5``, with a module where it had one;
+    another id is returned as it is."""
+    module, colon, name = env_id.rpartition(":")
+    return f"{module}{colon}{name.replace('Goal', 'Sparse', 1)}" if name in GOAL_MUJOCO_IDS else env_id
 
 
 def dense_env_id(env_id: str) -> str:

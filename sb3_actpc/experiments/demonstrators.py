@@ -59,10 +59,10 @@ def demonstrator_run(
     """
     if algo not in DEMONSTRATOR_ALGORITHMS:
         raise ValueError(f"algo={algo!r} is not one of {', '.join(DEMONSTRATOR_ALGORITHMS)}: choose one of these")
-    known = env_id.rpartition(":")[2]  # this package's ids may come with its module
+    known = sparse_env_id(env_id.rpartition(":")[2])  # this package's ids may come with its module
     if known in ROBOSUITE_IDS:
         raise ValueError(f"env_id={env_id!r} has no dense reward to learn by: use its scripted demonstrators")
-    learned_id = dense_env_id(sparse_env_id(known)) if sparse_env_id(known) in SPARSE_MUJOCO_IDS else env_id
+    learned_id = dense_env_id(known) if known in SPARSE_MUJOCO_IDS else env_id
     if n_timesteps is None:
         check_env_id(learned_id, gym_packages)
         limit = gym.spec(learned_id).max_episode_steps

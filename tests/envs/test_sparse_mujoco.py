@@ -316,7 +316,6 @@ def test_registering_again_changes_nothing() -> None:
 def test_ids_with_a_module_are_the_same_tasks() -> None:
     assert sparse_env_id("sb3_actpc.envs:GoalHopper-v5") == "sb3_actpc.envs:SparseHopper-v5"
     assert sparse_env_id("Goals:Other-v0") == "Goals:Other-v0"
-    assert dense_env_id("sb3_actpc.envs:SparseHopper-v5") == "Hopper-v5"  # which is Gymnasium's
 
 
 def test_dense_env_id_names_the_base_task_or_lists_the_known_ids() -> None:

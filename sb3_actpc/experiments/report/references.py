@@ -46,8 +46,8 @@ def paper_results(env_id: str | None = None) -> pd.DataFrame:
 
 @cache
 def reference_score(env_id: str) -> ReferenceScore | None:
-    """The scores of a task; None where none were measured."""
-    row = pd.read_csv(SCORES_FILE, index_col="env").dropna().T.get(env_id)
+    """The scores of a task, with a module or without; None where none were measured."""
+    row = pd.read_csv(SCORES_FILE, index_col="env").dropna().T.get(env_id.rpartition(":")[2])
     return None if row is None else ReferenceScore(float(row.random_score), float(row.demonstrators_score), row.measure)
 
 
