@@ -1264,6 +1264,7 @@ MUTANTS = [
         "if env_id in GOAL_MUJOCO_IDS",
         TABLE,
     ),
+    Mutant("the aim is no part of a run", "experiments/runs/schema.py", '"target_return",', "", f"{TABLE} -k follows"),
     Mutant(
         "a file's own variant is not known by its name",
         "experiments/comparison/plan.py",

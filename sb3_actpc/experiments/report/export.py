@@ -8,7 +8,7 @@ from typing import Any
 from sb3_actpc.experiments.report.figures import draw_curves
 from sb3_actpc.experiments.report.results import CURVES, SETTINGS, load_results, write_runs
 from sb3_actpc.experiments.runs.record import CONFIG, read_config
-from sb3_actpc.experiments.runs.schema import CONTENT, content_id
+from sb3_actpc.experiments.runs.schema import content, content_id
 from sb3_actpc.utils.files import atomic_write, folder_name
 
 
@@ -21,7 +21,7 @@ def export(folder: Path, target: Path) -> list[Path]:
     settings: dict[str, Any] = {}
     for path in sorted(folder.glob(f"*/*/seed[0-9]*_*/{CONFIG}")):
         config = read_config(path.parent)
-        settings[content_id(config)] = {name: config[name] for name in CONTENT if config.get(name) is not None}
+        settings[content_id(config)] = content(config)
     curves = results.evaluations[["run", *results.evaluations.columns.drop("run")]]
     with atomic_write(target / CURVES) as binary, gzip.GzipFile("", "wb", fileobj=binary, mtime=0) as packed:
         packed.write(curves.to_csv(index=False, float_format="%.6g").encode())

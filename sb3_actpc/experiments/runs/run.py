@@ -138,8 +138,10 @@ def finish_run(run: Run, report: Report = silent, callbacks: Sequence[BaseCallba
 
 
 def _content(run: Run) -> str:
-    """An id of what must not change; the policy may have been fitted to the observations, and ``eval_freq`` to the steps."""
-    return content_id({**run.model_dump(), "n_timesteps": None, "policy": None, "eval_freq": None}, run.seed)
+    """An id of what must not change; the policy may have been fitted to the observations, and ``eval_freq`` to the steps;
+    ``target_return`` and ``keep`` are compared by name."""
+    free = ("n_timesteps", "policy", "eval_freq", "target_return", "keep")
+    return content_id({**run.model_dump(), **dict.fromkeys(free)}, run.seed)
 
 
 def _run(run: Run, report: Report, callbacks: Sequence[BaseCallback], resumes: bool, is_held: bool) -> dict[str, Any]:

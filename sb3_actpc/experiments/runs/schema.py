@@ -33,6 +33,8 @@ CONTENT = (
     "demonstrations_sha256",
     "eval_freq",
     "eval_episodes",
+    "target_return",
+    "keep",
 )
 # what resolve() and the beginning of the training fill in
 FILLED = ("is_resolved", "demonstrations_sha256", "demonstrators_return", "versions", "git_commit", "dirty")
@@ -166,11 +168,15 @@ def merged(*parts: Run) -> dict[str, Any]:
     return said
 
 
+def content(record: Mapping[str, Any]) -> dict[str, Any]:
+    """As much of a run's ``config.json`` as decides the outcome; ``keep`` where it is not the default, as ids are older."""
+    known = {name: record[name] for name in CONTENT if record.get(name) is not None}
+    return {name: value for name, value in known.items() if (name, value) != ("keep", "last")}
+
+
 def content_id(record: Mapping[str, Any], seed: int | None = None) -> str:
-    """Ten hex digits from as much of a run's ``config.json`` as decides the outcome; without a seed, an id that all seeds
-    share."""
-    content = {name: record[name] for name in CONTENT if record.get(name) is not None}
-    text = json.dumps({**content, "seed": seed}, sort_keys=True)
+    """Ten hex digits from the :func:`content` of a run's ``config.json``; without a seed, an id that all seeds share."""
+    text = json.dumps({**content(record), "seed": seed}, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:10]
 
 

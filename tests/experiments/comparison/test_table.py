@@ -13,6 +13,7 @@ from sb3_actpc.experiments.comparison import ablation_variants, find_variant, pl
 from sb3_actpc.experiments.runs import ALGORITHMS, Run
 from sb3_actpc.experiments.runs.algorithms import check_keywords, load_algorithm
 from sb3_actpc.experiments.runs.presets import with_changes
+from sb3_actpc.experiments.runs.schema import content_id
 from tests.experiments.comparison.tasks import small_runs, write_preset
 
 HOPPER = str(shipped_demonstrations("SparseHopper-v5"))
@@ -57,10 +58,14 @@ def test_seeds_that_nothing_was_chosen_on_can_be_asked_for() -> None:
 def test_an_id_follows_the_content_of_a_run_and_nothing_else() -> None:
     [run] = plan(steps=500)
     assert plan(steps=500, threads=2, checkpoint_freq=7)[0].id == run.id  # how it is run is not what is run
+    unsaid = run.model_dump(exclude={"keep", "target_return"})  # by a version that did not count them
+    assert plan(steps=500, keep="last")[0].id == run.id == content_id(unsaid, run.seed)
     others = [
         plan(steps=501),
         plan(steps=500, demonstrations="none"),
         plan(steps=500, eval_episodes=3),
+        plan(steps=500, target_return=100.0),
+        plan(steps=500, keep="best"),
         plan(steps=500, algos=["refresh_alone"]),
         plan(steps=500, envs=[{"env": "SparseReacher-v5", "env_kwargs": {"threshold": 0.1}}]),
         plan(steps=500, seeds=2)[1:],
