@@ -66,6 +66,7 @@ HABIT, TRIALS = "tests/actpc/test_habit.py", "actpc/habit.py"
 REGIONS, REGION = "tests/actpc/test_trust_region.py", "actpc/trust_region.py"
 CLOSED, EQUATIONS = "tests/ngc/test_closed_forms.py", "tests/actpc/test_equations.py"
 TASKS = "tests/envs/test_sparse_mujoco.py"
+REPORTS = "tests/experiments/report/test_report.py"
 PRESETS, TABLE = "experiments/runs/presets.py", "tests/experiments/comparison/test_table.py"
 SCORES, STABLE = (f"tests/experiments/report/test_{name}.py" for name in ("statistics", "r_stability"))
 
@@ -1265,6 +1266,20 @@ MUTANTS = [
         TABLE,
     ),
     Mutant("the aim is no part of a run", "experiments/runs/schema.py", '"target_return",', "", f"{TABLE} -k follows"),
+    Mutant(
+        "a second number of steps hides the first",
+        "experiments/report/results.py",
+        "nunique().max() == 1",
+        "nunique().max() > 1",
+        f"{REPORTS} -k second_number",
+    ),
+    Mutant(
+        "ablations beside another base",
+        "experiments/report/ablations.py",
+        "== known.loc[base, ALIKE]",
+        "== known[ALIKE]",
+        f"{REPORTS} -k second_number",
+    ),
     Mutant(
         "a file's own variant is not known by its name",
         "experiments/comparison/plan.py",

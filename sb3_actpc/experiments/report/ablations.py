@@ -14,19 +14,26 @@ from sb3_actpc.experiments.report.statistics import mean_interval
 from sb3_actpc.utils.files import folder_name
 
 NO_EFFECT = "NO: the part did nothing"
+ALIKE = ["planned_steps", "demonstrations"]  # what a base and its ablations share
 
 
-def ablation_groups(results: Results, task: str) -> dict[str, pd.DataFrame]:
-    """Label -> runs on a task, the base first and then the ablations; empty without base or ablation."""
-    groups, variants = results.groups(task), ablation_variants()
-    found = {variant.name: groups[variant.name] for variant in variants if variant.name in groups}
-    return found if variants[0].name in found and len(found) > 1 else {}
+def ablation_groups(results: Results, task: str) -> list[dict[str, pd.DataFrame]]:
+    """Label -> runs on a task, for each base: the base first, and then the ablations (none, maybe) that are like it but for
+    the part that they lack."""
+    groups, order = results.groups(task), [variant.name for variant in ablation_variants()]
+    first = pd.DataFrame([runs.iloc[0] for runs in groups.values()], index=list(groups))
+    known = first[first["variant"].isin(order)].sort_values("variant", key=lambda names: names.map(order.index), kind="stable")
+    found, is_base = [], known["variant"] == order[0]
+    for base in known.index[is_base]:
+        alike = (known[ALIKE] == known.loc[base, ALIKE]).all(axis="columns") & ~is_base
+        found.append({label: groups[label] for label in (base, *known.index[alike])})
+    return found
 
 
 def without_effect(results: Results, task: str) -> list[str]:
-    """Names of the ablations on a task whose removal of a part changed not one action in any seed."""
-    names, runs = list(found := ablation_groups(results, task)), list(found.values())
-    return [name for name, own in zip(names[1:], runs[1:], strict=True) if changed_actions(results, runs[0], own) is False]
+    """Labels of the ablations on a task whose removal of a part changed not one action in any seed."""
+    groups = [list(group.items()) for group in ablation_groups(results, task)]
+    return [label for (_, base), *rest in groups for label, own in rest if changed_actions(results, base, own) is False]
 
 
 def changed_actions(results: Results, base: pd.DataFrame, other: pd.DataFrame) -> bool | None:
@@ -39,12 +46,26 @@ def changed_actions(results: Results, base: pd.DataFrame, other: pd.DataFrame) -
 
 
 def ablation_sections(results: Results, task: str, folder: Path) -> list[Section]:
-    """Of the report on a task, with its figure in ``folder``; none without ablations."""
-    found = ablation_groups(results, task)
-    if not found:
+    """Of the report on a task, with their figures in ``folder``: one for each base, none without ablations."""
+    names = {variant.name for variant in ablation_variants()[1:]}
+    if names.isdisjoint(results.finished.loc[results.finished["task"] == task, "variant"]):
         return []
-    picture, measure = f"ablations_{folder_name(task)}.png", measure_of(task)
-    draw_ablation({name: runs[measure].to_numpy() for name, runs in found.items()}, measure, task, folder / picture)
+    groups, sections = ablation_groups(results, task), []
+    for place, found in enumerate(groups, 1):
+        base = next(iter(found))
+        title = f"What each part is worth: {task}{f', {base}' if len(groups) > 1 else ''}"
+        if len(found) > 1:
+            picture = f"ablations_{folder_name(task)}{f'_{place}' if place > 1 else ''}.png"
+            sections.append(_section(results, task, found, title, folder / picture))
+        else:
+            sections.append(Section(title, f"Left out: no ablation has as many steps as {base}, and its demonstrations."))
+    return sections
+
+
+def _section(results: Results, task: str, found: dict[str, pd.DataFrame], title: str, picture: Path) -> Section:
+    """Of a base and its ablations, which are drawn as well."""
+    measure = measure_of(task)
+    draw_ablation({name: runs[measure].to_numpy() for name, runs in found.items()}, measure, task, picture)
     form = ".2f" if measure == "success_rate" else ".1f"
     about = {variant.name: variant.about for variant in ablation_variants()}
     base, rows = next(iter(found)), []
@@ -57,7 +78,7 @@ def ablation_sections(results: Results, task: str, folder: Path) -> list[Section
         rows.append(
             {
                 "variant": name,
-                "without": about[name],
+                "without": about[runs["variant"].iloc[0]],
                 "seeds": str(len(values)),
                 f"evaluation: {MEASURE_NAMES[measure]}": mean_and_deviation(values, form),
                 "95 % interval": interval((low, high), form),
@@ -70,7 +91,7 @@ def ablation_sections(results: Results, task: str, folder: Path) -> list[Section
         "gradient at the end of training: cosine of the two, and ratio of their norms (mean over seeds)."
     )
     caption = f"{task}: ablations, mean and 95 % interval over seeds"
-    return [Section(f"What each part is worth: {task}", text, pd.DataFrame(rows), picture, caption)]
+    return Section(title, text, pd.DataFrame(rows), picture.name, caption)
 
 
 def arriving_gradient(results: Results, run: str) -> list[tuple[float, float]]:

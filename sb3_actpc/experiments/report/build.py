@@ -142,11 +142,12 @@ def _aggregate_sections(results: Results, folder: Path) -> list[Section]:
     on_all = {str(label): parts for label, parts in by_label.items() if len(parts) == len(tasks)}
     whole = {label: [parts[task].to_numpy() for task in tasks] for label, parts in on_all.items()}
     if not whole:
-        return []
+        text = f"Left out: none of {', '.join(sorted(map(str, by_label)))} has runs on all of {', '.join(tasks)}."
+        return [Section("Across tasks", text)] if tasks else []
     means = {name: statistics.interquartile_mean(scores) for name, scores in whole.items()}
     figures.draw_aggregates(means, whole, folder / "aggregates.png")
     left_out = sorted(set(map(str, by_label)) - set(whole))
-    missing = f" Left out, because not run on every one: {', '.join(left_out)}." if left_out else ""
+    missing = f" Left out, because not every task has runs of that name: {', '.join(left_out)}." if left_out else ""
     text = (
         "The dense return (of robosuite's tasks, the success) of the last evaluation, normalised so that random actions are 0 "
         f"and the shipped demonstrators 1, over {', '.join(tasks)}. Intervals: 95 %, stratified bootstrap, left open for "

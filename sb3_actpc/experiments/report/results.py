@@ -34,7 +34,7 @@ class Results:
     :param runs: a row for each run, indexed by its folder's name: ``task``, ``variant``, ``algorithm``, ``settings`` (an id
         that runs share which differ in their seeds alone), ``demonstrations``, ``seed``, ``status``, ``steps``, what it
         reached (see :func:`run_measures`), ``seconds``, ``versions``, ``commit``, ``dirty`` (from a source tree with changes)
-        and ``label``: the variant's name, with a part of ``settings`` where several go by that name
+        and ``label``: the variant's name, and where several settings go by that name what tells them apart
     :param evaluations: the rows of ``progress.csv``, with the column ``run``
     :param episodes: the rows of ``episodes.csv`` likewise: every training episode; empty for an export
     :param diagnostics: what the agents logged about themselves, likewise
@@ -149,13 +149,21 @@ def _run_row(folder: Path, evaluations: pd.DataFrame, episodes: pd.DataFrame) ->
 
 
 def _labelled(runs: pd.DataFrame) -> pd.DataFrame:
+    return runs.assign(label=pd.concat([_labels(own) for _, own in runs.groupby("variant")]))
+
+
+def _labels(runs: pd.DataFrame) -> pd.Series:
+    """Of one variant's runs: its name, and where some task has several settings of that name the steps or demonstrations, on
+    every task, if these tell them apart; else, on that task alone, a part of their ids."""
     finished = runs[runs["status"] == FINISHED]
-    several = finished.groupby(["task", "variant"])["settings"].nunique() > 1
-    labels = [
-        f"{variant} [{settings[:4]}]" if several.get((task, variant), False) else variant
-        for task, variant, settings in zip(runs["task"], runs["variant"], runs["settings"], strict=True)
-    ]
-    return runs.assign(label=labels)
+    counts = finished.groupby("task")["settings"].nunique()
+    several = counts.index[counts > 1]
+    if several.empty:
+        return runs["variant"]
+    for column, form in (("planned_steps", " [{:,} steps]"), ("demonstrations", " [demonstrations: {}]")):
+        if finished.groupby(["task", column])["settings"].nunique().max() == 1:
+            return runs["variant"] + runs[column].map(form.format)
+    return runs["variant"] + (" [" + runs["settings"].str[:4] + "]").where(runs["task"].isin(several), "")
 
 
 def write_runs(results: Results, folder: Path) -> Path:

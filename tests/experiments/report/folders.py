@@ -30,10 +30,11 @@ def write_run(
     finished: bool = True,
     commit: str | None = None,
     dirty: bool = False,
+    steps: int = 1000,
     **settings: Any,
 ) -> Path:
-    """A run of 1000 steps, with the given dense returns of its training episodes and of its last evaluation."""
-    folder = out / folder_name(task) / variant / f"seed{seed}_{abs(hash((variant, seed, str(settings)))):010x}"
+    """A run that was to have 1000 steps, with the given dense returns of its training episodes and of its last evaluation."""
+    folder = out / folder_name(task) / variant / f"seed{seed}_{abs(hash((variant, seed, steps, str(settings)))):010x}"
     folder.mkdir(parents=True)
     config = {
         "algo": algo,
@@ -41,7 +42,7 @@ def write_run(
         "task": task,
         "env_kwargs": {},
         "seed": seed,
-        "n_timesteps": 1000,
+        "n_timesteps": steps,
         "settings": settings,
         "demonstrators_return": 2000.0,
         "versions": {"sb3-actpc": "0.1.0", "torch": "2.13.0"},

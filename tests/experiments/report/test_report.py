@@ -100,7 +100,7 @@ def test_normalised_scores_across_tasks(tmp_path: Path) -> None:
     assert table_row(markdown, "actpc", "## Across tasks")["interquartile mean"] == "1.000"
     row = table_row(markdown, "td3", "## Across tasks")
     assert (row["interquartile mean"], row["95 % interval"], row["runs"]) == ("0.000", "0.000 to 0.000", "4")
-    assert "Left out, because not run on every one: sac_rlpd." in markdown
+    assert "Left out, because not every task has runs of that name: sac_rlpd." in markdown
     assert table_row(markdown, "actpc over td3", "### Probability of improvement")["probability"] == "1.00"
 
 
@@ -136,6 +136,43 @@ def test_settings_that_go_by_one_name_are_kept_apart(tmp_path: Path) -> None:
     groups = load_results(tmp_path).groups(HOPPER)
     assert sorted(map(len, groups.values())) == [1, 2]
     assert all(re.fullmatch(r"actpc \[[0-9a-f]{4}\]", label) for label in groups)
+
+
+def test_a_second_number_of_steps_in_a_folder_leaves_the_first_comparison_whole(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    base, part, other = (variant.name for variant in ablation_variants()[:3])
+    for task in (HOPPER, REACHER):
+        for variant in (base, part, other):
+            write_run(tmp_path, task, variant, returns=[1.0] * 3)
+    for variant in (base, part):
+        write_run(tmp_path, HOPPER, variant, returns=[1.0] * 3, steps=2000, checksum=1 + (variant == part))
+    assert main(["report", str(tmp_path)]) == 1
+    errors = capsys.readouterr().err
+    assert f"{HOPPER}: not one action changed in {part} [1,000 steps], {other}: the part" in errors
+    markdown = (tmp_path / "report.md").read_text(encoding="utf-8")
+    for name in (f"{base} [1,000 steps]", f"{part} [1,000 steps]", other):
+        assert table_row(markdown, name, "## Across tasks")["runs"] == "2"
+    assert f"Left out, because not every task has runs of that name: {base} [2,000 steps], {part} [2,000 steps]." in markdown
+    longer = f"## What each part is worth: {HOPPER}, {base} [2,000 steps]"
+    assert table_row(markdown, f"{part} [2,000 steps]", longer)["actions changed"] == "yes"
+    assert other not in markdown.split(longer)[1].split("## ")[0]  # has no such run
+    assert {f"ablations_{HOPPER}.png", f"ablations_{HOPPER}_2.png"} < {path.name for path in tmp_path.iterdir()}
+
+
+def test_sections_that_are_left_out_are_named(tmp_path: Path) -> None:
+    """Nothing was run on both tasks; and no ablation has as many steps as the base."""
+    base, part = (variant.name for variant in ablation_variants()[:2])
+    write_run(tmp_path, HOPPER, base, steps=2000)
+    write_run(tmp_path, HOPPER, part)
+    write_run(tmp_path, REACHER, "td3", algo="td3")
+    write_report(tmp_path)
+    markdown = (tmp_path / "report.md").read_text(encoding="utf-8")
+    assert (
+        f"Left out: none of {base}, {part}, td3 has runs on all of {HOPPER}, {REACHER}"
+        in markdown.split("## Across tasks\n")[1]
+    )
+    assert f"Left out: no ablation has as many steps as {base}, " in markdown.split(f"each part is worth: {HOPPER}\n")[1]
 
 
 def test_the_page_needs_no_other_file_and_no_network(tmp_path: Path) -> None:
