@@ -1281,6 +1281,27 @@ MUTANTS = [
         f"{REPORTS} -k second_number",
     ),
     Mutant(
+        "a variant without a name is not its base's",
+        "experiments/comparison/plan.py",
+        "str(parse_variant(entry).name): entry for",
+        'str(entry.get("name")): entry for',
+        f"{TABLE} -k chosen",
+    ),
+    Mutant(
+        "an export of an export forgets the settings",
+        "experiments/report/export.py",
+        "if kept_settings.is_file()",
+        "if False",
+        "tests/experiments/report/test_export.py -k export_of",
+    ),
+    Mutant(
+        "references of two exports are two runs",
+        "experiments/report/published.py",
+        " | ~exported.duplicated()",
+        " | True",
+        "tests/experiments/report/test_published.py -k several_exports",
+    ),
+    Mutant(
         "a file's own variant is not known by its name",
         "experiments/comparison/plan.py",
         "own.get(name, name) for name",

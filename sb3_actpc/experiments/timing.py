@@ -78,13 +78,17 @@ def ratios(times: dict[str, list[float]], units: dict[str, str]) -> Ratios:
 
 
 def table(files: list[Path]) -> str:
-    """A Markdown table of what ``--output`` wrote, such as one file for each number of threads: a column for each file."""
-    measured = [json.loads(file.read_text()) for file in files]
-    heads = ["update, over its unit", *(f"{about['device']}, {about['threads']} threads" for about in measured)]
-    rows = []
-    for name, (_, unit) in measured[0]["ratios"].items():
-        cells = [f"{about['ratios'][name][0]:.2f}" if name in about["ratios"] else "" for about in measured]
-        rows.append([f"{name} / {unit}", *cells])
+    """A Markdown table of what ``--output`` wrote, such as one file for each number of threads: a column for each file.
+    ValueError for one of another kind."""
+    heads, columns = ["update, over its unit"], []
+    for file in files:
+        try:
+            about = json.loads(file.read_text())
+            columns.append({f"{name} / {unit}": f"{ratio:.2f}" for name, (ratio, unit) in about["ratios"].items()})
+            heads.append(f"{about['device']}, {about['threads']} threads")
+        except (ValueError, LookupError, TypeError, AttributeError) as error:
+            raise ValueError(f"{file}: not what `sb3-actpc bench --output` writes ({error!r})") from error
+    rows = [[name, *(column.get(name, "") for column in columns)] for name in columns[0]]
     return markdown(pd.DataFrame(rows, columns=heads))
 
 

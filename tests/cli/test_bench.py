@@ -2,6 +2,8 @@
 
 import json
 
+import pytest
+
 from sb3_actpc.experiments.timing import ratios as ratios_of
 from sb3_actpc.experiments.timing import table
 
@@ -30,3 +32,7 @@ def test_the_table_has_a_column_for_each_file(tmp_path):
         "| bare / TD3 | 0.90 | 0.75 |",
         "| compiled / TD3 | 0.50 |  |",
     ]
+    for text in ('{"a": 1}', "[1]", '{"ratios": [1]}', "no JSON", '{"device": "cpu", "threads": 1, "ratios": {"bare": 1}}'):
+        (tmp_path / "other.json").write_text(text)
+        with pytest.raises(ValueError, match=r"other\.json: not what `sb3-actpc bench --output` writes"):
+            table([*files, tmp_path / "other.json"])

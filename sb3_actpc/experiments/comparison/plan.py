@@ -70,7 +70,7 @@ def with_options(content: Mapping[str, Any], options: Mapping[str, Any]) -> dict
         content.pop("n_timesteps", None)
     if "algos" in options:
         mappings = [entry for entry in content.get("algos") or [] if isinstance(entry, Mapping)]
-        own = {str(entry.get("name", entry.get("algo"))): entry for entry in mappings}
+        own = {str(parse_variant(entry).name): entry for entry in mappings}
         for name in options["algos"]:
             if name not in own:
                 find_variant(name, own)

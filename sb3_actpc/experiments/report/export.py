@@ -15,10 +15,13 @@ from sb3_actpc.utils.files import atomic_write, folder_name
 def export(folder: Path, target: Path) -> list[Path]:
     """Write what is worth keeping of a comparison into a few small files, from which tables and figures can be made again:
     ``results.csv`` has a row for each run, ``curves.csv.gz`` their evaluations, ``settings.json`` what the ids of settings
-    stand for, ``curves_TASK.png`` the figure of each task. FileNotFoundError when there are no runs, OSError when a file
-    cannot be written."""
+    stand for, ``curves_TASK.png`` the figure of each task. ValueError when ``target`` is ``folder``, FileNotFoundError
+    when there are no runs, OSError when a file cannot be written."""
+    if target.resolve() == folder.resolve():
+        raise ValueError(f"{target} is the folder of the runs themselves: give another, they would not be read again")
     results = load_results(folder)
-    settings: dict[str, Any] = {}
+    kept_settings = folder / SETTINGS  # of an export, which has no folders of runs
+    settings: dict[str, Any] = json.loads(kept_settings.read_text(encoding="utf-8")) if kept_settings.is_file() else {}
     for path in sorted(folder.glob(f"*/*/seed[0-9]*_*/{CONFIG}")):
         config = read_config(path.parent)
         settings[content_id(config)] = content(config)

@@ -110,7 +110,8 @@ def _cell(spec: dict[str, Any], folder: Path) -> str:
         if not source:
             return ""
     folders = source if isinstance(source, list) else [source]
-    runs = exported = pd.concat(_runs(folder / name) for name in folders)
+    exported = pd.concat(_runs(folder / name) for name in folders)
+    runs = exported[exported["algorithm"].notna() | ~exported.duplicated()]  # exports share their references
     for key in [key for key in _CHOOSING if key in spec]:
         if spec[key] not in (known := exported[key].unique()):
             raise ValueError(f"no {key} {spec[key]!r} in {', '.join(folders)}: there are {', '.join(sorted(map(str, known)))}")
@@ -118,7 +119,9 @@ def _cell(spec: dict[str, Any], folder: Path) -> str:
     if runs.empty:
         return ""
     if runs["seed"].duplicated().any():
-        raise ValueError(f"several runs with one seed for {spec}: name settings ({', '.join(runs['settings'].unique())})")
+        raise ValueError(
+            f"several runs with one seed for {spec}: name settings ({', '.join(runs['settings'].unique())}) or one export"
+        )
     fields: dict[str, Any] = {name: _OverSeeds(runs[name]) for name in map(str, runs.select_dtypes("number"))}
     fields["n"] = _OverSeeds(runs["algorithm"].notna().groupby(runs["task"]).sum().replace(0, np.nan))
     fields["score"] = spec.get("score", "").format(**fields)

@@ -124,10 +124,13 @@ def test_what_a_preset_says_can_be_left_out() -> None:
 
 def test_an_algorithm_can_be_chosen_by_the_name_that_a_file_gives_it(capsys: pytest.CaptureFixture[str]) -> None:
     own = {"base": "refresh_alone", "name": "slow", "steps": 20}
-    content = {"envs": ["SparseReacher-v5"], "algos": [own], "n_timesteps": 70}
+    unnamed = {"base": "no_habit", "steps": 30}  # goes by the name of its base
+    content = {"envs": ["SparseReacher-v5"], "algos": [own, unnamed], "n_timesteps": 70}
     Path("c.yml").write_text(yaml.safe_dump(content), encoding="utf-8")
-    assert main(["compare", "c.yml", "--algos", "slow", "actpc", "--seeds", "1", "--steps", "60", "--dry-run"]) == 0
-    assert [line.split()[2:5:2] for line in capsys.readouterr().out.splitlines()[1:3]] == [["slow", "20"], ["actpc", "60"]]
+    names = ["slow", "actpc", "no_habit"]
+    assert main(["compare", "c.yml", "--algos", *names, "--seeds", "1", "--steps", "60", "--dry-run"]) == 0
+    rows = [line.split()[2:5:2] for line in capsys.readouterr().out.splitlines()[1:4]]
+    assert rows == [["slow", "20"], ["actpc", "60"], ["no_habit", "30"]]
     assert main(["compare", "c.yml", "--algos", "slwo", "--dry-run"]) == 2
     assert "(did you mean 'slow'?)" in capsys.readouterr().err
     Path("c.yml").write_text("{envs: [SparseReacher-v5], algos: }", encoding="utf-8")

@@ -50,6 +50,15 @@ def test_the_settings_that_an_id_stands_for_are_kept(tmp_path: Path) -> None:
     assert kept["settings"] == {"gamma": 0.75} and kept["env"] == HOPPER and "seed" not in kept
 
 
+def test_an_export_of_an_export_keeps_all_and_none_goes_into_its_own_folder(tmp_path: Path) -> None:
+    write_run(tmp_path / "runs", gamma=0.75)
+    with pytest.raises(ValueError, match="is the folder of the runs themselves: give another"):
+        export(tmp_path / "runs", tmp_path / "kept" / ".." / "runs")  # its runs would not be read again
+    export(tmp_path / "runs", tmp_path / "kept")
+    for path in export(tmp_path / "kept", tmp_path / "again"):
+        assert path.suffix == ".png" or path.read_bytes() == (tmp_path / "kept" / path.name).read_bytes(), path.name
+
+
 def test_measures_of_a_run() -> None:
     """Evaluations at 0, 4000, ..., 20,000: the worst counts from 5,000 steps on, the last half begins at 10,000."""
     evaluations = pd.DataFrame(

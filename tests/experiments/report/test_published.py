@@ -85,6 +85,8 @@ def test_a_row_can_come_from_several_exports(folder: Path) -> None:
     export(folder / "more", folder / "later")
     row = "both: {from: [kept, later], variant: actpc, cell: '{dense_return:each .0f} x {n:.0f}'}"
     assert lines(folder, row)[2] == "| both | 100, 300, 800 x 3 | -4 x 1 |"
+    references = "d: {from: [kept, later], variant: demonstrators}, p: {from: [kept, later], variant: 'paper:actpc'}"
+    assert lines(folder, references)[2:] == ["| d | 2000 |  |", "| p | 2171 |  |"]
 
 
 def test_each_task_can_come_from_an_export_of_its_own(folder: Path) -> None:
