@@ -3,7 +3,7 @@ constructor's signature, where type checkers see them too; :func:`checked` holds
 """
 
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import wraps
 from numbers import Integral
@@ -19,6 +19,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_actpc.ngc.circuit import LARGEST_SIZE as LARGEST_LAYER
 from sb3_actpc.utils.checks import KINDS, LARGEST_SIZE, check_device, check_kind, nearest
+from sb3_actpc.utils.constructors import constructors
 
 Parameters = ParamSpec("Parameters")
 CIRCUITS = ("actor", "critic", "generator", "prior")
@@ -70,6 +71,17 @@ def checked(init: Callable[Parameters, None]) -> Callable[Parameters, None]:
         init(*args, **kwargs)
 
     return checking
+
+
+def check_settings(kind: type, settings: Mapping[str, Any]) -> None:
+    """ValueError for the first of the settings that a :func:`checked` constructor of a class would refuse."""
+    annotations: dict[str, Any] = {}
+    for init in constructors(kind):
+        if hasattr(init, "__wrapped__"):
+            own = inspect.signature(init, eval_str=True).parameters.values()
+            annotations = {**{one.name: one.annotation for one in own}, **annotations}
+    for name in settings.keys() & annotations.keys():
+        _check(name, settings[name], annotations[name])
 
 
 def _check(name: str, value: Any, annotation: Any) -> None:

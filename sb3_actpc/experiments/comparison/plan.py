@@ -6,11 +6,19 @@ from pathlib import Path
 from typing import Any
 
 from sb3_actpc.demonstrations import fit_demonstrations
-from sb3_actpc.experiments.comparison.variants import ablation_variants, find_variant, parse_variant, part_of_run
+from sb3_actpc.experiments.comparison.variants import (
+    OF_TASKS,
+    OF_VARIANTS,
+    ablation_variants,
+    find_variant,
+    parse_variant,
+    part_of_run,
+)
 from sb3_actpc.experiments.runs import Run, resolve
 from sb3_actpc.experiments.runs.environments import check_env_id, make_train_env
 from sb3_actpc.experiments.runs.presets import CAN_BE_NONE, read_yaml
-from sb3_actpc.experiments.runs.schema import Count, Schema, Seed, merged
+from sb3_actpc.experiments.runs.schema import MAX_SEED, Count, Schema, Seed, merged
+from sb3_actpc.utils.checks import check_kind
 from sb3_actpc.utils.files import folder_name
 
 OWN_KEYS = ("envs", "algos", "ablate", "seeds", "first_seed", "output")
@@ -37,7 +45,8 @@ def read_comparison(given: Mapping[str, Any]) -> Comparison:
     """
     given = {str(key): value for key, value in given.items() if value is not None or key in CAN_BE_NONE}
     own = {key: given.pop(key) for key in OWN_KEYS if key in given}
-    shared = part_of_run({"eval_episodes": 10, "continuable": False, **given}, OWN_KEYS)
+    check_kind("ablate", own.get("ablate", False), bool)
+    shared = part_of_run({"eval_episodes": 10, "continuable": False, **given}, OWN_KEYS, (*OF_TASKS, *OF_VARIANTS))
     variants = [parse_variant(entry) for entry in _list(own, "algos")]
     if own.get("ablate"):
         variants += [variant for variant in ablation_variants() if variant not in variants]
@@ -49,7 +58,10 @@ def read_comparison(given: Mapping[str, Any]) -> Comparison:
     _check_names([task.env for task in tasks])
     _check_names([str(variant.name) for variant in variants])
     rest = {key: own[key] for key in ("seeds", "first_seed", "output") if key in own}
-    return Comparison(tasks=tuple(tasks), variants=tuple(variants), shared=shared, **rest)
+    comparison = Comparison(tasks=tuple(tasks), variants=tuple(variants), shared=shared, **rest)
+    if (last := comparison.first_seed + comparison.seeds - 1) > MAX_SEED:
+        raise ValueError(f"the last seed, {last}, must be at most {MAX_SEED}: give fewer seeds, or a smaller first_seed")
+    return comparison
 
 
 def read_comparison_file(path: Path) -> dict[str, Any]:
@@ -91,7 +103,7 @@ def plan_runs(comparison: Comparison, folder: Path | None = None) -> list[Run]:
         if other != run.name:
             raise ValueError(f"{run.task}: {other!r} and {run.name!r} have the same settings: leave one out")
     for run in {(run.env, repr(run.env_kwargs), run.demonstrations, _limits(run)): run for run in filled}.values():
-        _check_demonstrations(run)
+        _check_environment(run)
     seeds = range(comparison.first_seed, comparison.first_seed + comparison.seeds)
     seeded = [run.model_copy(update={"seed": seed}) for seed in seeds for run in filled]
     own = [folder / folder_name(str(run.task)) / str(run.name) / f"seed{run.seed}_{run.id}" for run in seeded]
@@ -108,15 +120,17 @@ def _fill(shared: Run, task: Run, variant: Run) -> Run:
         raise type(error)(f"{task.env}, {variant.name}: {error}") from error
 
 
-def _check_demonstrations(run: Run) -> None:
-    """Those that were given, in the environment: a wrong file is to end the command and not each of its runs."""
-    if run.demonstrations in ("shipped", "weak", "none"):
+def _check_environment(run: Run) -> None:
+    """Keywords and demonstrations that were given for it: wrong ones are to end the command and not each of its runs."""
+    own_demonstrations = run.demonstrations not in ("shipped", "weak", "none")
+    if not (own_demonstrations or run.env_kwargs):
         return
-    with closing(make_train_env(run.env, run.env_kwargs, 1, run.seed)) as env:
-        try:
-            fit_demonstrations(run.demonstrations, env, env.observation_space, env.action_space, *_limits(run))
-        except ValueError as error:
-            raise ValueError(f"{run.task}: {error}") from error
+    try:
+        with closing(make_train_env(run.env, run.env_kwargs, 1, run.seed)) as env:
+            if own_demonstrations:
+                fit_demonstrations(run.demonstrations, env, env.observation_space, env.action_space, *_limits(run))
+    except ValueError as error:
+        raise ValueError(f"{run.task}: {error}") from error
 
 
 def _limits(run: Run) -> tuple[Any, Any]:
@@ -127,7 +141,7 @@ def _parse_task(entry: Any) -> Run:
     entry = {"env": entry} if isinstance(entry, str) else entry
     if not isinstance(entry, Mapping) or "env" not in entry:
         raise ValueError(f"expected a Gymnasium id or a mapping with env, found {entry!r}")
-    return part_of_run({str(key): value for key, value in entry.items()})
+    return part_of_run({str(key): value for key, value in entry.items()}, elsewhere=OF_VARIANTS)
 
 
 def _list(given: Mapping[str, Any], name: str) -> list[Any]:

@@ -12,6 +12,7 @@ from sb3_actpc.utils.checks import nearest
 
 # what the comparison itself says of each of its runs
 PLANNED = ("seed", "task", "progress", "output")
+OF_TASKS, OF_VARIANTS = ("env",), ("algo", "name", "task_prefix")  # keys of an entry of envs, and of algos
 VARIANTS_FILE = Path(__file__).with_name("variants.yml")
 
 
@@ -34,7 +35,9 @@ def parse_variant(entry: Any) -> Run:
         raise ValueError(f"expected the name of an algorithm or a mapping, found {entry!r}")
     given = {str(key): value for key, value in entry.items()}
     base = given.pop("base", None)
-    own = part_of_run(given, ("base",))
+    if not isinstance(base, str | None):
+        raise ValueError(f"base={base!r} must be a text: the name of the variant that this one starts from")
+    own = part_of_run(given, ("base",), OF_TASKS)
     if base is not None:
         return Run(**merged(find_variant(base), own))
     if "algo" not in given:
@@ -42,13 +45,18 @@ def parse_variant(entry: Any) -> Run:
     return Run(**merged(Run(name=own.algo), own))
 
 
-def part_of_run(entry: Mapping[str, Any], also: Sequence[str] = ()) -> Run:
-    """A part of a run from its keys; ``also`` are keys that stand beside them. ValueError for an unknown key, with the nearest
-    known one, a wrong value, or a key that the comparison itself decides."""
-    known = sorted({*also, *Run.known_keys()} - set(PLANNED))
+def part_of_run(entry: Mapping[str, Any], also: Sequence[str] = (), elsewhere: Sequence[str] = ()) -> Run:
+    """A part of a run from its keys; ``also`` are keys that stand beside them, ``elsewhere`` those of another part. ValueError
+    for an unknown key, with the nearest known one, a wrong value, one of ``elsewhere``, or one that the comparison decides."""
+    known = sorted({*also, *Run.known_keys()} - {*PLANNED, *elsewhere})
     for key, value in entry.items():
         if key in PLANNED:
             raise ValueError(f"{key}={value!r} cannot be given here: the comparison decides it, leave it out")
+        if key in elsewhere:
+            place = "envs" if key in OF_TASKS else "algos"
+            raise ValueError(
+                f"{key}={value!r} cannot be given here, where it counts for nothing: give it in an entry of {place}"
+            )
         if key not in known:
             raise ValueError(f"unknown key {key!r}{nearest(key, known)}: expected some of {', '.join(known)}")
     return Run(**entry)

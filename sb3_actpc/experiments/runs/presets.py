@@ -15,6 +15,7 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 
+from sb3_actpc.actpc.arguments import check_settings
 from sb3_actpc.checkpoints import why_no_checkpoints
 from sb3_actpc.demonstrations import is_minari_id, shipped_demonstrations
 from sb3_actpc.demonstrations.minari import minari_files
@@ -85,6 +86,7 @@ def resolve(run: Run) -> Run:
     if run.n_timesteps is None:
         raise ValueError(f"n_timesteps is neither in the preset {run.preset_name!r} nor given: give --steps")
     check_keywords(algorithm, settings)
+    check_settings(algorithm, _parsed(settings))
     getattr(algorithm, "check_installed", lambda: None)()
     if run.noise_std is not None and run.noise_type is None and not is_noise_chosen:
         raise ValueError(f"noise_std={run.noise_std} is of no noise: give noise_type=normal too, or leave it out")
@@ -135,11 +137,7 @@ def preset(env_id: str, name: str | None = None, algo: str = "actpc") -> dict[st
 
 def agent_keywords(run: Run, observation_space: gym.Space[Any], action_space: gym.Space[Any]) -> dict[str, Any]:
     """Keywords of a filled run's algorithm's constructor, all but the environment, the seed and the device."""
-    keywords = copy.deepcopy(run.settings)  # SB3 adds keys of its own to the dictionaries it is given
-    if "learning_rate" in keywords:
-        keywords["learning_rate"] = parse_schedule(keywords["learning_rate"])
-    if isinstance(keywords.get("train_freq"), list):
-        keywords["train_freq"] = tuple(keywords["train_freq"])
+    keywords = _parsed(run.settings)
     check_kind("policy_kwargs", keywords.get("policy_kwargs"), Settings | None)
     activation = (keywords.get("policy_kwargs") or {}).get("activation_fn")
     if isinstance(activation, str):
@@ -154,6 +152,16 @@ def agent_keywords(run: Run, observation_space: gym.Space[Any], action_space: gy
         kind = NormalActionNoise if run.noise_type == "normal" else OrnsteinUhlenbeckActionNoise
         keywords["action_noise"] = kind(np.zeros(size), np.full(size, run.noise_std))
     return {"policy": fitting_policy(run.policy or "MlpPolicy", observation_space), **keywords}
+
+
+def _parsed(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """The settings with what YAML has no word for."""
+    keywords = copy.deepcopy(dict(settings))  # SB3 adds keys of its own to the dictionaries it is given
+    if "learning_rate" in keywords:
+        keywords["learning_rate"] = parse_schedule(keywords["learning_rate"])
+    if isinstance(keywords.get("train_freq"), list):
+        keywords["train_freq"] = tuple(keywords["train_freq"])
+    return keywords
 
 
 def fitting_policy(policy: str, observation_space: gym.Space[Any]) -> str:

@@ -184,6 +184,8 @@ def _describe(error: ValidationError, known: list[str]) -> str:
     """The first mistake, in one line."""
     first = error.errors()[0]
     key = ".".join(str(part) for part in first["loc"])
+    if first["type"] == "extra_forbidden" and key in known:
+        return f"{key}={first['input']!r} is given under another name too (steps and n_timesteps are one key): leave one out"
     if first["type"] == "extra_forbidden":
         return f"unknown key {key!r}{nearest(key, known)}: expected some of {', '.join(known)}"
     if first["type"] == "string_pattern_mismatch":

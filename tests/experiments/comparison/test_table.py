@@ -1,5 +1,6 @@
 """From names to a table of runs: ids, variants, the file, mistakes."""
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -210,6 +211,32 @@ def test_mistakes_give_one_line_and_begin_nothing(
     errors = capsys.readouterr().err.strip()
     assert message in errors and "\n" not in errors
     assert not list(Path(".").rglob("seed*"))
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"envs": [{"env": "SparseHopper-v5", "env_kwargs": {"conditon": "forward"}}]}, "no keyword 'conditon' (did you mean"),
+        ({"env_kwargs": {"threshold": "high"}}, "SparseReacher-v5: "),
+        ({"settings": {"gamma": "high"}}, "SparseReacher-v5, actpc: gamma='high' must be a finite number"),
+        ({"settings": {"gamma": 2}}, "gamma=2 must be between 0 and 1"),
+        ({"settings": {"learning_rate": "lin_high"}}, "learning_rate='lin_high' must be a number or lin_<number>"),
+        ({"algos": [{"algo": "her", "settings": {"q_filter": "no"}}]}, "q_filter='no' must be True or False"),
+        ({"first_seed": 2**31 - 1, "seeds": 2}, "the last seed, 2147483648, must be at most 2147483647: give fewer seeds"),
+        ({"algo": "td3"}, "algo='td3' cannot be given here, where it counts for nothing: give it in an entry of algos"),
+        ({"name": "foo"}, "name='foo' cannot be given here"),
+        ({"task_prefix": "Goal"}, "task_prefix='Goal' cannot be given here"),
+        ({"env": "Ant-v5"}, "env='Ant-v5' cannot be given here, where it counts for nothing: give it in an entry of envs"),
+        ({"envs": [{"env": "SparseReacher-v5", "algo": "td3"}]}, "algo='td3' cannot be given here"),
+        ({"algos": [{"base": "actpc", "env": "Ant-v5"}]}, "env='Ant-v5' cannot be given here"),
+        ({"ablate": "false"}, "ablate='false' must be True or False"),
+        ({"algos": [{"base": ["actpc"]}]}, "base=['actpc'] must be a text: the name of the variant"),
+        ({"steps": 10, "n_timesteps": 20}, "steps=10 is given under another name too (steps and n_timesteps are one key)"),
+    ],
+)
+def test_no_run_is_planned_that_would_fail_or_not_be_what_was_said(given: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(message)):
+        plan(**given)
 
 
 def test_given_demonstrations_are_read_once_for_all_algorithms_of_a_task(monkeypatch: pytest.MonkeyPatch) -> None:
