@@ -135,19 +135,23 @@ def _reference_rows(results: Results, task: str) -> list[dict[tuple[str, str], s
 
 
 def _aggregate_sections(results: Results, folder: Path) -> list[Section]:
-    """Statistics over all tasks with reference scores, of the variants that were run on each of them."""
+    """Statistics over all tasks with reference scores, of the variants that were run on each of them; a task where nothing
+    tells a variant's settings apart counts with each that another task has."""
     scored = results.finished.dropna(subset="normalized")
     tasks = list(scored["task"].unique())
-    by_label = {label: dict(tuple(runs.groupby("task")["normalized"])) for label, runs in scored.groupby("label")}
-    on_all = {str(label): parts for label, parts in by_label.items() if len(parts) == len(tasks)}
-    whole = {label: [parts[task].to_numpy() for task in tasks] for label, parts in on_all.items()}
+    by_label = {str(label): dict(tuple(runs.groupby("task")["normalized"])) for label, runs in scored.groupby("label")}
+    variants = dict(zip(scored["label"], scored["variant"], strict=True))
+    joined = {label: {**by_label.get(variants[label], {}), **parts} for label, parts in by_label.items()}
+    whole = {label: [parts[task].to_numpy() for task in tasks] for label, parts in joined.items() if len(parts) == len(tasks)}
     if not whole:
-        text = f"Left out: none of {', '.join(sorted(map(str, by_label)))} has runs on all of {', '.join(tasks)}."
+        text = f"Left out: none of {', '.join(sorted(by_label))} has runs on all of {', '.join(tasks)}."
         return [Section("Across tasks", text)] if tasks else []
     means = {name: statistics.interquartile_mean(scores) for name, scores in whole.items()}
     figures.draw_aggregates(means, whole, folder / "aggregates.png")
-    left_out = sorted(set(map(str, by_label)) - set(whole))
+    left_out = sorted(set(by_label) - set(whole) - {variants[label] for label in whole})
     missing = f" Left out, because not every task has runs of that name: {', '.join(left_out)}." if left_out else ""
+    if any(label != variants[label] in by_label for label in whole):
+        missing += " Where brackets tell a variant's settings apart, its runs on tasks with one kind of them count with each."
     text = (
         "The dense return (of robosuite's tasks, the success) of the last evaluation, normalised so that random actions are 0 "
         f"and the shipped demonstrators 1, over {', '.join(tasks)}. Intervals: 95 %, stratified bootstrap, left open for "

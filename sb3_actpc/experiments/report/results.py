@@ -24,6 +24,8 @@ SETTLED = 5000  # the worst evaluation is looked for from this step on
 # columns of progress.csv -> of episodes.csv
 MEASURES = {"dense_return": "dense_return", "sparse_return": "sparse_return", "success_rate": "success"}
 _TEXTS = ["task", "variant", "algorithm", "settings", "demonstrations", "status", "version", "versions", "commit", "error"]
+# columns that may tell the settings of a variant apart, and how a label says so
+_TELLING = (("planned_steps", "{:,} steps"), ("demonstrations", "demonstrations: {}"), ("settings", "{:.4}"))
 _NO_ROWS = pd.DataFrame(columns=["run"])
 
 
@@ -153,17 +155,16 @@ def _labelled(runs: pd.DataFrame) -> pd.DataFrame:
 
 
 def _labels(runs: pd.DataFrame) -> pd.Series:
-    """Of one variant's runs: its name, and where some task has several settings of that name the steps or demonstrations, on
-    every task, if these tell them apart; else, on that task alone, a part of their ids."""
+    """Of one variant's runs: its name, and of settings like those of tasks with several of that name what tells these apart:
+    the steps, the demonstrations, or else a part of their ids."""
     finished = runs[runs["status"] == FINISHED]
     counts = finished.groupby("task")["settings"].nunique()
     several = counts.index[counts > 1]
     if several.empty:
         return runs["variant"]
-    for column, form in (("planned_steps", " [{:,} steps]"), ("demonstrations", " [demonstrations: {}]")):
-        if finished.groupby(["task", column])["settings"].nunique().max() == 1:
-            return runs["variant"] + runs[column].map(form.format)
-    return runs["variant"] + (" [" + runs["settings"].str[:4] + "]").where(runs["task"].isin(several), "")
+    unclear = finished[finished["task"].isin(several)]
+    column, form = next(one for one in _TELLING if unclear.groupby(["task", one[0]])["settings"].nunique().max() == 1)
+    return runs["variant"] + runs[column].map(f" [{form}]".format).where(runs[column].isin(unclear[column]), "")
 
 
 def write_runs(results: Results, folder: Path) -> Path:

@@ -3,6 +3,7 @@
 import json
 import re
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 import pytest
@@ -158,6 +159,24 @@ def test_a_second_number_of_steps_in_a_folder_leaves_the_first_comparison_whole(
     assert table_row(markdown, f"{part} [2,000 steps]", longer)["actions changed"] == "yes"
     assert other not in markdown.split(longer)[1].split("## ")[0]  # has no such run
     assert {f"ablations_{HOPPER}.png", f"ablations_{HOPPER}_2.png"} < {path.name for path in tmp_path.iterdir()}
+
+
+@pytest.mark.parametrize("of_reacher", [{"steps": 1000}, {"steps": 50_000}])  # as one of the Hopper's, or as none
+@pytest.mark.parametrize("other", [{"steps": 2000}, {"gamma": 0.5}])
+def test_a_task_with_one_kind_of_settings_counts_with_each_of_another_tasks(
+    other: dict[str, Any], of_reacher: dict[str, Any], tmp_path: Path
+) -> None:
+    for task, settings in ((HOPPER, {}), (HOPPER, other), (REACHER, of_reacher)):
+        write_run(tmp_path, task, **settings)
+    write_report(tmp_path)
+    markdown = (tmp_path / "report.md").read_text(encoding="utf-8")
+    for name in load_results(tmp_path).groups(HOPPER):
+        if name == "actpc [2,000 steps]" and of_reacher["steps"] == 1000:
+            assert f"runs of that name: {name}." in markdown
+        else:
+            assert table_row(markdown, name, "## Across tasks")["runs"] == "2"
+    is_other = set(load_results(tmp_path).groups(REACHER)) == {"actpc"}
+    assert ("its runs on tasks with one kind of them count with each." in markdown) is is_other
 
 
 def test_sections_that_are_left_out_are_named(tmp_path: Path) -> None:
