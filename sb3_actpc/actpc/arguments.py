@@ -80,7 +80,7 @@ def check_settings(kind: type, settings: Mapping[str, Any]) -> None:
         if hasattr(init, "__wrapped__"):
             own = inspect.signature(init, eval_str=True).parameters.values()
             annotations = {**{one.name: one.annotation for one in own}, **annotations}
-    for name in settings.keys() & annotations.keys():
+    for name in filter(annotations.__contains__, settings):
         _check(name, settings[name], annotations[name])
 
 
