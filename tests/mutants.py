@@ -699,6 +699,13 @@ MUTANTS = [
     Mutant(
         "one teacher for all", CLONING, "self.teachers.append(self.make_circuit())", "self.teachers.append(self.clone)", CLONES
     ),
+    Mutant("clones keep their circuit's decay", CLONING, "memory)), self.weight_decay)", "memory)))", f"{CLONES} -k decay"),
+    Mutant(
+        "clones decay everywhere", AGENT, "is None and self.clone_noise else", "is None else", f"{ROOMS} -k smaller_synapses"
+    ),
+    Mutant(
+        "the decay of this once is ignored", CIRCUIT, " if weight_decay is None else weight_decay)", ")", f"{LEARNING} -k once"
+    ),
     Mutant("teachers that are not asked", CLONING, "elif self.ensemble_size > 1:", "elif False:", CLONES),
     Mutant("teachers are asked where it was shown", CLONING, "+= TEACHING_NOISE * th", "+= 0.0 * th", CLONES),
     Mutant("the first teacher alone", CLONING, "for teacher in teachers]).mean(0)", "for teacher in teachers])[0]", CLONES),

@@ -72,6 +72,7 @@ SMALLEST_VALUE_SCALE = 1.0
 NEED_DEMONSTRATIONS = ("demonstration_fraction", "actor_warm_start", "n_demonstrations", "n_demonstration_transitions")
 EXPERT_SIGNALS_INTERVAL = 1000  # updates between two evaluations of the demonstrations' signals
 PRETRAINING_INTERVAL = 1000  # updates between two lines about pre-training
+ROOM_DECAY = 1.0  # of clones' synapses where they imitate steps between demonstrations
 TARGET_NOISE_CLIP = 2.5  # standard deviations, as TD3's 0.5 for 0.2
 AVERAGING_RATE = 0.001  # per update, of the average of the actor that becomes the habit
 LARGEST_BOUND = 1e6  # of an observation; larger ones stand for none
@@ -140,7 +141,8 @@ class ActPC(OffPolicyAlgorithm):
         ensemble that teaches it (:mod:`sb3_actpc.actpc.cloning`); the learning rate falls meanwhile
     :param refresh_weight: weight of the actor's refresh from the demonstrations and its own good episodes
     :param refresh_kwargs: keywords of :class:`~sb3_actpc.actpc.self_imitation.Refresh`, for refresh and warm start:
-        ``weighting`` (by "returns"; the paper's is "uniform"), ``own_episodes``, ``noise``, ``ensemble_size`` and ``n_clones``
+        ``weighting`` (by "returns"; the paper's is "uniform"), ``own_episodes``, ``noise``, ``weight_decay``,
+        ``ensemble_size`` and ``n_clones``
     :param demonstration_fraction: share of the batch, which all circuits share, that comes from the demonstrations
     :param alpha_ep: weight of the epistemic signal
     :param alpha_in: weight of the instrumental signal
@@ -648,8 +650,8 @@ class ActPC(OffPolicyAlgorithm):
             self.expert.room = None
             for part in self._imitated():
                 part.neighbours = None
-        size = self.refresh.ensemble_size
-        return Cloning(circuit, self.policy.make_actor, self._sample_for_clones, self.actor_warm_start, size)
+        size, decay = self.refresh.ensemble_size, self.clone_decay if self.actor_warm_start else None
+        return Cloning(circuit, self.policy.make_actor, self._sample_for_clones, self.actor_warm_start, size, decay)
 
     def _sample_for_clones(self, n: int) -> Imitated:
         return self._sample_imitated(n, self.clone_noise)
@@ -1054,6 +1056,12 @@ class ActPC(OffPolicyAlgorithm):
         if self.expert is not None and self.refresh.noise is not None:
             return self.refresh.noise if self.expert.demonstrations.n_episodes > 1 else 0.0
         return float(self.clones_guess)
+
+    @property
+    def clone_decay(self) -> float | None:
+        """Decay of clones' synapses: as asked for, or by default ``ROOM_DECAY`` where they imitate steps between
+        demonstrations and None, which is their circuits' own, where not."""
+        return ROOM_DECAY if self.refresh.weight_decay is None and self.clone_noise else self.refresh.weight_decay
 
     def _features_of(self, episodes: Episodes, rows: np.ndarray) -> th.Tensor:
         """(B, n_features) of (B,) rows, some at a time: there can be many images."""

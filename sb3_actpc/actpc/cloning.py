@@ -31,6 +31,7 @@ class Cloning:
     :param sample: draws imitated steps
     :param n_updates: of every circuit
     :param ensemble_size: how many teach the clone, 2 or more; with 1 it learns alone
+    :param weight_decay: λ of all these circuits meanwhile; None for their own
     """
 
     def __init__(
@@ -40,9 +41,10 @@ class Cloning:
         sample: Sample,
         n_updates: int,
         ensemble_size: int = 1,
+        weight_decay: float | None = None,
     ) -> None:
         self.clone, self.make_circuit, self.sample = clone, make_circuit, sample
-        self.n_updates, self.ensemble_size = n_updates, ensemble_size
+        self.n_updates, self.ensemble_size, self.weight_decay = n_updates, ensemble_size, weight_decay
         self.teachers: list[NGCCircuit] = []
 
     def __len__(self) -> int:
@@ -67,16 +69,18 @@ class Cloning:
         rate = first * (last / first) ** (done / self.n_updates)
         for group, own in zip(circuit.optimizer.param_groups, circuit.parameter_groups(rate), strict=True):
             group["lr"] = own["lr"]
-        circuit.apply_changes(circuit.hebbian_update(circuit.settle(features, actions, memory)))
+        circuit.apply_changes(circuit.hebbian_update(circuit.settle(features, actions, memory)), self.weight_decay)
 
     def checkpoint_state(self) -> dict[str, Any]:
         """The sizes, the teachers and their optimizers' moments, as plain values and tensors."""
         teachers = [(dict(teacher.state_dict()), teacher.optimizer.state_dict()["state"]) for teacher in self.teachers]
-        return {"n_updates": self.n_updates, "ensemble_size": self.ensemble_size, "teachers": teachers}
+        sizes = {"n_updates": self.n_updates, "ensemble_size": self.ensemble_size, "weight_decay": self.weight_decay}
+        return {**sizes, "teachers": teachers}
 
     def restore_checkpoint_state(self, state: dict[str, Any]) -> None:
         """:param state: what :meth:`checkpoint_state` returned"""
         self.n_updates, self.ensemble_size = state["n_updates"], state["ensemble_size"]
+        self.weight_decay = state.get("weight_decay")  # None in a checkpoint of before
         self.teachers = [self.make_circuit() for _ in state["teachers"]]
         for teacher, (synapses, moments) in zip(self.teachers, state["teachers"], strict=True):
             teacher.load_state_dict(synapses)

@@ -38,6 +38,8 @@ class Refresh:
     :param own_episodes: which of them are imitated too: "paid" (every one, as often as its return says; "best" where steps are
         not drawn by returns, or nothing is demonstrated) or "best" (those that are paid at least what the best one was: the
         paper)
+    :param weight_decay: λ of the synapses of clones and their teachers, in the place of their circuit's; None for 1 where they
+        imitate steps between demonstrations, which small synapses guess better, else as the circuit's
     :param ensemble_size: others that teach a clone what to do around the imitated steps, 2 or more; 1 for none (the
         paper). See :mod:`sb3_actpc.actpc.cloning`
     :param n_clones: clones that are tried at most, the first included, while the habit is paid less than nine tenths of what
@@ -53,11 +55,12 @@ class Refresh:
         weighting: Weighting = "returns",
         noise: Annotated[float | None, Between(0)] = None,
         own_episodes: Literal["paid", "best"] = "paid",
+        weight_decay: Annotated[float | None, Between(0)] = None,
         ensemble_size: Annotated[int, Between(1)] = 3,
         n_clones: Annotated[int, Between(1)] = 6,
     ) -> None:
         self.weighting, self.noise, self.own_episodes = weighting, noise, own_episodes
-        self.ensemble_size, self.n_clones = ensemble_size, n_clones
+        self.weight_decay, self.ensemble_size, self.n_clones = weight_decay, ensemble_size, n_clones
 
 
 class ImitationSamples(NamedTuple):

@@ -336,14 +336,17 @@ class NGCCircuit(nn.Module):
             groups.append({"params": self.synapses.feedback, "lr": learning_rate * scale, "lr_scale": scale})
         return groups
 
-    def apply_changes(self, changes: HebbianChanges) -> None:
+    def apply_changes(self, changes: HebbianChanges, weight_decay: float | None = None) -> None:
         """
         Hand the changes to the circuit's ``optimizer``, which its owner has set (see :meth:`parameter_groups`), bound the step
         it takes, and keep the settling rates stable.
 
         The one place where a change becomes minus a gradient.
+
+        :param changes: of this circuit's synapses
+        :param weight_decay: λ of this once; None for the circuit's own
         """
-        self._decay_synapses()
+        self._decay_synapses(self.weight_decay if weight_decay is None else weight_decay)
         old = [parameter.clone() for parameter in self._scaled_synapses()] if self.synaptic_scaling == "soft_bound" else []
         targets = [*self.synapses.weights, *self.synapses.biases, *self.synapses.memory]
         for parameter, gradient in zip(targets, th._foreach_neg(changes.tensors()), strict=True):
@@ -358,11 +361,11 @@ class NGCCircuit(nn.Module):
         if self._keep_rates:
             self.update_settling_rates()
 
-    def _decay_synapses(self) -> None:
-        for group in self.optimizer.param_groups if self.weight_decay else ():
+    def _decay_synapses(self, weight_decay: float) -> None:
+        for group in self.optimizer.param_groups if weight_decay else ():
             matrices = [parameter for parameter in group["params"] if parameter.dim() > 1]
             if matrices:
-                th._foreach_mul_(matrices, max(0.0, 1.0 - group["lr"] * self.weight_decay))
+                th._foreach_mul_(matrices, max(0.0, 1.0 - group["lr"] * weight_decay))
 
     def _scaled_synapses(self) -> list[th.Tensor]:
         return [*self.synapses.weights, *self.synapses.feedback]

@@ -126,9 +126,9 @@ def test_students_differ_less_beside_what_is_shown_than_clones_do(monkeypatch):
 def test_rates_fall_geometrically_for_every_circuit_and_leave_nothing_behind(ensemble_size, monkeypatch):
     seen, original = [], NGCCircuit.apply_changes
 
-    def watched(circuit, changes):
+    def watched(circuit, changes, *given):
         seen.append((circuit, [group["lr"] for group in circuit.optimizer.param_groups]))
-        original(circuit, changes)
+        original(circuit, changes, *given)
 
     monkeypatch.setattr(NGCCircuit, "apply_changes", watched)
     model = imitating(
@@ -149,6 +149,24 @@ def test_rates_fall_geometrically_for_every_circuit_and_leave_nothing_behind(ens
     model.learn(2)
     assert [group["lr"] for group in model.actor.circuit.optimizer.param_groups] == pytest.approx([2e-4, 0.9 * 2e-4])
     assert [group["lr"] for group in model.critic.first().optimizer.param_groups] == pytest.approx([8e-4, 0.9 * 8e-4])
+
+
+@pytest.mark.parametrize("ensemble_size", [1, 2])
+def test_the_decay_of_clones_is_their_teachers_too_and_nobodys_later(ensemble_size, monkeypatch):
+    seen, original = [], NGCCircuit._decay_synapses
+
+    def watched(circuit, weight_decay):
+        seen.append((circuit, weight_decay))
+        original(circuit, weight_decay)
+
+    monkeypatch.setattr(NGCCircuit, "_decay_synapses", watched)
+    model = imitating(actor_warm_start=5, refresh_kwargs={"ensemble_size": ensemble_size, "weight_decay": 3.0})
+    model.pretrain()
+    assert len({id(circuit) for circuit, _ in seen}) == (1 if ensemble_size == 1 else 3)
+    assert {decay for _, decay in seen} == {3.0}
+    seen.clear()
+    model.learn(4)
+    assert seen and {decay for _, decay in seen} == {circuit.weight_decay for circuit, _ in seen} == {0.1}
 
 
 def test_further_clones_are_made_as_the_first_was(monkeypatch):
@@ -197,7 +215,7 @@ class Stop(Exception):
     pass
 
 
-def stopped_after(n_updates: int) -> ActPC:
+def stopped_after(n_updates: int, **keywords) -> ActPC:
     """An agent whose warm start was interrupted."""
 
     def update(self, index):
@@ -206,7 +224,7 @@ def stopped_after(n_updates: int) -> ActPC:
         original(self, index)
 
     original = Cloning.update
-    model = imitating()
+    model = imitating(**keywords)
     with pytest.MonkeyPatch.context() as patch, pytest.raises(Stop):
         patch.setattr(Cloning, "update", update)
         model.learn(9)
@@ -236,6 +254,12 @@ def test_a_clone_in_the_making_keeps_the_sizes_that_it_was_begun_with(n_done, ot
     assert len(other.cloning) == 20 and len(other.cloning.teachers) == len(model.cloning.teachers)
     other.pretrain()
     assert other.n_cloning_updates == 20
+
+
+def test_a_clone_in_the_making_keeps_the_decay_that_it_was_begun_with():
+    model, other = stopped_after(7, refresh_kwargs={"ensemble_size": 3, "weight_decay": 0.7}), imitating()
+    other.restore_checkpoint_state(model.checkpoint_state())
+    assert other.cloning.weight_decay == 0.7
 
 
 def test_parameters_that_have_imitated_are_not_trained_over():

@@ -7,6 +7,8 @@ import pytest
 import torch as th
 
 from sb3_actpc.actpc import room as room_module
+from sb3_actpc.actpc.actpc import ROOM_DECAY
+from sb3_actpc.actpc.cloning import Cloning
 from sb3_actpc.actpc.room import Room, nearest_steps
 from sb3_actpc.actpc.self_imitation import Episodes
 from sb3_actpc.actpc.trust_region import SMALLEST_UNIT
@@ -103,6 +105,31 @@ def test_without_a_word_on_it_there_is_noise_where_the_next_episode_is_farther_t
     assert model.clone_noise == noise
     assert f"noise on what clones imitate: {noise:g} of" in model.describe()
     assert make(demonstrations=data, refresh_kwargs={"noise": 0.3}).clone_noise == 0.3
+
+
+@pytest.mark.parametrize(
+    ("apart", "keywords", "expected"),
+    [
+        (0.12, {}, ROOM_DECAY),
+        (0.12, {"noise": 0.0}, None),
+        (0.08, {"noise": 0.3}, ROOM_DECAY),
+        (0.08, {}, None),
+        (0.08, {"weight_decay": 0.0}, 0.0),
+        (0.12, {"weight_decay": 0.4}, 0.4),
+    ],
+)
+def test_clones_that_imitate_between_demonstrations_have_smaller_synapses(apart, keywords, expected, monkeypatch):
+    """None stands for the decay of their circuit."""
+    made, original = [], Cloning.__init__
+
+    def watched(self, *given):
+        original(self, *given)
+        made.append(self.weight_decay)
+
+    monkeypatch.setattr(Cloning, "__init__", watched)
+    model = imitating(demonstrations=parallel_lines(apart), refresh_kwargs=keywords, observation_normalization="none")
+    model.pretrain()
+    assert made == [expected]
 
 
 @pytest.mark.parametrize("noise", [None, 0.0])

@@ -39,7 +39,7 @@ RUNGS = {
     "policy_kwargs.habit",
     "policy_kwargs.trust_radius",
 }
-ARM_RUNGS = {"refresh_kwargs.noise", "refresh_kwargs.ensemble_size", "refresh_kwargs.n_clones"}
+ARM_RUNGS = {f"refresh_kwargs.{name}" for name in ("noise", "weight_decay", "ensemble_size", "n_clones")}
 
 
 def cases() -> list[tuple[str, str, str]]:

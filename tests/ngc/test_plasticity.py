@@ -19,12 +19,12 @@ def train(circuit, optimizer, n_updates, batch=teacher_batch):
         circuit.apply_changes(circuit.hebbian_update(circuit.settle(*batch())))
 
 
-def apply_nothing(circuit, memory=None):
+def apply_nothing(circuit, memory=None, **once):
     """Changes of zero, at a learning rate of 0.1: what is left is what the circuit does on its own."""
     changes = circuit.hebbian_update(circuit.settle(*teacher_batch(), memory=memory))
     th._foreach_zero_(changes.tensors())
     circuit.optimizer = th.optim.SGD(circuit.parameter_groups(0.1))
-    circuit.apply_changes(changes)
+    circuit.apply_changes(changes, **once)
 
 
 def test_plain_sgd_adds_the_change():
@@ -129,6 +129,16 @@ def test_weight_decay_spares_the_biases():
     apply_nothing(circuit, memory=th.zeros(128, 2))
     for name, parameter in circuit.named_parameters():
         assert th.allclose(parameter, before[name] * (1.0 if name.startswith("biases") else 0.95))
+
+
+@pytest.mark.parametrize(("once", "kept"), [({"weight_decay": 2.0}, 0.8), ({"weight_decay": 0.0}, 1.0), ({}, 0.95)])
+def test_a_decay_of_this_once_is_in_the_place_of_the_circuits_own(once, kept):
+    circuit = NGCCircuit(8, 3, (16,), weight_decay=0.5)
+    before = [synapses.clone() for synapses in circuit.weights]
+    apply_nothing(circuit, **once)
+    for synapses, old in zip(circuit.weights, before, strict=True):
+        assert th.allclose(synapses, kept * old)
+    assert circuit.weight_decay == 0.5
 
 
 def test_halving_gamma_e_halves_the_movement_of_the_error_synapses_under_adam():
