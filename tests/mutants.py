@@ -849,6 +849,23 @@ MUTANTS = [
         "in (self.candidate_returns,) if sample",
         f"{HABIT} -k spread",
     ),
+    Mutant(
+        "a few successes prove a learner", TRIALS, "is_early = is_coin and has_time", "is_early = False", f"{HABIT} -k nothing"
+    ),
+    Mutant(
+        "a likely success is enough in the end",
+        TRIALS,
+        "if has_time or is_coin else",
+        "if has_time else",
+        f"{HABIT} -k nothing",
+    ),
+    Mutant(
+        "successes with noise hasten a learner", TRIALS, "is_doubtful = is_coin or", "is_doubtful =", f"{HABIT} -k nothing"
+    ),
+    Mutant(
+        "clones are learners of all or nothing", TRIALS, "is_coin = not self.is_clone and", "is_coin =", f"{HABIT} -k nothing"
+    ),
+    Mutant("nothing is all", TRIALS, "return self.habit_return > 0.0 and", "return", f"{HABIT} -k nothing"),
     Mutant("all dimensions spread alike", REGION, "residuals.square().mean(0)", "residuals.square().mean()", REGIONS),
     Mutant(
         "the deviation has no unit",

@@ -17,6 +17,7 @@ N_PROOFS = 2  # episodes of a candidate at least, before it is judged by less th
 # environment steps, or episodes however short: of a candidate before it is judged, and of the habit after one not accepted
 PROOF_STEPS, ENOUGH_PROOFS = 500, 10
 MOST_PROOF_STEPS = 2000  # that a candidate has for a proof
+MANY_PROOFS = 20  # episodes of a learner that are paid all or nothing, before it is accepted
 # of the habit, which is frozen: with random goals the last twenty alone may all be unlucky; and of the learning actor
 KEPT_RETURNS, KEPT_NOISY_RETURNS = 100, 2
 # of what the imitated episodes were paid: a clone that is paid less by more is no good one, and no good beginning
@@ -58,6 +59,10 @@ class Trials:
     gain must be worth what has not been seen: a candidate that has played less often than the habit has had fewer occasions
     to fall, and plays on until it has had as many, or ``ENOUGH_PROOFS``, if it gains no more than that risk. After a
     candidate that did not prove itself the habit plays again: what made it the habit was partly luck.
+
+    Where an episode is paid all or nothing, as a lifted cube is, a few say little, and whoever looks after each of them finds
+    a gain in the end. A learner then has twice the steps in any case, plays ``MANY_PROOFS`` episodes in them if it can, and
+    must gain ``SURE`` of its standard errors to the end.
 
     Clones of the same demonstrations can do very differently, by their first synapses alone. So while the habit is paid less
     than what it imitates, further clones are candidates: before anything is learned, where ``GREAT_SHORTFALL`` of it is
@@ -215,7 +220,8 @@ class Trials:
         great_loss = gain + SURE * error < -GREAT_LOSS * unit
         if not _is_tried(n, self.candidate_steps) and not (n >= N_PROOFS and great_loss):
             return None
-        is_doubtful = not self.is_clone and not self.is_ahead()
+        is_coin = not self.is_clone and self._is_all_or_nothing()
+        is_doubtful = is_coin or not (self.is_clone or self.is_ahead())
         has_time = self.candidate_steps < MOST_PROOF_STEPS * (2 if is_doubtful else 1)
         if great_loss:
             return "rejected"
@@ -223,10 +229,15 @@ class Trials:
             return None
         if gain < -max(smallest, LIKELY * error if has_time else 0.0):
             return "rejected"
-        if gain > 0.0 and gain >= max(smallest, (SURE if has_time else LIKELY) * error):
-            return "accepted" if gain >= self._unseen_risk() * unit else None
+        if gain > 0.0 and gain >= max(smallest, (SURE if has_time or is_coin else LIKELY) * error):
+            is_early = is_coin and has_time and n < MANY_PROOFS
+            return "accepted" if gain >= self._unseen_risk() * unit and not is_early else None
         is_open = has_time and abs(gain) + SURE * error > smallest
         return None if is_open else "tied"
+
+    def _is_all_or_nothing(self) -> bool:
+        """Whether all paid episodes of habit and candidate are paid the same, and the habit has one."""
+        return self.habit_return > 0.0 and len({*self.habit_returns, *self.candidate_returns} - {0.0}) == 1
 
     def _unseen_risk(self) -> float:
         """By how much more likely the candidate's next episode is a first fall than the habit's, by the rule of succession:

@@ -23,6 +23,7 @@ from sb3_actpc.actpc.habit import (
     ENOUGH_PROOFS,
     KEPT_RETURNS,
     LIKELY,
+    MANY_PROOFS,
     MOST_PROOF_STEPS,
     N_PROOFS,
     PROOF_STEPS,
@@ -267,10 +268,38 @@ def test_a_loss_that_may_be_chance_is_not_held_against_a_candidate_while_it_has_
 def test_of_short_episodes_a_candidate_may_play_as_many_as_it_takes():
     """Successes of 0 or 1, two fifths against one: 35 episodes tell the two apart by the errors asked for, ten do not."""
     length = MOST_PROOF_STEPS // 40
-    for n_needed, paid in ((35, [0.0, 0.0, 1.0, 0.0, 1.0] * 7), (40, [0.0, 1.0, 0.0, 0.0] * 10)):
+    for n_needed, paid in ((35, [0.0, 0.0, 1.0, 0.0, 1.0] * 7), (80, [0.0, 1.0, 0.0, 0.0] * 20)):
         trials = Trials(1, habit_returns=[0.0, 0.0, 1.0, 0.0, 0.0] * 4, tests_habit=False)
         verdicts = [play_quiet(trials, one, length)[1] for one in paid[:n_needed]]
         assert verdicts == [None] * (n_needed - 1) + ["accepted" if n_needed == 35 else "tied"]
+
+
+@pytest.mark.parametrize("noisy", [0.0, 1.0])
+@pytest.mark.parametrize(
+    ("is_clone", "habit", "length", "candidate", "n_needed", "verdict"),
+    [
+        (False, [1.0, 0.0], 100, [1.0], MANY_PROOFS, "accepted"),  # in 2000 of 4000 steps
+        (True, [1.0, 0.0], 100, [1.0], 5, "accepted"),  # a gain of 0.5 by errors of 0.23, after 500 steps
+        (False, [1.0, 0.0], 250, [1.0], 16, "accepted"),  # it had its steps
+        (False, [1.0, 0.0], 250, [1.0, 0.0, 1.0, 1.0, 0.0], 16, "tied"),  # 0.125, and errors of 0.17
+        (True, [1.0, 0.0], 250, [1.0, 0.0, 1.0, 1.0, 0.0], 8, "accepted"),  # 0.125, and half of 0.21
+        (False, [0.0, 0.0], 100, [1.0], 5, "accepted"),  # nothing to lose
+        (False, [-1.0, 0.0], 100, [0.0], 5, "accepted"),  # a cost is not nothing
+        (False, [1.0, 0.5], 100, [1.5], 5, "accepted"),  # more than all
+        (False, [1.0, 0.0], 250, [0.0], 2, "rejected"),  # a loss is judged as ever
+    ],
+)
+def test_of_a_learner_that_is_paid_all_or_nothing_many_episodes_or_all_of_its_steps_are_asked(
+    is_clone, habit, length, candidate, n_needed, verdict, noisy
+):
+    """Twenty episodes of the habit. The noisy ones, two, may be luck."""
+    trials = Trials(1, habit_returns=habit * 10, tests_habit=False)
+    verdicts = []
+    for paid in (candidate * 20)[:n_needed]:
+        trials.on_trial, trials.is_clone, trials.noisy_returns = True, is_clone, [noisy] * 2
+        cast(trials, "candidate")
+        verdicts.append(play(trials, paid, length)[1])
+    assert verdicts == [None] * (n_needed - 1) + [verdict]
 
 
 def test_an_unlucky_row_of_the_habits_episodes_is_no_candidates_chance():
