@@ -866,6 +866,24 @@ MUTANTS = [
         "clones are learners of all or nothing", TRIALS, "is_coin = not self.is_clone and", "is_coin =", f"{HABIT} -k nothing"
     ),
     Mutant("nothing is all", TRIALS, "return self.habit_return > 0.0 and", "return", f"{HABIT} -k nothing"),
+    Mutant("too few successes are a tie", TRIALS, '"undecided" if is_coin else "tied"', '"tied"', f"{HABIT} -k nothing"),
+    Mutant(
+        "given synapses have no rivals",
+        AGENT,
+        "self.trials or Trials(1, n_clones=clones)",
+        "self.trials or Trials(1)",
+        f"{HABIT} -k given_synapses",
+    ),
+    Mutant(
+        "steps of old actions", AGENT, 'self.bootstrap == "literal" and self.n_steps > 1', "False", f"{LEARNS} -k go_together"
+    ),
+    Mutant(
+        "episodes of many environments",
+        AGENT,
+        "self.n_envs > 1 and isinstance(every, tuple)",
+        "isinstance(every, int)",
+        f"{LEARNS} -k go_together",
+    ),
     Mutant("all dimensions spread alike", REGION, "residuals.square().mean(0)", "residuals.square().mean()", REGIONS),
     Mutant(
         "the deviation has no unit",

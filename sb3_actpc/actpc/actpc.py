@@ -17,7 +17,14 @@ from stable_baselines3.common.callbacks import BaseCallback, ProgressBarCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn, Schedule, TrainFreq
+from stable_baselines3.common.type_aliases import (
+    GymEnv,
+    MaybeCallback,
+    RolloutReturn,
+    Schedule,
+    TrainFreq,
+    TrainFrequencyUnit,
+)
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 from tqdm import tqdm
 
@@ -310,7 +317,7 @@ class ActPC(OffPolicyAlgorithm):
             raise ValueError("env=None: an environment or the id of one is needed, such as 'Pendulum-v1'")
         assert isinstance(self.action_space, spaces.Box)
         check_actions(self.action_space, self.action_noise)
-        self._check_generator()
+        self._check_together()
         # both here, as a loaded agent may be given others; of the same signals it keeps what their normalisers have seen
         with named_in_errors(f"refresh_kwargs={self.refresh_kwargs!r}"):
             self.refresh = Refresh(**(self.refresh_kwargs or {}))
@@ -328,7 +335,7 @@ class ActPC(OffPolicyAlgorithm):
             clones = self.refresh.n_clones - 1 if self.demonstrations is not None and self.actor_warm_start else 0
             # of a loaded agent, whose environment may be another: what it paid is forgotten
             goes_on = self.trials is not None and self._last_obs is not None
-            self.trials = (self.trials or Trials(1)).forgotten(self.n_envs, goes_on)
+            self.trials = (self.trials or Trials(1, n_clones=clones)).forgotten(self.n_envs, goes_on)
             self.trials.n_clones = min(self.trials.n_clones, clones)
         self._setup_demonstrations()
         self._fit_to_bounds()
@@ -504,7 +511,7 @@ class ActPC(OffPolicyAlgorithm):
         tb_log_name: str = "run",
         progress_bar: bool = False,
     ) -> tuple[int, BaseCallback]:
-        self._check_generator()
+        self._check_together()
         self._check_learning_rates()
         if reset_num_timesteps or self._last_obs is None:  # SB3 resets the environments
             self._rollout_state: tuple[np.ndarray, ...] | None = None
@@ -534,12 +541,25 @@ class ActPC(OffPolicyAlgorithm):
         self._compiled = self._compiled or compiled_update(self, self._total_timesteps)  # resumed, as straight
         return result
 
-    def _check_generator(self) -> None:
-        """:raises ValueError: where the buffer does not keep what it learns to predict: an episode's last observation"""
+    def _check_together(self) -> None:
+        """
+        :raises ValueError: for keywords that do not go together: a generator beside a buffer that does not keep what it learns
+            to predict, an episode's last observation; returns of several steps of an action that was taken at their beginning;
+            episodes of several environments, which do not end together
+        """
         if self.alpha_ep and self.optimize_memory_usage:
             raise ValueError(
                 f"alpha_ep={self.alpha_ep:g} does not work with optimize_memory_usage=True, which keeps the next episode's "
                 "first observation in the place of an episode's last: use optimize_memory_usage=False or alpha_ep=0"
+            )
+        if self.bootstrap == "literal" and self.n_steps > 1:
+            raise ValueError(
+                f"n_steps={self.n_steps} does not work with bootstrap='literal', which values the action taken: use n_steps=1"
+            )
+        every = self.train_freq
+        if self.n_envs > 1 and isinstance(every, tuple) and every[1] in ("episode", TrainFrequencyUnit.EPISODE):
+            raise ValueError(
+                f"train_freq=({every[0]}, 'episode') needs one environment, not n_envs={self.n_envs}: use a number of steps"
             )
 
     def _warn_of_idle_settings(self) -> None:

@@ -11,7 +11,7 @@ from statistics import fmean
 from typing import Any, Literal
 
 Role = Literal["actor", "candidate", "habit"]
-Verdict = Literal["accepted", "tied", "rejected"]
+Verdict = Literal["accepted", "tied", "undecided", "rejected"]
 
 N_PROOFS = 2  # episodes of a candidate at least, before it is judged by less than a great loss
 # environment steps, or episodes however short: of a candidate before it is judged, and of the habit after one not accepted
@@ -23,7 +23,8 @@ KEPT_RETURNS, KEPT_NOISY_RETURNS = 100, 2
 # of what the imitated episodes were paid: a clone that is paid less by more is no good one, and no good beginning
 SHORTFALL, GREAT_SHORTFALL = 0.1, 0.5
 EARLY_CLONES = 2  # that are tried before anything is learned: where these do no better, it was not by chance
-# standard errors: that a gain must pass at any time, and after ``MOST_PROOF_STEPS``; the second is also a loss's before
+# standard errors: that a gain must pass at any time, and, unless paid all or nothing, after ``MOST_PROOF_STEPS``; the second
+# is also a loss's before
 SURE, LIKELY = 1.5, 0.5
 # shares of the habit's mean return: what counts as a gain or a loss, and with what loss a candidate is rejected at once
 SMALLEST_GAIN, GREAT_LOSS = 0.01, 0.2
@@ -61,8 +62,9 @@ class Trials:
     candidate that did not prove itself the habit plays again: what made it the habit was partly luck.
 
     Where an episode is paid all or nothing, as a lifted cube is, a few say little, and whoever looks after each of them finds
-    a gain in the end. A learner then has twice the steps in any case, plays ``MANY_PROOFS`` episodes in them if it can, and
-    must gain ``SURE`` of its standard errors to the end.
+    a gain in the end. Beside a habit that is paid at all a learner then has twice the steps in any case, plays
+    ``MANY_PROOFS`` episodes in them if it can, and must gain ``SURE`` of its standard errors to the end; what is then neither
+    is undecided, and no reason to go farther. Of episodes of 500 steps and more hardly any gain is so sure.
 
     Clones of the same demonstrations can do very differently, by their first synapses alone. So while the habit is paid less
     than what it imitates, further clones are candidates: before anything is learned, where ``GREAT_SHORTFALL`` of it is
@@ -160,7 +162,8 @@ class Trials:
         :param has_learned: whether the learning actor differs from the habit by more than imitation; before, clones alone are
             candidates
         :return: "accepted": the candidate becomes the habit; "tied": it is dropped, being neither proven better nor worse;
-            "rejected": it is dropped, being worse; None: nothing follows yet
+            "undecided": it is dropped, its episodes being too few; "rejected": it is dropped, being worse; None: nothing
+            follows yet
         """
         self.has_learned = has_learned
         role, episode_return, length = self.roles[env], self.returns[env], self.lengths[env]
@@ -232,8 +235,8 @@ class Trials:
         if gain > 0.0 and gain >= max(smallest, (SURE if has_time or is_coin else LIKELY) * error):
             is_early = is_coin and has_time and n < MANY_PROOFS
             return "accepted" if gain >= self._unseen_risk() * unit and not is_early else None
-        is_open = has_time and abs(gain) + SURE * error > smallest
-        return None if is_open else "tied"
+        is_open = abs(gain) + SURE * error > smallest
+        return "tied" if not is_open else None if has_time else "undecided" if is_coin else "tied"
 
     def _is_all_or_nothing(self) -> bool:
         """Whether all paid episodes of habit and candidate are paid the same, and the habit has one."""

@@ -426,6 +426,10 @@ class ActPCPolicy(BasePolicy):
         for group in groups:
             group["lr_scale"] *= scale
         kwargs = dict(self.optimizer_kwargs)
+        if "lr" in kwargs:
+            raise ValueError(
+                f"optimizer_kwargs has lr={kwargs['lr']!r}: use learning_rate=, or a circuit's own, as in actor_kwargs"
+            )
         if self.optimizer_class is th.optim.Adam:
             kwargs.setdefault("fused", True)  # one kernel for all synapses
         with named_in_errors(f"optimizer_kwargs={self.optimizer_kwargs!r}"):

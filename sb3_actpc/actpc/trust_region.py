@@ -15,7 +15,7 @@ MULTIPLIERS, FIRST_MULTIPLIER = (0.02, 200.0), 0.05
 LARGEST_UNHELD = 3.0
 RADII = 0.1, 1000.0  # below a third of a standard deviation nothing is learned
 # what a verdict about a candidate (:mod:`sb3_actpc.actpc.habit`) does to the radius
-RADIUS_FACTORS = {"accepted": 1.25, "tied": 2.0, "rejected": 0.7}
+RADIUS_FACTORS = {"accepted": 1.25, "tied": 2.0, "undecided": 1.0, "rejected": 0.7}
 
 
 def spread_of(residuals: th.Tensor) -> th.Tensor:

@@ -1000,6 +1000,19 @@ def test_a_generator_is_refused_a_buffer_that_forgets_how_episodes_end(tmp_path)
         model.learn(20)
 
 
+@pytest.mark.parametrize(
+    ("settings", "named"),
+    [
+        ({"bootstrap": "literal", "n_steps": 3}, "n_steps=3 does not work with bootstrap='literal'.*use n_steps=1"),
+        ({"n_envs": 2, "train_freq": (1, "episode")}, r"train_freq=\(1, 'episode'\) needs one environment, not n_envs=2"),
+        ({"policy_kwargs": {"optimizer_kwargs": {"lr": 1.0}}}, "optimizer_kwargs has lr=1.0: use learning_rate="),
+    ],
+)
+def test_what_does_not_go_together_is_refused_before_anything_is_learned(settings, named):
+    with pytest.raises(ValueError, match=named):
+        make(**settings)
+
+
 def test_whole_numbers_are_no_actions():
     class Whole(CountingEnv):
         def __init__(self):

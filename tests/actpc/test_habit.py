@@ -271,7 +271,7 @@ def test_of_short_episodes_a_candidate_may_play_as_many_as_it_takes():
     for n_needed, paid in ((35, [0.0, 0.0, 1.0, 0.0, 1.0] * 7), (80, [0.0, 1.0, 0.0, 0.0] * 20)):
         trials = Trials(1, habit_returns=[0.0, 0.0, 1.0, 0.0, 0.0] * 4, tests_habit=False)
         verdicts = [play_quiet(trials, one, length)[1] for one in paid[:n_needed]]
-        assert verdicts == [None] * (n_needed - 1) + ["accepted" if n_needed == 35 else "tied"]
+        assert verdicts == [None] * (n_needed - 1) + ["accepted" if n_needed == 35 else "undecided"]
 
 
 @pytest.mark.parametrize("noisy", [0.0, 1.0])
@@ -281,7 +281,7 @@ def test_of_short_episodes_a_candidate_may_play_as_many_as_it_takes():
         (False, [1.0, 0.0], 100, [1.0], MANY_PROOFS, "accepted"),  # in 2000 of 4000 steps
         (True, [1.0, 0.0], 100, [1.0], 5, "accepted"),  # a gain of 0.5 by errors of 0.23, after 500 steps
         (False, [1.0, 0.0], 250, [1.0], 16, "accepted"),  # it had its steps
-        (False, [1.0, 0.0], 250, [1.0, 0.0, 1.0, 1.0, 0.0], 16, "tied"),  # 0.125, and errors of 0.17
+        (False, [1.0, 0.0], 250, [1.0, 0.0, 1.0, 1.0, 0.0], 16, "undecided"),  # 0.125, and errors of 0.17
         (True, [1.0, 0.0], 250, [1.0, 0.0, 1.0, 1.0, 0.0], 8, "accepted"),  # 0.125, and half of 0.21
         (False, [0.0, 0.0], 100, [1.0], 5, "accepted"),  # nothing to lose
         (False, [-1.0, 0.0], 100, [0.0], 5, "accepted"),  # a cost is not nothing
@@ -706,6 +706,13 @@ def test_the_trust_region_is_resized_by_verdicts_once_something_is_learned(paid,
     assert float(model.policy.trust_region.radius) == pytest.approx(factor * radius)
 
 
+def test_what_is_undecided_leaves_the_trust_region_as_it_is():
+    region = make(policy_kwargs={"habit": True}).policy.trust_region
+    radius = float(region.radius)
+    region.resize("undecided")
+    assert float(region.radius) == radius
+
+
 @pytest.mark.parametrize(("late", "role"), [(0, "habit"), (1, "candidate")])
 @pytest.mark.parametrize("begun_at", [0, 100])
 def test_a_candidate_is_taken_once_the_critic_has_pressed_long_enough(begun_at, late, role, monkeypatch):
@@ -901,6 +908,22 @@ def test_a_loaded_agent_tries_as_many_clones_as_are_left_and_asked_for(tmp_path)
         again.set_env(DummyVecEnv([CountingEnv]))
         left.append(again.trials.n_clones)
     assert left == [2, 0, 2, 0]
+
+
+@pytest.mark.parametrize("by", ["weights", "parameters"])
+def test_an_agent_that_was_given_synapses_tries_other_clones_too(by, tmp_path):
+    settings = {"refresh_kwargs": {"n_clones": 4}}
+    model = imitating(**settings)
+    model.pretrain()
+    if by == "weights":
+        given = {"demonstrations": demonstrations(), "actor_warm_start": 4, **settings}
+        again = ActPC.from_weights(model.save_weights(tmp_path / "agent"), model.env, **given)
+    else:
+        again = imitating(**settings)
+        again.set_parameters(model.get_parameters())
+    again.learn(2)
+    assert again.pretrained
+    assert again.trials.n_clones == 3
 
 
 def test_save_and_load_keep_the_habit_and_how_it_is_pressed(tmp_path):
