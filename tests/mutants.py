@@ -410,7 +410,7 @@ MUTANTS = [
     Mutant("the learning actor acts", POLICIES, "self.circuit if self.habit is None", "self.circuit if True", HABIT),
     Mutant("one proof is enough", TRIALS, "if n < N_PROOFS:", "if n < 1:", HABIT),
     Mutant("a tie is a proof", TRIALS, "gain >= max(smallest, (SURE", "gain >= max(0.0, (SURE", HABIT),
-    Mutant("chance is a proof", TRIALS, "(SURE if has_time else LIKELY) * error", "0.0", HABIT),
+    Mutant("chance is a proof", TRIALS, "(SURE if has_time or is_coin else LIKELY) * error", "0.0", HABIT),
     Mutant("chance is a tie", TRIALS, "abs(gain) + SURE * error > smallest", "abs(gain) > smallest", f"{HABIT} -k chance"),
     Mutant(
         "a chance loss is held against a candidate", TRIALS, "LIKELY * error if has_time else 0.0", "0.0", f"{HABIT} -k chance"
@@ -479,9 +479,9 @@ MUTANTS = [
         "pass  # an agent",
         f"{CLONES} -k saved",
     ),
-    Mutant("two good episodes are proof", TRIALS, "not self.is_clone and not self.is_ahead()", "False", f"{HABIT} -k twice"),
+    Mutant("two good episodes are proof", TRIALS, "not (self.is_clone or self.is_ahead())", "False", f"{HABIT} -k twice"),
     Mutant(
-        "noise judges clones", TRIALS, "not self.is_clone and not self.is_ahead()", "not self.is_ahead()", f"{HABIT} -k twice"
+        "noise judges clones", TRIALS, "not (self.is_clone or self.is_ahead())", "not self.is_ahead()", f"{HABIT} -k twice"
     ),
     Mutant(
         "a decent beginning is not enough",
@@ -584,8 +584,8 @@ MUTANTS = [
     Mutant(
         "a running episode's rest proves a loaded habit",
         AGENT,
-        "(self.trials or Trials(1)).forgotten(self.n_envs, goes_on)",
-        "(self.trials or Trials(1)).forgotten(self.n_envs)",
+        ".forgotten(self.n_envs, goes_on)",
+        ".forgotten(self.n_envs)",
         f"{HABIT} -k goes_on_in_another",
     ),
     Mutant(
@@ -1076,7 +1076,11 @@ MUTANTS = [
         EQUATIONS,
     ),
     Mutant(
-        "unseen falls count for nothing", TRIALS, "if gain >= self._unseen_risk() * unit else None", "", f"{HABIT} -k occasion"
+        "unseen falls count for nothing",
+        TRIALS,
+        "gain >= self._unseen_risk() * unit and not is_early",
+        "not is_early",
+        f"{HABIT} -k occasion",
     ),
     Mutant(
         "the habit's occasions are counted without end",
