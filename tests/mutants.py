@@ -58,6 +58,7 @@ SIMULATORS, RESUMES = "checkpoints/simulators.py", "tests/checkpoints/test_exact
 ENCODING, HELD = "checkpoints/encoding.py", "tests/checkpoints/test_environments.py"
 CLONING, CLONES = "actpc/cloning.py", "tests/actpc/test_cloning.py"
 ROOM, ROOMS = "actpc/room.py", "tests/actpc/test_room.py"
+WITHIN, WITHINS = "actpc/within_episodes.py", "tests/actpc/test_within_episodes.py"
 LEARNS, STORES = "tests/actpc/test_agent.py", "tests/actpc/test_buffers.py"
 COUPLED, SPARSE = "ngc/coupled.py", "envs/sparse_mujoco.py"
 STATISTICS, R_STABILITY = "experiments/report/statistics.py", "experiments/report/r_stability.py"
@@ -815,6 +816,22 @@ MUTANTS = [
         "tests/cli/test_choices.py -k kept_agent",
     ),
     Mutant("changes lie crosswise", "ngc/products.py", ".t().contiguous()", ".t()", "tests/ngc/test_products.py -k shape"),
+    Mutant("the first exponent", WITHIN, "int(np.argmin(errors))", "0", WITHINS),
+    Mutant(
+        "what names the episode is small anyhow",
+        WITHIN,
+        " if errors[best] < (1.0 - SMALLEST_GAIN) * most else as_it_is",
+        "",
+        WITHINS,
+    ),
+    Mutant("any gain will do", WITHIN, "(1.0 - SMALLEST_GAIN) * ", "", f"{WITHINS} -k small_gain"),
+    Mutant("absent neighbours answer", WITHIN, " * known)", ")", f"{WITHINS} -k each_step"),
+    Mutant("episodes count alike", WITHIN, ".square().mean(0), features", ".square().mean(0) * 0.9, features", WITHINS),
+    Mutant("the share of the variance", WITHIN, "(within / total).sqrt()", "(within / total)", WITHINS),
+    Mutant("weights take the scales' place", POLICIES, "self.scale.mul_(weights)", "self.scale.copy_(weights)", WITHINS),
+    Mutant(
+        "features are weighed by default alone", AGENT, 'if self.observation_normalization == "episodes"', "if True", WITHINS
+    ),
     Mutant("noise where there is no room", AGENT, " and self.room.is_wide", "", f"{ROOMS} -k without_a_word"),
     Mutant("room in any unit", ROOM, "> self.step", "> 0.5", f"{ROOMS} -k without_a_word"),
     Mutant("noise of one size", ROOM, "size * way.abs() * th.randn_like(features)", "size * th.randn_like(features)", ROOMS),

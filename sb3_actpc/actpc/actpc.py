@@ -64,6 +64,7 @@ from sb3_actpc.actpc.self_imitation import (
     sample_union,
 )
 from sb3_actpc.actpc.trust_region import spread_of
+from sb3_actpc.actpc.within_episodes import feature_weights
 from sb3_actpc.checkpoints import Restored, between_updates, load_checkpoint, load_weights, save_weights
 from sb3_actpc.demonstrations import fit_demonstrations
 from sb3_actpc.demonstrations.dataset import Demonstrations
@@ -76,6 +77,7 @@ Weighing = float | th.Tensor  # a weight: a number, or 0-d where an update is on
 # of the mean absolute action-value that ``scale_pressure`` divides by: one paid step. Where nothing was paid yet, the critic's
 # noise must not be blown up to full strength
 SMALLEST_VALUE_SCALE = 1.0
+FROM_DEMONSTRATIONS = ("demonstrations", "episodes")  # normalisations
 NEED_DEMONSTRATIONS = ("demonstration_fraction", "actor_warm_start", "n_demonstrations", "n_demonstration_transitions")
 EXPERT_SIGNALS_INTERVAL = 1000  # updates between two evaluations of the demonstrations' signals
 PRETRAINING_INTERVAL = 1000  # updates between two lines about pre-training
@@ -106,7 +108,7 @@ class ActPC(OffPolicyAlgorithm):
     ``actor_warm_start``                   7500           0
     ``critic_warmup``                      3000           0
     ``demonstration_fraction``             0.5            0
-    ``observation_normalization``          demonstrations none
+    ``observation_normalization``          episodes       none
     ``policy_kwargs["habit"]``             True           False
     the actor's learning rate, of others'  1/4 [#]_       1
     ====================================== ============== =======
@@ -165,8 +167,10 @@ class ActPC(OffPolicyAlgorithm):
     :param target_policy_noise: standard deviation of the noise on the target actor's action; 0 for none
     :param target_update_interval: the targets move after every update (1), or every so many environment steps; hard copies
         as in DQN are ``tau=1, target_update_interval=C``
-    :param observation_normalization: "none" (the paper), "demonstrations" (their mean and standard deviation, fixed) or
-        "bounds" (those of the observation space, which must be finite, become -1 and 1)
+    :param observation_normalization: "none" (the paper), "demonstrations" (their mean and standard deviation, fixed),
+        "episodes" (the same, and what varies less within episodes than between them is taken smaller where the demonstrations
+        then tell better what is done: :mod:`sb3_actpc.actpc.within_episodes`) or "bounds" (those of the observation space,
+        which must be finite, become -1 and 1)
     :param compile: run the updates of circuits that sweep, or settle by eq. 1, as one graph of ``torch.compile`` (see
         :mod:`~sb3_actpc.actpc.compiled`): True, False or "auto", where the run is long enough to earn it
     :param policy_kwargs: keywords of :class:`~sb3_actpc.actpc.policies.ActPCPolicy`: ``net_arch``, ``n_critics``, ``habit``,
@@ -235,7 +239,7 @@ class ActPC(OffPolicyAlgorithm):
         bootstrap: Literal["joint", "literal"] = "joint",
         target_policy_noise: Weight = 0.2,
         target_update_interval: Annotated[int, Between(1)] = 1,
-        observation_normalization: Literal["none", "demonstrations", "bounds"] | None = None,
+        observation_normalization: Literal["none", "demonstrations", "episodes", "bounds"] | None = None,
         compile: Annotated[bool | str, check_compile] = "auto",
         policy_kwargs: Settings | None = None,
         stats_window_size: Size = 100,
@@ -298,7 +302,7 @@ class ActPC(OffPolicyAlgorithm):
         self.bootstrap = bootstrap
         self.target_policy_noise = target_policy_noise
         self.target_update_interval = target_update_interval
-        self.observation_normalization: str = default(observation_normalization, "demonstrations", "none")
+        self.observation_normalization: str = default(observation_normalization, "episodes", "none")
         self.compile = compile
         self.signal_kwargs = signal_kwargs
         self.signals = InternalSignals()
@@ -411,7 +415,7 @@ class ActPC(OffPolicyAlgorithm):
         self._followed = self.demonstrations, self.n_demonstrations, self.n_demonstration_transitions
         if self.demonstrations is None:
             idle = [name for name in NEED_DEMONSTRATIONS if getattr(self, name)]
-            idle += ["observation_normalization"] if self.observation_normalization == "demonstrations" else []
+            idle += ["observation_normalization"] if self.observation_normalization in FROM_DEMONSTRATIONS else []
             if idle:
                 raise ValueError(f"{' and '.join(idle)} need demonstrations=; pass a file or leave them out")
             return
@@ -428,10 +432,17 @@ class ActPC(OffPolicyAlgorithm):
             return  # a trained agent acts without them; ``learn`` says what is missing
         assert isinstance(self.action_space, spaces.Box)
         self.expert = DemonstrationReplay(demonstrations, self.observation_space, self.action_space, self.memory_history)
-        if self.observation_normalization == "demonstrations" and not self.pretrained:
+        if self.observation_normalization in FROM_DEMONSTRATIONS and not self.pretrained:
             self.actor.normalizer.begin()
             if not self._normalises_observations():
-                self.actor.normalizer.fit(self._features_of(self.expert.episodes, np.arange(len(self.expert))))
+                self._fit_to_demonstrations(self.expert.episodes)
+
+    def _fit_to_demonstrations(self, shown: Episodes) -> None:
+        normalizer, rows = self.actor.normalizer, np.arange(len(shown))
+        normalizer.fit(self._features_of(shown, rows))
+        if self.observation_normalization == "episodes":
+            features, actions = self._features_of(shown, rows), self.inputs.tensor(shown.actions)
+            normalizer.weigh(feature_weights(features, actions, shown.starts))
 
     def _normalises_observations(self) -> bool:
         """Whether VecNormalize does; at first it knows nothing of what it will make of the demonstrations."""
@@ -638,8 +649,8 @@ class ActPC(OffPolicyAlgorithm):
             return
         if self._normalises_observations():
             warnings.warn(
-                "VecNormalize's observation statistics drift under what is learned now, and observation_normalization="
-                "'demonstrations' is not used: use VecNormalize(norm_obs=False) with it",
+                "VecNormalize's observation statistics drift under what is learned now, and those of the demonstrations "
+                "(observation_normalization) are not used: use VecNormalize(norm_obs=False)",
                 stacklevel=2,
             )
         if self.cloning is None and not self.pretrained:

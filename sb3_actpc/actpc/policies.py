@@ -66,6 +66,10 @@ class ObservationNormalizer(nn.Module):
         self.scale.copy_(th.where(std > 1e-4, 1.0 / std, 1.0))  # a feature that never changed says nothing of its scale
         self.clip.fill_(OBSERVATION_CLIP)
 
+    def weigh(self, weights: th.Tensor) -> None:
+        """:param weights: (n_features,), that normalised features are multiplied by from now on"""
+        self.scale.mul_(weights)
+
     def forward(self, features: th.Tensor) -> th.Tensor:
         """:param features: (..., n_features)
         :return: the same shape, normalised"""

@@ -654,7 +654,7 @@ def test_what_vec_normalize_normalises_is_not_normalised_again(norm_obs, fitted)
     """It begins with a mean of 0: what the demonstrations look like to it then says nothing of later."""
     env = VecNormalize(DummyVecEnv([CountingEnv]), norm_obs=norm_obs)
     model = imitating(env)
-    assert model.observation_normalization == "demonstrations"
+    assert model.observation_normalization == "episodes"
     shown = demonstrations().observations
     features = model._features_of(model.expert.episodes, np.arange(len(model.expert))).numpy()
     assert np.allclose(features.mean(0), 0.0, atol=1e-4) == fitted

@@ -1,0 +1,65 @@
+"""Which features tell what is done, and which tell only what episode it is.
+
+With ten demonstrations whatever stays the same throughout each of them, as how a can was turned when it was put there, names
+the episode, and whoever imitates them may go by that name. Features that vary less within episodes than between them (by the
+intraclass correlation) are taken smaller. A goal stays the same too, and is needed: so how much smaller is asked of the
+demonstrations, by how well the nearest steps of the others tell what is done at each step.
+"""
+
+import numpy as np
+import torch as th
+
+from sb3_actpc.actpc.room import nearest_steps
+
+EXPONENTS = (1, 2)  # beside 0, of the share of a feature's standard deviation that it has within episodes
+SMALLEST_GAIN = 0.05  # of the squared error; where it is less, features stay as they are
+N_NEIGHBOURS = 3  # other episodes whose nearest steps are asked
+MOST_ASKED, MOST_ANSWERING = 1000, 4000  # steps
+
+
+def feature_weights(features: th.Tensor, actions: th.Tensor, episodes: np.ndarray) -> th.Tensor:
+    """
+    How much each feature counts for where a step is.
+
+    :param features: (N, n_features) of demonstrated steps, normalised
+    :param actions: (N, A) shown there
+    :param episodes: (N,) numbers of their episodes
+    :return: (n_features,), in [0, 1]; 1 for all where that tells as well what is done
+    """
+    share = share_within(features, episodes)
+    as_it_is, *candidates = (share**exponent for exponent in (0, *EXPONENTS))
+    if len(np.unique(episodes)) < 2:
+        return as_it_is
+    most, *errors = (error_of_neighbours(features * weights, actions, episodes) for weights in (as_it_is, *candidates))
+    best = int(np.argmin(errors))
+    return candidates[best] if errors[best] < (1.0 - SMALLEST_GAIN) * most else as_it_is
+
+
+def error_of_neighbours(features: th.Tensor, actions: th.Tensor, episodes: np.ndarray) -> float:
+    """
+    Mean squared error of what is done at the nearest steps of other episodes, on average of these, as a guess of what is done.
+
+    :param features: (N, n_features)
+    :param actions: (N, A)
+    :param episodes: (N,) numbers of their episodes, two at least
+    """
+    asked, answering = (np.arange(0, len(features), -(-len(features) // most)) for most in (MOST_ASKED, MOST_ANSWERING))
+    nearest = nearest_steps(features[asked], episodes[asked], features[answering], episodes[answering], N_NEIGHBOURS)
+    known = th.as_tensor(nearest >= 0, device=actions.device)[:, :, None]
+    told = (actions[answering][nearest] * known).sum(1) / known.sum(1).clamp_min(1)
+    return float((told - actions[asked]).square().mean())
+
+
+def share_within(features: th.Tensor, episodes: np.ndarray) -> th.Tensor:
+    """
+    Of each feature's standard deviation, what it has within episodes: the root of 1 less the intraclass correlation.
+
+    :param features: (N, n_features)
+    :param episodes: (N,) numbers of their episodes
+    :return: (n_features,), in [0, 1]; 1 for a feature that never changes
+    """
+    numbers = th.as_tensor(np.unique(episodes, return_inverse=True)[1], device=features.device)
+    lengths = th.bincount(numbers)[:, None]
+    means = features.new_zeros(len(lengths), features.shape[1]).index_add_(0, numbers, features) / lengths
+    within, total = (features - means[numbers]).square().mean(0), features.var(0, correction=0)
+    return (within / total).sqrt().clamp_max(1.0).where(total > 1e-8, th.ones_like(total))

@@ -1,0 +1,139 @@
+"""Features that tell what is done, and features that name the episode."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch as th
+
+from sb3_actpc import ActPC
+from sb3_actpc.actpc import within_episodes
+from sb3_actpc.actpc.within_episodes import error_of_neighbours, feature_weights, share_within
+from tests.actpc.agents import imitating, make, plain
+from tests.actpc.envs import demonstrations
+
+N_EPISODES, LENGTH = 10, 40
+EPISODES = np.repeat(np.arange(0, N_EPISODES * LENGTH, LENGTH), LENGTH)
+
+
+def steps(seed=0):
+    """Positions that go up and down within every episode, and what each episode alone has: (N,) both, of unit variance."""
+    generator = np.random.default_rng(seed)
+    position = generator.uniform(-1.0, 1.0, size=N_EPISODES * LENGTH)
+    own = np.repeat(generator.permutation(np.linspace(-1.0, 1.0, N_EPISODES)), LENGTH)
+    return (th.as_tensor((x - x.mean()) / x.std(), dtype=th.float32) for x in (position, own))
+
+
+def test_the_share_within_episodes_is_that_of_an_analysis_of_variance():
+    """Two episodes around 0 and 6, of -1 and 1 in turn: 1 of a variance of 1 + 9; around 0 alone all of it; else nothing."""
+    inner = th.tensor([1.0, -1.0]).repeat(4)
+    between = th.tensor([0.0, 6.0]).repeat_interleave(4)
+    features = th.stack([between + inner, inner, between, th.full((8,), 3.0)], dim=1)
+    shares = share_within(features, np.array([7, 7, 7, 7, 2, 2, 2, 2]))
+    assert shares.tolist() == pytest.approx([0.1**0.5, 1.0, 0.0, 1.0], abs=1e-6)
+
+
+def test_episodes_of_different_lengths_count_by_their_steps():
+    features = th.tensor([[0.0], [2.0], [4.0], [6.0], [9.0]])
+    within = (9.0 + 1.0 + 1.0 + 9.0) / 5  # around 3, and around 9
+    assert share_within(features, np.array([0, 0, 0, 0, 1]))[0] == pytest.approx((within / np.var([0, 2, 4, 6, 9])) ** 0.5)
+
+
+def test_what_names_the_episode_is_taken_smaller_where_it_tells_nothing_of_what_is_done():
+    position, own = steps()
+    features, actions = th.stack([position, own + 0.1 * th.randn(len(own))], dim=1), (2.0 * position).tanh()[:, None]
+    weights = feature_weights(features, actions, EPISODES)
+    assert weights[0] > 0.9 and weights[1] < 0.05
+    assert weights.tolist() == pytest.approx((share_within(features, EPISODES) ** 2).tolist())  # the largest exponent
+
+
+def test_a_goal_stays_the_same_within_an_episode_and_keeps_its_size():
+    position, goal = steps()
+    weights = feature_weights(th.stack([position, goal], dim=1), (goal - position).tanh()[:, None], EPISODES)
+    assert weights.tolist() == [1.0, 1.0]
+
+
+def test_a_goal_beside_a_name():
+    """Both stay the same, and are taken smaller, or not, together: what is needed decides."""
+    position, goal = steps()
+    name = next(iter(list(steps(1))[1:]))
+    actions = (goal - position).tanh()[:, None]
+    assert feature_weights(th.stack([position, goal, name], dim=1), actions, EPISODES).tolist() == [1.0] * 3
+
+
+def test_a_small_gain_changes_nothing(monkeypatch):
+    """So it is with gaits, which are the same in every episode: what was measured of them stays as it was."""
+    position, own = steps()
+    features, actions = th.stack([position, own], dim=1), (2.0 * position).tanh()[:, None]
+    assert feature_weights(features, actions, EPISODES)[1] < 1.0
+    monkeypatch.setattr(within_episodes, "SMALLEST_GAIN", 1.0)
+    assert feature_weights(features, actions, EPISODES).tolist() == [1.0, 1.0]
+
+
+@pytest.mark.parametrize("number", [1, 2])
+def test_few_episodes_say_nothing(number):
+    """One has no others to be asked; of two each asks the other, however far that is."""
+    rows = slice(0, number * LENGTH)
+    position, own = (one[rows] for one in steps())
+    features, actions = th.stack([position, own], dim=1), (2.0 * position).tanh()[:, None]
+    assert feature_weights(features, actions, EPISODES[rows]).tolist() == [1.0, 1.0]
+
+
+def test_each_step_is_told_the_mean_of_what_the_nearest_of_the_others_do():
+    """Three at most, and of two others two: 0 is told the mean of 1 and 3, and so on."""
+    places = th.tensor([[0.0], [1.0], [3.0]])
+    assert error_of_neighbours(places, places, np.arange(3)) == pytest.approx((2.0**2 + 0.5**2 + 2.5**2) / 3)
+    five = th.tensor([[0.0], [1.0], [2.0], [3.0], [9.0]])
+    told = th.tensor([[2.0], [5 / 3], [4 / 3], [1.0], [2.0]])
+    assert error_of_neighbours(five, five, np.arange(5)) == pytest.approx(float((told - five).square().mean()))
+
+
+def test_of_many_steps_some_are_asked(monkeypatch):
+    asked = []
+
+    def watched(features, episodes, demonstrated, demonstrated_episodes, n):
+        asked.append((len(features), len(demonstrated)))
+        return original(features, episodes, demonstrated, demonstrated_episodes, n)
+
+    original = within_episodes.nearest_steps
+    monkeypatch.setattr(within_episodes, "nearest_steps", watched)
+    monkeypatch.setattr(within_episodes, "MOST_ASKED", 30)
+    monkeypatch.setattr(within_episodes, "MOST_ANSWERING", 150)
+    position, own = steps()
+    weights = feature_weights(th.stack([position, own], dim=1), (2.0 * position).tanh()[:, None], EPISODES)
+    assert asked == [(29, 134)] * 3 and weights[1] < 0.05  # every 14th of 400, and every third
+
+
+def named(n_episodes=6, length=30):
+    """Demonstrations whose third observation is the episode's own, and whose actions follow the first."""
+    data = demonstrations(n_episodes=n_episodes, length=length)
+    generator = np.random.default_rng(3)
+    observations = generator.uniform(-1.0, 1.0, size=data.observations.shape).astype(np.float32)
+    observations[:, 2] = np.repeat(np.arange(n_episodes), length)
+    actions = np.repeat(np.tanh(observations[:, :1]), data.actions.shape[1], axis=1).astype(np.float32)
+    return dataclasses.replace(data, observations=observations, actions=actions)
+
+
+def test_the_agent_takes_them_smaller_unless_told_not_to():
+    data, scales = named(), {}
+    for asked in (None, "episodes", "demonstrations"):
+        model = make(demonstrations=data, observation_normalization=asked)
+        scales[asked] = model.actor.normalizer.scale
+        model.set_env(model.env)  # fits again, to what is neither normalised nor weighed
+        assert th.equal(model.actor.normalizer.scale, scales[asked])
+    std = data.observations.std(0)
+    assert scales["demonstrations"].tolist() == pytest.approx((1.0 / std).tolist(), rel=1e-5)
+    assert th.equal(scales[None], scales["episodes"])
+    assert (scales[None] * std)[2] < 1e-6 and ((scales[None] * std)[:2] > 0.9).all()
+
+
+def test_weights_of_features_are_kept_in_a_file(tmp_path):
+    model = imitating(demonstrations=named())
+    path = model.save_weights(tmp_path / "agent")
+    acting = ActPC.from_weights(path, model.env)
+    assert th.equal(acting.actor.normalizer.scale, model.actor.normalizer.scale)
+
+
+def test_without_demonstrations_there_are_no_episodes_to_go_by():
+    with pytest.raises(ValueError, match="observation_normalization need demonstrations="):
+        ActPC("MlpPolicy", "Pendulum-v1", **plain(observation_normalization="episodes"))
