@@ -816,11 +816,10 @@ MUTANTS = [
         "tests/cli/test_choices.py -k kept_agent",
     ),
     Mutant("changes lie crosswise", "ngc/products.py", ".t().contiguous()", ".t()", "tests/ngc/test_products.py -k shape"),
-    Mutant("the first exponent", WITHIN, "int(np.argmin(errors))", "0", WITHINS),
     Mutant(
         "what names the episode is small anyhow",
         WITHIN,
-        " if errors[best] < (1.0 - SMALLEST_GAIN) * most else as_it_is",
+        " if weighed < (1.0 - SMALLEST_GAIN) * error else as_it_is",
         "",
         WITHINS,
     ),

@@ -2,7 +2,7 @@
 
 With ten demonstrations whatever stays the same throughout each of them, as how a can was turned when it was put there, names
 the episode, and whoever imitates them may go by that name. Features that vary less within episodes than between them (by the
-intraclass correlation) are taken smaller. A goal stays the same too, and is needed: so how much smaller is asked of the
+intraclass correlation) are taken smaller. A goal stays the same too, and is needed: so whether they are is asked of the
 demonstrations, by how well the nearest steps of the others tell what is done at each step.
 """
 
@@ -11,7 +11,6 @@ import torch as th
 
 from sb3_actpc.actpc.room import nearest_steps
 
-EXPONENTS = (1, 2)  # beside 0, of the share of a feature's standard deviation that it has within episodes
 SMALLEST_GAIN = 0.05  # of the squared error; where it is less, features stay as they are
 N_NEIGHBOURS = 3  # other episodes whose nearest steps are asked
 MOST_ASKED, MOST_ANSWERING = 1000, 4000  # steps
@@ -27,12 +26,11 @@ def feature_weights(features: th.Tensor, actions: th.Tensor, episodes: np.ndarra
     :return: (n_features,), in [0, 1]; 1 for all where that tells as well what is done
     """
     share = share_within(features, episodes)
-    as_it_is, *candidates = (share**exponent for exponent in (0, *EXPONENTS))
+    as_it_is = th.ones_like(share)
     if len(np.unique(episodes)) < 2:
         return as_it_is
-    most, *errors = (error_of_neighbours(features * weights, actions, episodes) for weights in (as_it_is, *candidates))
-    best = int(np.argmin(errors))
-    return candidates[best] if errors[best] < (1.0 - SMALLEST_GAIN) * most else as_it_is
+    error, weighed = (error_of_neighbours(features * weights, actions, episodes) for weights in (as_it_is, share))
+    return share if weighed < (1.0 - SMALLEST_GAIN) * error else as_it_is
 
 
 def error_of_neighbours(features: th.Tensor, actions: th.Tensor, episodes: np.ndarray) -> float:
