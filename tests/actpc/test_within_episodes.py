@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 import torch as th
 
-from sb3_actpc import ActPC
+from sb3_actpc import ActPC, shipped_demonstrations
 from sb3_actpc.actpc import within_episodes
 from sb3_actpc.actpc.within_episodes import error_of_neighbours, feature_weights, share_within
+from sb3_actpc.demonstrations.dataset import Demonstrations
 from tests.actpc.agents import imitating, make, plain
 from tests.actpc.envs import demonstrations
 
@@ -125,6 +126,19 @@ def test_the_agent_takes_them_smaller_unless_told_not_to():
     assert scales["demonstrations"].tolist() == pytest.approx((1.0 / std).tolist(), rel=1e-5)
     assert th.equal(scales[None], scales["episodes"])
     assert (scales[None] * std)[2] < 1e-3 and ((scales[None] * std)[:2] > 0.9).all()
+
+
+@pytest.mark.parametrize(
+    ("task", "is_weighed"),
+    [("Lift-v0", True), ("PickPlaceCan-v0", True), ("Reacher-v5", False), ("Hopper-v5", False), ("HalfCheetah-v5", False)],
+)
+def test_arms_are_weighed_and_neither_gaits_nor_the_reacher_whose_goal_stays_the_same(task, is_weighed):
+    shown = Demonstrations.load(shipped_demonstrations(f"Sparse{task}"))
+    observations = th.as_tensor(shown.observations)
+    features = (observations - observations.mean(0)) / observations.std(0).clamp_min(1e-4)
+    bounds = shown.episode_bounds
+    episodes = np.repeat(bounds[:, 0], bounds[:, 1] - bounds[:, 0])
+    assert bool((feature_weights(features, th.as_tensor(shown.actions), episodes) < 1.0).any()) == is_weighed
 
 
 def test_weights_of_features_are_kept_in_a_file(tmp_path):
