@@ -9,10 +9,9 @@ demonstrations, by how well the nearest steps of the others tell what is done at
 import numpy as np
 import torch as th
 
-from sb3_actpc.actpc.room import nearest_steps
+from sb3_actpc.actpc.room import N_NEIGHBOURS, nearest_steps
 
 SMALLEST_GAIN = 0.05  # of the squared error; where it is less, features stay as they are
-N_NEIGHBOURS = 3  # other episodes whose nearest steps are asked
 MOST_ASKED, MOST_ANSWERING = 1000, 4000  # steps
 
 
