@@ -251,7 +251,7 @@ class NGCCircuit(nn.Module):
         :param target: (B, n_outputs)
         :param memory: m_t, (B, n_memory), for a circuit with a working memory
         :return: latents, activations and errors of every layer
-        :raises ValueError: as :meth:`project`
+        :raises ValueError: as :meth:`project`, and for a target of another shape than the outputs'
         """
         chain = self.chain(x, memory)
         chain.clamp_output(target)
@@ -345,7 +345,13 @@ class NGCCircuit(nn.Module):
 
         :param changes: of this circuit's synapses
         :param weight_decay: λ of this once; None for the circuit's own
+        :raises ValueError: for a circuit without an optimiser
         """
+        if not hasattr(self, "optimizer"):
+            raise ValueError(
+                "this circuit has no optimizer to hand its changes to; set one first, as in "
+                "circuit.optimizer = torch.optim.Adam(circuit.parameter_groups(1e-3))"
+            )
         self._decay_synapses(self.weight_decay if weight_decay is None else weight_decay)
         old = [parameter.clone() for parameter in self._scaled_synapses()] if self.synaptic_scaling == "soft_bound" else []
         targets = [*self.synapses.weights, *self.synapses.biases, *self.synapses.memory]

@@ -23,10 +23,14 @@ class CoupledState:
 
 
 def check_agreement(actor: NGCCircuit, critic: NGCCircuit) -> None:
-    """:raises ValueError: for two circuits that cannot settle as one, as their schedules differ"""
-    for name in ("settling", "n_settling_steps", "dynamics"):
+    """:raises ValueError: for two circuits that cannot settle as one, as their schedules differ; a sweep takes no steps"""
+    is_swept = actor.settling == critic.settling == "scheduled"
+    for name in ("settling",) if is_swept else ("settling", "n_settling_steps", "dynamics"):
         if getattr(actor, name) != getattr(critic, name):
-            raise ValueError(f"actor {name}={getattr(actor, name)!r} and critic {name}={getattr(critic, name)!r} must agree")
+            raise ValueError(
+                f"actor {name}={getattr(actor, name)!r} and critic {name}={getattr(critic, name)!r} must agree, as the two settle as "
+                f"one; give both circuits the same {name}"
+            )
 
 
 def settle_coupled(

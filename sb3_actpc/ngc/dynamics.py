@@ -104,7 +104,16 @@ class SettlingChain:
         self.first_prediction = hidden[0].clone() if hidden else self.output_prediction
 
     def clamp_output(self, target: th.Tensor) -> None:
-        """Clamp the output layer to ``target`` (B, n_outputs): its error is target - g(z̄), now and after every step."""
+        """
+        Clamp the output layer to ``target`` (B, n_outputs): its error is target - g(z̄), now and after every step.
+
+        :raises ValueError: for a target of another shape, which would be broadcast
+        """
+        if target.shape != self.output.shape:
+            raise ValueError(
+                f"target has the shape {tuple(target.shape)} where the circuit's outputs have {tuple(self.output.shape)}; give one "
+                "target for each output of each row of the batch"
+            )
         self.target = target
         self.output_error = th.empty_like(self.output)
         self.drive = th.empty_like(self.output) if self.settings.output_activation.name != "identity" else self.output_error

@@ -95,6 +95,16 @@ def test_a_pair_that_does_not_fit_is_named():
         settle_coupled(actor, NGCCircuit(23, 6), x)
     with pytest.raises(ValueError, match="must agree"):
         settle_coupled(make_pair(settling="scheduled")[0], critic, x)
+    critic.n_settling_steps = 7
+    with pytest.raises(ValueError, match=r"n_settling_steps=10 and critic n_settling_steps=7 must agree.*give both circuits"):
+        settle_coupled(actor, critic, x)
+
+
+def test_a_swept_pair_may_name_any_number_of_steps():
+    actor, critic, x = make_pair(settling="scheduled")
+    expected = settle_coupled(actor, critic, x).actor.errors[-1].clone()
+    critic.n_settling_steps = 7
+    assert th.equal(settle_coupled(actor, critic, x).actor.errors[-1], expected)
 
 
 def test_policy_gradient_is_exact_whatever_the_feedback():

@@ -220,6 +220,24 @@ def test_a_missing_or_unwanted_memory_is_named():
         make()[0].settle(x, target, th.zeros(7, 4, dtype=x.dtype))
 
 
+@pytest.mark.parametrize("settling", ["scheduled", "iterative"])
+def test_a_target_of_another_shape_is_refused(settling):
+    """It would be broadcast: one target for the whole batch, or one number for all outputs."""
+    circuit, x, target = make(settling=settling)
+    for wrong in (target[0], target[:1], target[:, :1]):
+        with pytest.raises(ValueError, match="target has the shape"):
+            circuit.settle(x, wrong)
+
+
+def test_a_circuit_without_an_optimizer_says_how_to_set_one():
+    circuit, x, target = make()
+    changes = circuit.hebbian_update(circuit.settle(x, target))
+    with pytest.raises(ValueError, match="no optimizer"):
+        circuit.apply_changes(changes)
+    circuit.optimizer = th.optim.Adam(circuit.parameter_groups(1e-3))
+    circuit.apply_changes(changes)
+
+
 @pytest.mark.parametrize("feedback", ["tied", "learned"])
 def test_synapses_go_into_a_circuit_that_settles_in_another_way(feedback):
     """Given rates are the constructor's, adapted ones follow from the synapses."""
