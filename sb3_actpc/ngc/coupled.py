@@ -28,8 +28,8 @@ def check_agreement(actor: NGCCircuit, critic: NGCCircuit) -> None:
     for name in ("settling",) if is_swept else ("settling", "n_settling_steps", "dynamics"):
         if getattr(actor, name) != getattr(critic, name):
             raise ValueError(
-                f"actor {name}={getattr(actor, name)!r} and critic {name}={getattr(critic, name)!r} must agree, as the two settle as "
-                f"one; give both circuits the same {name}"
+                f"actor {name}={getattr(actor, name)!r} and critic {name}={getattr(critic, name)!r} must agree, as they "
+                f"settle as one; give both circuits the same {name}"
             )
 
 
