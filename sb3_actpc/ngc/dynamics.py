@@ -111,8 +111,8 @@ class SettlingChain:
         """
         if target.shape != self.output.shape:
             raise ValueError(
-                f"target has the shape {tuple(target.shape)}, the circuit's outputs have {tuple(self.output.shape)}; give one target "
-                "for each output of each row of the batch"
+                f"target has the shape {tuple(target.shape)}, the circuit's outputs have {tuple(self.output.shape)}; give one "
+                "target for each output of each row of the batch"
             )
         self.target = target
         self.output_error = th.empty_like(self.output)
