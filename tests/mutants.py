@@ -117,6 +117,27 @@ MUTANTS = [
         f"{SETTLING} -k 'one_step or further'",
     ),
     Mutant(
+        "a target of one row is one for all",
+        "ngc/dynamics.py",
+        "if target.shape != self.output.shape:",
+        "if target.shape[-1:] != self.output.shape[-1:]:",
+        f"{SETTLING} -k another_shape",
+    ),
+    Mutant(
+        "a sweep asks for the same steps of both circuits",
+        COUPLED,
+        'for name in ("settling",) if is_swept else',
+        'for name in ("settling", "n_settling_steps") if is_swept else',
+        "tests/ngc/test_scheduled.py -k any_number_of_steps",
+    ),
+    Mutant(
+        "two circuits may relax for different times",
+        COUPLED,
+        'for name in ("settling",) if is_swept else',
+        'for name in ("settling",) if is_swept or True else',
+        "tests/ngc/test_scheduled.py -k does_not_fit",
+    ),
+    Mutant(
         "projection without the last bias",
         CIRCUIT,
         "output = predict(x, self.synapses.weights[-1], biases[-1])",
