@@ -59,6 +59,7 @@ ENCODING, HELD = "checkpoints/encoding.py", "tests/checkpoints/test_environments
 CLONING, CLONES = "actpc/cloning.py", "tests/actpc/test_cloning.py"
 ROOM, ROOMS = "actpc/room.py", "tests/actpc/test_room.py"
 WITHIN, WITHINS = "actpc/within_episodes.py", "tests/actpc/test_within_episodes.py"
+STRANGERS = "tests/actpc/test_strangers.py"
 LEARNS, STORES = "tests/actpc/test_agent.py", "tests/actpc/test_buffers.py"
 COUPLED, SPARSE = "ngc/coupled.py", "envs/sparse_mujoco.py"
 STATISTICS, R_STABILITY = "experiments/report/statistics.py", "experiments/report/r_stability.py"
@@ -840,9 +841,36 @@ MUTANTS = [
     Mutant(
         "what names the episode is small anyhow",
         WITHIN,
-        " if weighed < (1.0 - SMALLEST_GAIN) * error else as_it_is",
-        "",
+        "        return as_it_is\n    for",
+        "        pass\n    for",
         WITHINS,
+    ),
+    Mutant("no feature is asked for on its own", WITHIN, "< SMALL_SHARE", "< 0.0", f"{WITHINS} -k cue"),
+    Mutant("any need will do", WITHIN, "(1.0 - SMALLEST_NEED) * ", "2.0 * ", f"{WITHINS} -k cue"),
+    Mutant("every so manieth step", ROOM, "np.linspace(0, n - 1, min(n, most))", "np.arange(0, n, -(-n // most))", ROOMS),
+    Mutant("neighbours of the step's own episode", ROOM, "np.where(own, -1, part.neighbours)", "part.neighbours", ROOMS),
+    Mutant("change is absolute", POLICIES, "SMALLEST_CHANGE * features.abs().amax(0)", "1e-4 + 0.0 * features[0]", STRANGERS),
+    Mutant("any deviation is change", POLICIES, ".clamp_min(SMALLEST_DEVIATION)", "", f"{STRANGERS} -k noise"),
+    Mutant(
+        "an extractor that is trained", POLICIES, "        features_extractor.eval()", "        pass", f"{STRANGERS} -k fixed"
+    ),
+    Mutant(
+        "fused whatever is given",
+        POLICIES,
+        ' and not kwargs.keys() & {"foreach", "differentiable"}',
+        "",
+        f"{STRANGERS} -k adam",
+    ),
+    Mutant("VecNormalize knows nothing", AGENT, "            self._show_to_vec_normalize()", "", f"{STRANGERS} -k vec_norm"),
+    Mutant("held statistics move", AGENT, " or not normalize.training", "", f"{STRANGERS} -k held"),
+    Mutant(
+        "the first step as it was seen", AGENT, "if self._last_original_obs is not None:", "if False:", f"{STRANGERS} -k first"
+    ),
+    Mutant("a rate of a file", AGENT, 'group["lr_scale"] = scale', "pass", f"{STRANGERS} -k outlasts"),
+    Mutant("anybody's buffer", AGENT, "n_envs == self.n_envs", "True", f"{STRANGERS} -k buffers"),
+    Mutant("buffers that are refused stay", AGENT, "        self.replay_buffer = given", "", f"{STRANGERS} -k buffers"),
+    Mutant(
+        "loaded synapses aside", CIRCUIT, "    circuit._list_synapses()", "    pass", "tests/ngc/test_settling.py -k loaded"
     ),
     Mutant("any gain will do", WITHIN, "(1.0 - SMALLEST_GAIN) * ", "", f"{WITHINS} -k small_gain"),
     Mutant("absent neighbours answer", WITHIN, " * known)", ")", f"{WITHINS} -k each_step"),
@@ -1136,8 +1164,8 @@ MUTANTS = [
     Mutant(
         "a policy of one's own has no keywords of its own",
         POLICIES,
-        "for kind in policy_class.__mro__ if",
-        "for kind in ActPCPolicy.__mro__ if",
+        "{*constructor_keywords(policy_class)} -",
+        "{*constructor_keywords(ActPCPolicy)} -",
         f"{LEARNS} -k keywords_of_its_own",
     ),
     # ------------------------------------------------------------------ buffers
@@ -1178,7 +1206,11 @@ MUTANTS = [
         STORES,
     ),
     Mutant(
-        "returns of several steps are not discounted", BUFFERS, "* mask * discounts).sum", "* mask).sum", f"{STORES} -k n_step"
+        "returns of several steps are not discounted",
+        BUFFERS,
+        "* mask * self.gamma ** np.arange(self.n_steps, dtype=np.float32)).sum",
+        "* mask).sum",
+        f"{STORES} -k n_step",
     ),
     Mutant(
         "a ring's rows without their past are drawn",

@@ -68,8 +68,10 @@ from sb3_actpc.actpc.within_episodes import feature_weights
 from sb3_actpc.checkpoints import Restored, between_updates, load_checkpoint, load_weights, save_weights
 from sb3_actpc.demonstrations import fit_demonstrations
 from sb3_actpc.demonstrations.dataset import Demonstrations
+from sb3_actpc.demonstrations.recording import ENDLESS
 from sb3_actpc.ngc import CoupledState, HebbianChanges, NGCCircuit, settle_coupled
-from sb3_actpc.utils.checks import Settings, check_finite, check_kind, named_in_errors
+from sb3_actpc.utils.checks import Settings, check_finite, check_kind, named_in_errors, nearest
+from sb3_actpc.utils.constructors import constructor_keywords
 
 SelfActPC = TypeVar("SelfActPC", bound="ActPC")
 Weighing = float | th.Tensor  # a weight: a number, or 0-d where an update is one graph, whose numbers are constants
@@ -85,7 +87,6 @@ ROOM_DECAY = 1.0  # of clones' synapses where they imitate steps between demonst
 TARGET_NOISE_CLIP = 2.5  # standard deviations, as TD3's 0.5 for 0.2
 AVERAGING_RATE = 0.001  # per update, of the average of the actor that becomes the habit
 LARGEST_BOUND = 1e6  # of an observation; larger ones stand for none
-ENDLESS = 5000  # steps of an episode, after which a habit's user is warned
 CANDIDATE_AGE = 2000  # updates of a pressing critic before that average is a candidate: one that begins is wrong
 
 
@@ -347,13 +348,13 @@ class ActPC(OffPolicyAlgorithm):
         self._compiled: CompiledUpdate | None = None
 
     def _make_policy(self) -> ActPCPolicy:
-        check_policy_kwargs(self.policy_class, self.policy_kwargs)
         given = self.policy_kwargs.get("circuit_kwargs") or {}
         check_kind("circuit_kwargs", given, Settings | None)
         chosen = given.get("settling", self.settling)
         if not isinstance(chosen, str) or chosen != self.settling:
             raise ValueError(f"circuit_kwargs has settling={chosen!r} but the agent's is {self.settling!r}; pass settling=")
         kwargs = {**self.policy_kwargs, "circuit_kwargs": {**given, "settling": self.settling}}
+        check_policy_kwargs(self.policy_class, kwargs)
         policy = self.policy_class(self.observation_space, self.action_space, self.lr_schedule, **kwargs)
         assert isinstance(policy, ActPCPolicy)
         return policy
@@ -375,6 +376,9 @@ class ActPC(OffPolicyAlgorithm):
                 f"replay_buffer_kwargs has {name!r}: give it to the agent (history: policy_kwargs['memory_history'])"
             )
         kwargs |= self.replay_buffer_kwargs
+        known = constructor_keywords(kind)
+        for name in kwargs.keys() - known:
+            raise ValueError(f"replay_buffer_kwargs has {name!r}, which {kind.__name__} does not take{nearest(name, known)}")
         if issubclass(kind, HerReplayBuffer):
             assert self.env is not None, "You must pass an environment when using `HerReplayBuffer`"  # as SB3 does
             kwargs["env"] = self.env
@@ -416,7 +420,10 @@ class ActPC(OffPolicyAlgorithm):
         if self.demonstrations is None:
             idle = [name for name in NEED_DEMONSTRATIONS if getattr(self, name)]
             idle += ["observation_normalization"] if self.observation_normalization in FROM_DEMONSTRATIONS else []
-            if idle:
+            if idle and self._is_trained():  # what these did stays in the circuits
+                self.demonstration_fraction, self.actor_warm_start = 0.0, 0
+                self.n_demonstrations = self.n_demonstration_transitions = None
+            elif idle:
                 raise ValueError(f"{' and '.join(idle)} need demonstrations=; pass a file or leave them out")
             return
         if self.env is None and isinstance(self.observation_space, spaces.Dict):
@@ -426,8 +433,8 @@ class ActPC(OffPolicyAlgorithm):
             demonstrations = fit_demonstrations(
                 self.demonstrations, self.env, self.observation_space, self.action_space, *limits
             )
-        except FileNotFoundError:
-            if not (self.pretrained or self.num_timesteps or self.n_cloning_updates):
+        except (FileNotFoundError, ImportError, ValueError) as error:
+            if not self._is_trained() or not (isinstance(error, FileNotFoundError) or self.env is None):
                 raise
             return  # a trained agent acts without them; ``learn`` says what is missing
         assert isinstance(self.action_space, spaces.Box)
@@ -436,6 +443,9 @@ class ActPC(OffPolicyAlgorithm):
             self.actor.normalizer.begin()
             if not self._normalises_observations():
                 self._fit_to_demonstrations(self.expert.episodes)
+
+    def _is_trained(self) -> bool:
+        return bool(self.pretrained or self.num_timesteps or self.n_cloning_updates)
 
     def _fit_to_demonstrations(self, shown: Episodes) -> None:
         normalizer, rows = self.actor.normalizer, np.arange(len(shown))
@@ -623,7 +633,9 @@ class ActPC(OffPolicyAlgorithm):
         )
 
     def _describe_imitated(self) -> str:
-        if not (self.refresh_weight or self.actor_warm_start):
+        assert self.replay_buffer is not None
+        is_of_nothing = self.expert is None and self.replay_buffer.self_imitation is None
+        if is_of_nothing or not (self.refresh_weight or self.actor_warm_start):
             return "nothing"
         own = "" if self.expert is not None else "own episodes, "
         if self.refresh.weighting == "uniform":
@@ -655,6 +667,7 @@ class ActPC(OffPolicyAlgorithm):
             )
         if self.cloning is None and not self.pretrained:
             self.n_cloning_updates = 0  # an agent that was saved meanwhile begins again: its teachers are not in the file
+            self._show_to_vec_normalize()
             self.cloning = self._clone_into(self.actor.circuit)
         n_updates = max(n_prior, 0) + (0 if self.cloning is None else len(self.cloning) - self.n_cloning_updates)
         for update in tqdm(range(n_updates), "pre-training", disable=not progress_bar):
@@ -674,6 +687,23 @@ class ActPC(OffPolicyAlgorithm):
         if self.actor_warm_start and self.trials is not None:
             self.trials.n_clones = self.refresh.n_clones - 1
         self.policy.has_imitated.fill_(1.0)
+
+    def _show_to_vec_normalize(self) -> None:
+        """Its statistics are of the demonstrations before anything learns from these: they have seen one observation else."""
+        normalize = self._vec_normalize_env
+        if normalize is None or not normalize.norm_obs or not normalize.training:
+            return
+        assert self.expert is not None
+        shown = self.expert.episodes
+        for rows in np.array_split(np.arange(len(shown)), 1 + len(shown) // 1024):
+            observations = shown.take(rows).observations
+            if isinstance(normalize.obs_rms, dict):
+                for key, statistics in normalize.obs_rms.items():
+                    statistics.update(observations[key])
+            else:
+                normalize.obs_rms.update(observations)
+        if self._last_original_obs is not None:
+            self._last_obs = normalize.normalize_obs(self._last_original_obs)
 
     def _clone_into(self, circuit: NGCCircuit) -> Cloning:
         """What makes an actor's circuit a clone of whatever is imitated by now."""
@@ -838,7 +868,9 @@ class ActPC(OffPolicyAlgorithm):
         _copy(cloning.clone, self.policy.candidate)
 
     def _check_observations(self, observations: Any) -> None:
-        map_observations(lambda array: check_finite("environment", "observations", array, self.num_timesteps), observations)
+        with np.errstate(over="ignore"):  # circuits see float32
+            seen = map_observations(lambda one: one.astype(np.float32) if one.dtype == np.float64 else one, observations)
+        map_observations(lambda array: check_finite("environment", "observations", array, self.num_timesteps), seen)
 
     def _score(
         self,
@@ -1157,8 +1189,14 @@ class ActPC(OffPolicyAlgorithm):
         return model
 
     def set_parameters(self, *args: Any, **kwargs: Any) -> None:
-        """As in SB3. What a habit was paid says nothing of one that is given in its place."""
+        """As in SB3. What a habit was paid says nothing of one that is given in its place, and how a circuit's learning rate
+        goes with the agent's is a setting, not a parameter."""
+        groups = [group for _, circuit in self.policy.named_circuits() for group in circuit.optimizer.param_groups]
+        scales = [group["lr_scale"] for group in groups]
         super().set_parameters(*args, **kwargs)
+        groups = [group for _, circuit in self.policy.named_circuits() for group in circuit.optimizer.param_groups]
+        for group, scale in zip(groups, scales, strict=True):
+            group["lr_scale"] = scale
         if self.trials is not None:
             self.trials = self.trials.forgotten(self.n_envs, goes_on=True)
 
@@ -1210,6 +1248,24 @@ class ActPC(OffPolicyAlgorithm):
         :param keywords: constructor keywords that replace the stored ones, such as ``demonstrations``
         """
         return load_checkpoint(cls, path, env, **keywords)
+
+    def load_replay_buffer(self, path: Any, truncate_last_traj: bool = True) -> None:
+        """
+        As in SB3, which unpickles: load files that you trust.
+
+        :raises ValueError: for a buffer of another algorithm, or of as many environments as this agent has not
+        """
+        given = self.replay_buffer
+        super().load_replay_buffer(path, truncate_last_traj)
+        loaded = self.replay_buffer
+        n_envs = getattr(loaded, "n_envs", None)
+        if isinstance(loaded, SignalReplay) and n_envs == self.n_envs:
+            return
+        self.replay_buffer = given
+        raise ValueError(
+            f"{path} holds a {type(loaded).__name__} of {n_envs} environments: this agent, of {self.n_envs}, needs "
+            "what save_replay_buffer of such an ActPC has written"
+        )
 
     def save_weights(self, path: str | PathLike[str]) -> Path:
         """

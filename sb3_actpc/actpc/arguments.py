@@ -152,8 +152,13 @@ def check_actions(space: gym.spaces.Box, noise: ActionNoise | None) -> None:
     :param noise: of exploration; its shape is known for SB3's kinds
     :raises ValueError: when a dimension has no finite extent, or the noise another shape
     """
-    if not np.all(np.isfinite([space.low, space.high])):
-        raise ValueError(f"action_space={space} must have finite bounds; wrap the environment to rescale it")
+    with np.errstate(over="ignore", invalid="ignore"):
+        is_finite = np.all(np.isfinite(space.high - space.low))  # the largest numbers that there are stand for no bound too
+    if not is_finite:
+        raise ValueError(
+            f"action_space={space} must have finite bounds: give its actions those that they have, by "
+            "gymnasium.wrappers.TransformAction(env, lambda action: action, gymnasium.spaces.Box(low, high))"
+        )
     if not np.issubdtype(space.dtype, np.floating):  # SB3's buffer would cut scaled actions off to whole numbers
         raise ValueError(
             f"action_space={space} must have a floating dtype: wrap the environment in a gymnasium.ActionWrapper whose "
@@ -220,8 +225,11 @@ def check_extractor(name: str, kind: Any) -> None:
 
 
 def check_optimizer(name: str, kind: Any) -> None:
-    """A class of ``torch.optim``."""
+    """A class of ``torch.optim`` that steps by the changes alone."""
     _check_subclass(name, kind, th.optim.Optimizer)
+    closure = inspect.signature(kind.step).parameters.get("closure")
+    if closure is not None and closure.default is closure.empty:
+        raise ValueError(f"{name}={kind!r} asks for a loss again and again; circuits have none: use one such as Adam or SGD")
 
 
 def _check_subclass(name: str, kind: Any, base: type) -> None:

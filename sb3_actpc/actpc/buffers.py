@@ -231,16 +231,16 @@ class SignalReplay(ReplayBuffer):
         env: VecNormalize | None,
         rewards_of: tuple[Normalize, Normalize] | None = STORED,
     ) -> SignalReplaySamples:
-        last, mask = rows, None
+        window, last, mask = rows[:, None], rows, None
         history, history_mask = self._history_at(rows, envs, env)
         next_history: tuple[Any, Any] = (None, None)
         if self.n_steps > 1:
-            last, mask = self._n_step_window(rows, envs)
+            window, last, mask = self._n_step_window(rows, envs)
             next_history = self._history_at(last, envs, env, including=True)
         epistemic = instrumental = np.zeros((len(rows), 1), dtype=np.float32)
         if rewards_of is not None:
-            epistemic = self._summed(self.epistemic, rows, envs, mask, rewards_of[0])
-            instrumental = self._summed(self.instrumental, rows, envs, mask, rewards_of[1])
+            epistemic = self._summed(self.epistemic, window, envs, mask, rewards_of[0])
+            instrumental = self._summed(self.instrumental, window, envs, mask, rewards_of[1])
         one_step_on = mask is not None and rewards_of is not None
         return SignalReplaySamples(
             observations=self._observations_at(rows, envs, env),
@@ -248,7 +248,7 @@ class SignalReplay(ReplayBuffer):
             next_observations=self._next_observations_at(last, envs, env),
             dones=self.to_torch((self.dones[last, envs] * (1 - self.timeouts[last, envs])).reshape(-1, 1)),
             rewards=self.to_torch(
-                self._summed(self.rewards, rows, envs, mask, lambda rewards: self._normalize_reward(rewards, env))
+                self._summed(self.rewards, window, envs, mask, lambda rewards: self._normalize_reward(rewards, env))
             ),
             discounts=None if mask is None else self.to_torch(self.gamma ** mask.sum(1, keepdims=True)),
             epistemic=self.to_torch(epistemic),
@@ -301,28 +301,27 @@ class SignalReplay(ReplayBuffer):
         tensors = map_observations(lambda t: t.reshape(*mask.shape, *t.shape[1:]), self._to_tensors(flat, env))
         return tensors, self.to_torch(mask)
 
-    def _n_step_window(self, rows: np.ndarray, envs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Last row of each n-step window and which of its ``n_steps`` rows count, (B,) and (B, n_steps)."""
+    def _n_step_window(self, rows: np.ndarray, envs: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The rows of each n-step window, the last that counts, and which do, (B, n_steps), (B,) and (B, n_steps)."""
         window = (rows[:, None] + np.arange(self.n_steps)) % self.buffer_size
         ended = (self.dones[window, envs[:, None]] != 0) | (window == self.newest)
         before = np.cumsum(ended, axis=1) - ended
         mask = (before == 0).astype(np.float32)
-        return window[np.arange(len(rows)), mask.sum(1).astype(int) - 1], mask
+        return window, window[np.arange(len(rows)), mask.sum(1).astype(int) - 1], mask
 
     def _summed(
         self,
         values: np.ndarray,
-        rows: np.ndarray,
+        window: np.ndarray,
         envs: np.ndarray,
         mask: np.ndarray | None,
         normalize: Normalize,
     ) -> np.ndarray:
-        """``values`` at the rows, or their discounted sum over the n-step window, each normalised first, (B, 1)."""
+        """``values`` at a window's one row, or their discounted sum over longer ones, each normalised first, (B, 1)."""
+        normalized = normalize(values[window, envs[:, None]])
         if mask is None:
-            return normalize(values[rows, envs].reshape(-1, 1))
-        window = (rows[:, None] + np.arange(self.n_steps)) % self.buffer_size
-        discounts = self.gamma ** np.arange(self.n_steps, dtype=np.float32)
-        return (normalize(values[window, envs[:, None]]) * mask * discounts).sum(1, keepdims=True)
+            return normalized
+        return (normalized * mask * self.gamma ** np.arange(self.n_steps, dtype=np.float32)).sum(1, keepdims=True)
 
 
 class CombinedReplayBuffer(SignalReplay):

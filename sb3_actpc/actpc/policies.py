@@ -31,11 +31,14 @@ from sb3_actpc.actpc.trust_region import TrustRegion
 from sb3_actpc.ngc import NGCCircuit, WorkingMemory, check_agreement
 from sb3_actpc.ngc.activations import ACTIVATIONS
 from sb3_actpc.utils.checks import LARGEST_SIZE, Settings, named_in_errors
+from sb3_actpc.utils.constructors import constructor_keywords
 
 # what circuit_kwargs, actor_kwargs and so on may set; sizes follow from the task
 _SIZES = {"self", "n_inputs", "n_outputs", "hidden", "output_activation", "n_memory", "n_feedback_inputs"}
 CIRCUIT_KEYWORDS = set(inspect.signature(NGCCircuit.__init__).parameters) - _SIZES
 OBSERVATION_CLIP = 10.0
+# standard deviations at least, of a feature that has changed: of its largest size, and at all; a smaller one may be rounding
+SMALLEST_CHANGE, SMALLEST_DEVIATION = 1e-4, 1e-7
 PRIOR_NET_ARCH = (512, 256)  # paper: prior of all MuJoCo tasks
 ACTOR_SLOWNESS = 4.0  # how much slower than the others the actor learns beside a habit
 
@@ -63,7 +66,8 @@ class ObservationNormalizer(nn.Module):
         """:param features: (N, n_features), not normalised, whose mean and standard deviation are used from now on"""
         self.mean.copy_(features.mean(0))
         std = features.std(0, correction=0)
-        self.scale.copy_(th.where(std > 1e-4, 1.0 / std, 1.0))  # a feature that never changed says nothing of its scale
+        has_changed = std > (SMALLEST_CHANGE * features.abs().amax(0)).clamp_min(SMALLEST_DEVIATION)
+        self.scale.copy_(th.where(has_changed, 1.0 / std, 1.0))  # a feature that never changed says nothing of its scale
         self.clip.fill_(OBSERVATION_CLIP)
 
     def weigh(self, weights: th.Tensor) -> None:
@@ -121,6 +125,7 @@ class ActPCActor(BasePolicy):
             normalize_images=normalize_images,
             squash_output=True,
         )
+        features_extractor.eval()  # dropout and running statistics would go on under a finished actor
         n_features = features_extractor.features_dim
         self.net_arch, self.circuit_kwargs, self.memory_history = list(net_arch), circuit_kwargs, memory_history
         self.normalizer = ObservationNormalizer(n_features)
@@ -157,9 +162,8 @@ class ActPCActor(BasePolicy):
         return self.circuit if self.habit is None else self.habit
 
     def train(self, mode: bool = True) -> "ActPCActor":
-        """Only the extractor can tell training from acting: circuits have no such mode (SB3 asks at every step)."""
+        """Nothing can tell training from acting: circuits have no such mode, and the extractor, which nobody trains, acts."""
         self.training = mode
-        self.features_extractor.train(mode)
         return self
 
     def features(self, observations: PyTorchObs) -> th.Tensor:
@@ -434,7 +438,7 @@ class ActPCPolicy(BasePolicy):
             raise ValueError(
                 f"optimizer_kwargs has lr={kwargs['lr']!r}: use learning_rate=, or a circuit's own, as in actor_kwargs"
             )
-        if self.optimizer_class is th.optim.Adam:
+        if self.optimizer_class is th.optim.Adam and not kwargs.keys() & {"foreach", "differentiable"}:
             kwargs.setdefault("fused", True)  # one kernel for all synapses
         with named_in_errors(f"optimizer_kwargs={self.optimizer_kwargs!r}"):
             return self.optimizer_class(groups, **kwargs)
@@ -468,10 +472,6 @@ class ActPCPolicy(BasePolicy):
         self.actor.train(mode)
         return self
 
-    def features(self, observations: PyTorchObs) -> th.Tensor:
-        """What every circuit sees of the observations, (B, n_features)."""
-        return self.actor.features(observations)
-
     def forward(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         return self._predict(observation, deterministic)
 
@@ -499,15 +499,17 @@ def check_policy(name: str, policy: Any) -> None:
 def check_policy_kwargs(policy_class: type[BasePolicy], given: Mapping[str, Any]) -> None:
     """:raises ValueError: naming the keywords that the class has not, nor one that it is made from; the policy checks the
     values"""
-    classes = [kind for kind in policy_class.__mro__ if issubclass(kind, ActPCPolicy)]
-    parameters = [parameter for kind in classes for parameter in inspect.signature(kind).parameters.values()]
-    known = {one.name for one in parameters if one.kind not in (one.VAR_POSITIONAL, one.VAR_KEYWORD)}
-    known -= {"observation_space", "action_space", "lr_schedule"}
+    known = {*constructor_keywords(policy_class)} - {"observation_space", "action_space", "lr_schedule"}
     unknown = sorted(set(given) - known)
     if "activation_fn" in unknown:
         raise ValueError(
             f"policy_kwargs has activation_fn={given['activation_fn']!r}: activations are chosen by name, with "
             f"policy_kwargs=dict(circuit_kwargs=dict(activation=...)), one of {sorted(ACTIVATIONS)}"
+        )
+    if {*unknown} & {*constructor_keywords(ActPCPolicy)}:
+        raise ValueError(
+            f"{policy_class.__name__} does not take {unknown}, which ActPC gives it: let its __init__ take **kwargs and pass "
+            "them on to ActPCPolicy's"
         )
     if unknown:
         raise ValueError(f"policy_kwargs has unknown keys {unknown}; choose from {sorted(known)}")

@@ -33,8 +33,8 @@ class Room:
     def __init__(self, shown: Episodes, features_of: FeaturesOf, by_return: bool) -> None:
         self.shown, self.features_of = shown, features_of
         drawn = np.flatnonzero(shown.weights > 0.0) if by_return else np.arange(len(shown))
-        self.rows = drawn[:: -(-len(drawn) // MOST_NEIGHBOURS)]
-        rows = drawn[:: -(-len(drawn) // MOST_MEASURED)]
+        self.rows = drawn[evenly(len(drawn), MOST_NEIGHBOURS)]
+        rows = drawn[evenly(len(drawn), MOST_MEASURED)]
         rows = rows[(rows + 1 < len(shown)) & (shown.starts[rows] == shown.starts[np.minimum(rows + 1, len(shown) - 1)])]
         self.step, self.is_wide = 0.0, False
         if len(rows):
@@ -53,6 +53,10 @@ class Room:
             numbers = part.starts[rows] if part is self.shown else np.full(len(rows), -1)
             nearest = self._nearest(self.features_of(part, rows), numbers, N_NEIGHBOURS)
             part.neighbours = np.repeat(nearest, every, axis=0)[: len(part)]
+            if part is self.shown and every > 1:  # beyond an episode's end they may be of the step's own
+                own = self.shown.starts[part.neighbours] == self.shown.starts[:, None]
+                left = np.where(own, -1, part.neighbours)
+                part.neighbours = np.take_along_axis(left, np.argsort(left < 0, axis=1, kind="stable"), axis=1)
 
     def between(
         self, features: th.Tensor, actions: th.Tensor, neighbours: np.ndarray, noise: float
@@ -79,6 +83,15 @@ class Room:
         demonstrated = self.features_of(self.shown, self.rows)
         nearest = nearest_steps(features, episodes, demonstrated, self.shown.starts[self.rows], n)
         return np.where(nearest < 0, -1, self.rows[nearest])
+
+
+def evenly(n: int, most: int) -> np.ndarray:
+    """
+    Rows that are spread over all of ``n``: not every so manieth, which of episodes of one length may always be the same step.
+
+    :return: (min(n, most),), increasing
+    """
+    return np.linspace(0, n - 1, min(n, most)).astype(np.int64)
 
 
 def nearest_steps(

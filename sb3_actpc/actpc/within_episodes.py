@@ -3,15 +3,18 @@
 With ten demonstrations whatever stays the same throughout each of them, as how a can was turned when it was put there, names
 the episode, and whoever imitates them may go by that name. Features that vary less within episodes than between them (by the
 intraclass correlation) are taken smaller. A goal stays the same too, and is needed: so whether they are is asked of the
-demonstrations, by how well the nearest steps of the others tell what is done at each step.
+demonstrations, of all of them together and of each that would hardly be left, by how well the nearest steps of the others tell
+what is done at each step.
 """
 
 import numpy as np
 import torch as th
 
-from sb3_actpc.actpc.room import N_NEIGHBOURS, nearest_steps
+from sb3_actpc.actpc.room import N_NEIGHBOURS, evenly, nearest_steps
 
-SMALLEST_GAIN = 0.05  # of the squared error; where it is less, features stay as they are
+# of the squared error: of taking features smaller, where it is less they stay as they are; and of one that keeps its size
+SMALLEST_GAIN, SMALLEST_NEED = 0.05, 0.1
+SMALL_SHARE = 0.5  # of a feature that is asked for on its own
 MOST_ASKED, MOST_ANSWERING = 1000, 4000  # steps
 
 
@@ -22,14 +25,25 @@ def feature_weights(features: th.Tensor, actions: th.Tensor, episodes: np.ndarra
     :param features: (N, n_features) of demonstrated steps, normalised
     :param actions: (N, A) shown there
     :param episodes: (N,) numbers of their episodes
-    :return: (n_features,), in [0, 1]; 1 for all where that tells as well what is done
+    :return: (n_features,), in [0, 1]; 1 for all where that tells as well what is done, and for each that is needed
     """
-    share = share_within(features, episodes)
-    as_it_is = th.ones_like(share)
+    weights = share_within(features, episodes)
+    as_it_is = th.ones_like(weights)
     if len(np.unique(episodes)) < 2:
         return as_it_is
-    error, weighed = (error_of_neighbours(features * weights, actions, episodes) for weights in (as_it_is, share))
-    return share if weighed < (1.0 - SMALLEST_GAIN) * error else as_it_is
+
+    def error(of_weights: th.Tensor) -> float:
+        return error_of_neighbours(features * of_weights, actions, episodes)
+
+    smallest = error(weights)
+    if smallest >= (1.0 - SMALLEST_GAIN) * error(as_it_is):
+        return as_it_is
+    for feature in weights.argsort().tolist():
+        if weights[feature] < SMALL_SHARE:
+            needed = weights.index_fill(0, th.tensor(feature, device=weights.device), 1.0)
+            if (with_it := error(needed)) < (1.0 - SMALLEST_NEED) * smallest:
+                weights, smallest = needed, with_it
+    return weights
 
 
 def error_of_neighbours(features: th.Tensor, actions: th.Tensor, episodes: np.ndarray) -> float:
@@ -40,7 +54,7 @@ def error_of_neighbours(features: th.Tensor, actions: th.Tensor, episodes: np.nd
     :param actions: (N, A)
     :param episodes: (N,) numbers of their episodes, two at least
     """
-    asked, answering = (np.arange(0, len(features), -(-len(features) // most)) for most in (MOST_ASKED, MOST_ANSWERING))
+    asked, answering = (evenly(len(features), most) for most in (MOST_ASKED, MOST_ANSWERING))
     nearest = nearest_steps(features[asked], episodes[asked], features[answering], episodes[answering], N_NEIGHBOURS)
     known = th.as_tensor(nearest >= 0, device=actions.device)[:, :, None]
     told = (actions[answering][nearest] * known).sum(1) / known.sum(1).clamp_min(1)

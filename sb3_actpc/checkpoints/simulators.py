@@ -9,6 +9,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper
 
 from sb3_actpc.checkpoints.encoding import Decoder, Encoder, LostValue, OpaqueValue
+from sb3_actpc.utils.tasks import task_id
 
 # what the constructors make anew, and the time of the clock
 _SKIPPED = {"venv", "env", "class_attributes", "results_writer", "obs_spaces", "metadata", "_metadata", "spec", "_cached_spec"}
@@ -53,9 +54,8 @@ def _named_layers(env: gym.Env[Any, Any]) -> list[tuple[str, gym.Env[Any, Any]]]
 
 def env_name(env: VecEnv) -> str:
     """The Gymnasium id of the task, or the class of an environment that has none; never an empty text."""
-    spec = env.get_attr("spec", indices=0)[0] if env.has_attr("spec") else None
-    if spec is not None:
-        return str(spec.id)
+    if (env_id := task_id(env)) is not None:
+        return env_id
     innermost = vec_env_layers(env)[-1]
     return type(innermost.envs[0].unwrapped if isinstance(innermost, DummyVecEnv) else innermost).__qualname__
 

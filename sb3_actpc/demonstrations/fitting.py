@@ -62,8 +62,9 @@ def fit_demonstrations(
         raise ValueError(f"n_demonstrations={n_episodes}, n_demonstration_transitions={n_transitions}: {error}") from error
     env_id = None
     if env is not None:
-        spec = env.get_attr("spec", indices=0)[0] if env.has_attr("spec") else None
-        env_id = None if spec is None else spec.id
+        from sb3_actpc.utils.tasks import task_id  # heavy: demonstrations do without
+
+        env_id = task_id(env)
         paid_id = "" if env_id is None else sparse_env_id(env_id)
         if paid_id in SPARSE_MUJOCO_IDS and base_name(dense_env_id(paid_id)) == base_name(demonstrations.env_id):
             sparse_id = f"Sparse{demonstrations.env_id.rpartition(':')[2]}"  # which then pays them anew
@@ -73,7 +74,10 @@ def fit_demonstrations(
     try:
         demonstrations.check(observation_space, action_space, env_id)
     except ValueError as error:
-        raise ValueError(f"{error}: record them in this environment, wrapped as it is here (Demonstrations.record)") from None
+        fix = "record them in this environment, wrapped as it is here (Demonstrations.record)"
+        if env_id is not None and base_name(env_id) != base_name(demonstrations.env_id):
+            fix += f", or say that it is this one: dataclasses.replace(demonstrations, env_id={env_id!r})"
+        raise ValueError(f"{error}: {fix}") from None
     if env is None:
         return demonstrations
     from stable_baselines3.common.vec_env import VecTransposeImage, unwrap_vec_wrapper  # heavy: demonstrations do without

@@ -1,6 +1,7 @@
 """Playing a task with whoever can do it: trained agents, scripted demonstrators, plain functions."""
 
 import sys
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
@@ -14,6 +15,7 @@ from sb3_actpc.utils.extras import installed_version
 
 Columns = dict[str, np.ndarray]
 Report = Callable[[str], None]
+ENDLESS = 5000  # steps of an episode, after which the user is warned
 
 
 def silent(_: str) -> None:
@@ -151,6 +153,12 @@ def _play(act: Callable[[Any, bool], np.ndarray], env: gym.Env[Any, Any], seed: 
         next_row = flat(observation)
         rows.append((row, next_row, shown, reward, terminated, info.get("dense_reward", reward)))
         row, done = next_row, terminated or truncated
+        if len(rows) == ENDLESS:
+            warnings.warn(
+                f"an episode of {env_name(env)} has gone on for {ENDLESS} steps and is recorded to its end: where it has "
+                "none, give it one with gymnasium.wrappers.TimeLimit",
+                stacklevel=2,
+            )
     names = ("observations", "next_observations", "actions", "rewards", "terminations", "dense_rewards")
     columns = {name: np.asarray(values, dtype=np.float32) for name, values in zip(names, zip(*rows, strict=True), strict=True)}
     return {**columns, "terminations": columns["terminations"].astype(bool)}, info

@@ -172,6 +172,9 @@ class NGCCircuit(nn.Module):
         )
         for parameter in self.parameters():
             parameter.requires_grad_(False)
+        self._list_synapses()
+
+    def _list_synapses(self) -> None:
         # the same parameters as plain lists: indexing a ParameterList costs more than a small product
         self.synapses = Synapses(*map(list, (self.weights, self.biases, self.memory_weights, self.feedback_weights)))
 
@@ -234,8 +237,9 @@ class NGCCircuit(nn.Module):
         :param x: (B, n_inputs)
         :param memory: m_t, (B, n_memory), for a circuit with a working memory
         :return: (B, n_outputs)
-        :raises ValueError: when the memory is missing, not wanted or of the wrong size
+        :raises ValueError: for an input that is no such tensor, for a memory that is missing, not wanted or of the wrong size
         """
+        self._check_inputs(x)
         biases = self.synapses.layer_biases(memory, self.memory_weight)
         for weights, bias in zip(self.synapses.weights[:-1], biases[:-1], strict=True):
             latents = predict(x, weights, bias, self.in_bfloat16)
@@ -282,6 +286,7 @@ class NGCCircuit(nn.Module):
 
     def chain(self, x: th.Tensor, memory: th.Tensor | None = None) -> SettlingChain:
         """The projected chain of this circuit's layers, to be clamped and settled; see :meth:`settle` for the shapes."""
+        self._check_inputs(x)
         settings = ChainSettings(
             self.activation,
             self.output_activation,
@@ -293,6 +298,12 @@ class NGCCircuit(nn.Module):
             self.in_bfloat16,
         )
         return SettlingChain(self.synapses, settings, x, memory)
+
+    def _check_inputs(self, x: th.Tensor) -> None:
+        n, dtype = self.sizes[0], self.synapses.weights[0].dtype
+        if not isinstance(x, th.Tensor) or x.dim() != 2 or x.shape[1] != n or x.dtype != dtype:
+            found = f"a {x.dtype} tensor {tuple(x.shape)}" if isinstance(x, th.Tensor) else f"a {type(x).__name__}"
+            raise ValueError(f"this circuit takes inputs of shape (B, {n}), a {dtype} tensor, but was given {found}")
 
     def residual(self, state: SettledState) -> th.Tensor:
         """
@@ -412,6 +423,7 @@ class NGCCircuit(nn.Module):
 
 
 def _follow_loaded(circuit: NGCCircuit, _: Any) -> None:
+    circuit._list_synapses()  # ``assign=True`` puts others in their place
     if circuit._follows_loaded:
         circuit.update_settling_rates(n_iterations=30)
 

@@ -30,8 +30,9 @@ class Synapses(NamedTuple):
         :raises ValueError: when a memory is missing, not wanted or of the wrong size
         """
         n_memory = self.memory[0].shape[1] if self.memory else 0
-        if (memory is not None) != bool(n_memory) or (memory is not None and memory.shape[1] != n_memory):
-            found = "no memory" if memory is None else f"a memory of size {memory.shape[1]}"
+        fits = not n_memory if memory is None else bool(n_memory) and memory.dim() == 2 and memory.shape[1] == n_memory
+        if not fits:
+            found = "no memory" if memory is None else f"a memory of shape {tuple(memory.shape)}"
             raise ValueError(f"this circuit has n_memory={n_memory} but was given {found}")
         if memory is None or not memory_weight:
             return self.biases

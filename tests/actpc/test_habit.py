@@ -648,7 +648,7 @@ class Unpaid(CountingEnv):
 
 
 def actions_of(model, circuit):
-    scaled = circuit.project(model.policy.features(th.as_tensor(OBSERVATIONS))).numpy()
+    scaled = circuit.project(model.actor.features(th.as_tensor(OBSERVATIONS))).numpy()
     return model.policy.unscale_action(scaled)
 
 

@@ -9,7 +9,7 @@ import torch as th
 from sb3_actpc.actpc import room as room_module
 from sb3_actpc.actpc.actpc import ROOM_DECAY
 from sb3_actpc.actpc.cloning import Cloning
-from sb3_actpc.actpc.room import Room, nearest_steps
+from sb3_actpc.actpc.room import Room, evenly, nearest_steps
 from sb3_actpc.actpc.self_imitation import Episodes
 from sb3_actpc.actpc.trust_region import SMALLEST_UNIT
 from tests.actpc.agents import imitating, make
@@ -160,8 +160,16 @@ def test_neighbours_in_long_sets_are_some_of_their_steps(monkeypatch):
     assert room.shown.neighbours[:, 0].tolist() == [2, 0, 0, 2, 2]
 
 
-@pytest.mark.parametrize(("most", "expected"), [(5, [1, 2, 1, 2, 3]), (3, [1, 1, 1, 1, 3])])
-def test_of_very_long_sets_some_steps_are_measured_and_the_next_ones_take_their_neighbours(most, expected, monkeypatch):
+def test_of_long_sets_of_equal_episodes_every_step_has_its_turn():
+    """1,000 episodes of 50 steps, of which 1,000 are asked: every fiftieth would be the same step of each."""
+    rows = evenly(50_000, 1000)
+    assert len(np.unique(rows)) == 1000 and (rows[0], rows[-1]) == (0, 49_999)
+    assert len(np.unique(rows % 50)) == 50
+    assert evenly(7, 1000).tolist() == list(range(7))
+
+
+@pytest.mark.parametrize(("most", "expected"), [(5, [1, 2, 1, 2, 3]), (3, [1, 2, 1, 1, 3])])
+def test_of_very_long_sets_some_steps_are_measured_and_the_next_ones_take_theirs_but_their_own(most, expected, monkeypatch):
     monkeypatch.setattr(room_module, "MOST_SEARCHES", most)
     room = room_of([[0.0], [3.0], [4.0], [10.0], [30.0]], np.arange(5))
     room.measure(room.shown)

@@ -62,6 +62,33 @@ def test_a_goal_beside_a_name():
     assert feature_weights(th.stack([position, goal, name], dim=1), actions, EPISODES).tolist() == [1.0] * 3
 
 
+def sorting(seed):
+    """To the middle, and then to the left or right as a lamp says: features are (position, time, lamp, four names)."""
+    generator, rows = np.random.default_rng(seed), []
+    for episode in range(N_EPISODES):
+        position, lamp, names = generator.normal(size=3) * 0.3, [-1.0, 1.0][episode % 2], generator.normal(size=4)
+        for step in range(LENGTH):
+            goal = np.array([lamp if step >= 0.6 * LENGTH else 0.0, 0.0, 0.0])
+            action = np.clip(3.0 * (goal - position), -1.0, 1.0)
+            rows.append(np.concatenate([position, [step], [lamp], names, action]))
+            position = position + 0.1 * action
+    data = np.array(rows)
+    features = (data[:, :9] - data[:, :9].mean(0)) / data[:, :9].std(0)
+    return th.as_tensor(features, dtype=th.float32), th.as_tensor(data[:, 9:], dtype=th.float32)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_cue_among_names_keeps_its_size(seed):
+    """Lamp and names stay the same within an episode, and without all five of them the others tell better what is done."""
+    features, actions = sorting(seed)
+    share = share_within(features, EPISODES)
+    errors = [error_of_neighbours(features * weights, actions, EPISODES) for weights in (th.ones_like(share), share)]
+    assert share[4:].max() < 1e-3 and errors[1] < 0.9 * errors[0]
+    weights, others = feature_weights(features, actions, EPISODES), [0, 1, 2, 3, 5, 6, 7, 8]
+    assert weights[4] == 1.0
+    assert weights[others].tolist() == share[others].tolist()
+
+
 def test_a_small_gain_changes_nothing(monkeypatch):
     """So it is with gaits, which are the same in every episode: what was measured of them stays as it was."""
     position, own = steps()
@@ -102,7 +129,7 @@ def test_of_many_steps_some_are_asked(monkeypatch):
     monkeypatch.setattr(within_episodes, "MOST_ANSWERING", 150)
     position, own = steps()
     weights = feature_weights(th.stack([position, own], dim=1), (2.0 * position).tanh()[:, None], EPISODES)
-    assert asked == [(29, 134)] * 2 and weights[1] < 0.05  # every 14th of 400, and every third
+    assert asked == [(30, 150)] * 3 and weights[1] < 0.05  # as they are, all by their share, and the name at its size
 
 
 def named(n_episodes=6, length=30):

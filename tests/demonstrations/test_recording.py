@@ -1,5 +1,6 @@
 """Recording: whoever acts, wherever, an episode's rows are what the environment showed, and only what is asked for is kept."""
 
+import warnings
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,7 +11,7 @@ from gymnasium import spaces
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from sb3_actpc.demonstrations import Demonstrations, fit_demonstrations
+from sb3_actpc.demonstrations import Demonstrations, fit_demonstrations, recording
 from tests.recordings import record
 
 
@@ -165,6 +166,15 @@ def test_a_model_sees_observations_as_its_vec_normalize_shows_them() -> None:
     expected = model.predict(env.normalize_obs(shown.observations), deterministic=True)[0]
     np.testing.assert_allclose(shown.actions, expected, atol=1e-6)
     assert not np.allclose(shown.actions, model.predict(shown.observations, deterministic=True)[0])
+
+
+def test_an_episode_that_goes_on_and_on_is_said_to(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(recording, "ENDLESS", 4)
+    with pytest.warns(UserWarning, match="gone on for 4 steps.*TimeLimit"):
+        Demonstrations.record(lambda _: np.zeros(1), Corridor(length=5), 1)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        Demonstrations.record(lambda _: np.zeros(1), Corridor(length=3), 1)
 
 
 def test_sampled_actions_differ_and_deterministic_ones_do_not() -> None:

@@ -15,9 +15,9 @@ def test_memory_is_the_concatenation_of_projected_observations():
 
 
 def test_the_projection_is_fixed_and_gaussian():
-    memory = WorkingMemory(100, std=0.5)
+    memory = WorkingMemory(100)
     assert not memory.projection.requires_grad
-    assert float(memory.projection.std()) == pytest.approx(0.5, rel=0.05)
+    assert float(memory.projection.std()) == pytest.approx(0.1, rel=0.05)
 
 
 def test_bad_sizes_are_named():

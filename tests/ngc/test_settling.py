@@ -1,5 +1,6 @@
 """Settling: what moves, where it comes to rest, and what stays put. Expectations from the energy, by autograd or algebra."""
 
+import numpy as np
 import pytest
 import torch as th
 
@@ -216,8 +217,39 @@ def test_a_missing_or_unwanted_memory_is_named():
     circuit, x, target = make(n_memory=4)
     with pytest.raises(ValueError, match="n_memory=4 but was given no memory"):
         circuit.settle(x, target)
-    with pytest.raises(ValueError, match="n_memory=0 but was given a memory of size 4"):
+    with pytest.raises(ValueError, match=r"n_memory=0 but was given a memory of shape \(7, 4\)"):
         make()[0].settle(x, target, th.zeros(7, 4, dtype=x.dtype))
+
+
+def test_a_memory_without_a_batch_is_named():
+    circuit, x, target = make(n_memory=4)
+    with pytest.raises(ValueError, match=r"n_memory=4 but was given a memory of shape \(4,\)"):
+        circuit.settle(x, target, th.zeros(4, dtype=x.dtype))
+
+
+@pytest.mark.parametrize(
+    ("wrong", "found"),
+    [
+        (th.zeros(7, 6, dtype=th.float64), r"torch.float64 tensor \(7, 6\)"),
+        (th.zeros(5, dtype=th.float64), r"torch.float64 tensor \(5,\)"),
+        (th.zeros(7, 5), "a torch.float32 tensor"),
+        (np.zeros((7, 5)), "a ndarray"),
+    ],
+)
+def test_inputs_that_are_none_are_named(wrong, found):
+    circuit, _, target = make()
+    for use in (circuit.project, lambda x: circuit.settle(x, target)):
+        with pytest.raises(ValueError, match=rf"takes inputs of shape \(B, 5\), a torch.float64 tensor, .*{found}"):
+            use(wrong)
+
+
+@pytest.mark.parametrize("assign", [False, True])
+def test_loaded_synapses_are_those_that_are_used(assign):
+    circuit, x, _ = make()
+    other = make()[0]
+    assert not th.equal(circuit.project(x), other.project(x))
+    circuit.load_state_dict(other.state_dict(), assign=assign)
+    assert th.equal(circuit.project(x), other.project(x))
 
 
 @pytest.mark.parametrize("settling", ["scheduled", "iterative"])
