@@ -60,6 +60,7 @@ CLONING, CLONES = "actpc/cloning.py", "tests/actpc/test_cloning.py"
 ROOM, ROOMS = "actpc/room.py", "tests/actpc/test_room.py"
 WITHIN, WITHINS = "actpc/within_episodes.py", "tests/actpc/test_within_episodes.py"
 STRANGERS = "tests/actpc/test_strangers.py"
+HELD_OUT, HELD_OUTS = "actpc/held_out.py", "tests/actpc/test_held_out.py"
 LEARNS, STORES = "tests/actpc/test_agent.py", "tests/actpc/test_buffers.py"
 COUPLED, SPARSE = "ngc/coupled.py", "envs/sparse_mujoco.py"
 STATISTICS, R_STABILITY = "experiments/report/statistics.py", "experiments/report/r_stability.py"
@@ -717,7 +718,7 @@ MUTANTS = [
     Mutant("a given noise is ignored", AGENT, "return self.refresh.noise if", "return 1.0 if", f"{ROOMS} -k without_a_word"),
     Mutant("clones imitate without noise", AGENT, "_imitated(n, self.clone_noise)", "_imitated(n)", f"{HABIT} -k noise"),
     Mutant(
-        "the learning actor is blurred", AGENT, "n: int, noise: float = 0.0) -> I", "n: int, noise: float = 0.5) -> I", HABIT
+        "the learning actor is blurred", AGENT, "n: int, noise: float = 0.0, parts", "n: int, noise: float = 0.5, parts", HABIT
     ),
     Mutant(
         "one teacher for all", CLONING, "self.teachers.append(self.make_circuit())", "self.teachers.append(self.clone)", CLONES
@@ -844,6 +845,26 @@ MUTANTS = [
         "        return as_it_is\n    for",
         "        pass\n    for",
         WITHINS,
+    ),
+    Mutant("noise whatever is held out", AGENT, "between <= MOST_BLUR * without", "True", HELD_OUTS),
+    Mutant("no noise where it costs anything", AGENT, "between <= MOST_BLUR * without", "between <= without", HELD_OUTS),
+    Mutant("asked at every step", AGENT, "if expert.noise_helps is None:", "if True:", f"{HELD_OUTS} -k imitate_between"),
+    Mutant("held out and shown too", HELD_OUT, "shown.select(~is_held)", "shown", HELD_OUTS),
+    Mutant("the mean error", HELD_OUT, ".mean(1).median()", ".mean(1).mean()", f"{HELD_OUTS} -k typical"),
+    Mutant(
+        "numbers are drawn from everybody's",
+        HELD_OUT,
+        "            np.random.set_state(before)",
+        "            pass",
+        HELD_OUTS,
+    ),
+    Mutant("asked with the decay of none", AGENT, "if noise and self.refresh.weight_decay is None", "if False", HELD_OUTS),
+    Mutant(
+        "episodes begin where they began",
+        IMITATION,
+        "np.searchsorted(rows, self.starts[rows])",
+        "self.starts[rows]",
+        HELD_OUTS,
     ),
     Mutant("no feature is asked for on its own", WITHIN, "< SMALL_SHARE", "< 0.0", f"{WITHINS} -k cue"),
     Mutant("any need will do", WITHIN, "(1.0 - SMALLEST_NEED) * ", "2.0 * ", f"{WITHINS} -k cue"),

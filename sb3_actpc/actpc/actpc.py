@@ -51,6 +51,7 @@ from sb3_actpc.actpc.demonstration_replay import DemonstrationReplay
 from sb3_actpc.actpc.diagnostics import Diagnostics
 from sb3_actpc.actpc.features import Batch, CircuitInputs
 from sb3_actpc.actpc.habit import Trials
+from sb3_actpc.actpc.held_out import N_ASKED, N_UPDATES, random_numbers_of_its_own, split, typical_error
 from sb3_actpc.actpc.policies import POLICIES, ActPCActor, ActPCPolicy, Critics, check_policy, check_policy_kwargs
 from sb3_actpc.actpc.reward_signals import InternalSignals, summed_squared_errors
 from sb3_actpc.actpc.room import Room
@@ -84,6 +85,7 @@ NEED_DEMONSTRATIONS = ("demonstration_fraction", "actor_warm_start", "n_demonstr
 EXPERT_SIGNALS_INTERVAL = 1000  # updates between two evaluations of the demonstrations' signals
 PRETRAINING_INTERVAL = 1000  # updates between two lines about pre-training
 ROOM_DECAY = 1.0  # of clones' synapses where they imitate steps between demonstrations
+MOST_BLUR = 1.5  # of their error on episodes that are held out, over that of clones that imitate what is shown alone
 TARGET_NOISE_CLIP = 2.5  # standard deviations, as TD3's 0.5 for 0.2
 AVERAGING_RATE = 0.001  # per update, of the average of the actor that becomes the habit
 LARGEST_BOUND = 1e6  # of an observation; larger ones stand for none
@@ -605,7 +607,7 @@ class ActPC(OffPolicyAlgorithm):
             warnings.warn(
                 f"{self._total_timesteps} steps of n_envs={self.n_envs} with gradient_steps={self.gradient_steps} and "
                 f"train_freq={every} make {n_updates} updates in all, and nothing but clones can become the habit before "
-                f"{needed}: gradient_steps=-1 makes as many updates as there are steps",
+                f"update {needed}: gradient_steps=-1 makes as many updates as there are steps",
                 stacklevel=5,
             )
 
@@ -1086,10 +1088,13 @@ class ActPC(OffPolicyAlgorithm):
         self.diagnostics.settled("actor", state)
         return self.actor.circuit.hebbian_update(state)
 
-    def _sample_imitated(self, n: int, noise: float = 0.0) -> Imitated:
-        """Features, actions and working memory of ``n`` imitated steps; with noise, of steps between the demonstrations."""
-        inputs, parts = self.inputs, self._imitated()
-        room = self.room if noise else None
+    def _sample_imitated(
+        self, n: int, noise: float = 0.0, parts: list[Episodes] | None = None, room: Room | None = None
+    ) -> Imitated:
+        """Features, actions and working memory of ``n`` imitated steps, or of steps of ``parts``; with noise, of steps between
+        the demonstrations, or those of ``room``."""
+        inputs, parts = self.inputs, parts or self._imitated()
+        room = (room or self.room) if noise else None
         if room is not None:
             for part in parts:
                 room.measure(part)
@@ -1114,11 +1119,38 @@ class ActPC(OffPolicyAlgorithm):
 
     @property
     def clone_noise(self) -> float:
-        """Noise on what clones imitate: as asked for, or by default 1 where the demonstrations leave room and 0 where not; 0
-        with a single demonstration, which has no neighbours."""
+        """Noise on what clones imitate: as asked for, or by default 1 where the demonstrations leave room, unless clones of
+        some of them tell worse then what is done in the others, and 0 where not; 0 with a single demonstration, which has no
+        neighbours."""
         if self.expert is not None and self.refresh.noise is not None:
             return self.refresh.noise if self.expert.demonstrations.n_episodes > 1 else 0.0
-        return float(self.clones_guess)
+        return float(self.clones_guess and self._noise_helps())
+
+    def _noise_helps(self) -> bool:
+        """Whether a clone that imitates between demonstrations is about as precise where none was shown as one that does not,
+        or more. Asked once; what is drawn for it is drawn by nobody else."""
+        expert = self.expert
+        assert expert is not None
+        if expert.noise_helps is None:
+            parts = split(expert.episodes)
+            expert.noise_helps = True
+            if parts is not None and self.actor_warm_start:
+                with random_numbers_of_its_own(self.device):
+                    without, between = (self._error_when_held_out(noise, *parts) for noise in (0.0, 1.0))
+                expert.noise_helps = between <= MOST_BLUR * without
+        return expert.noise_helps
+
+    def _error_when_held_out(self, noise: float, shown: Episodes, held_out: Episodes) -> float:
+        room = Room(shown, self._features_of, is_by_return([shown], self.refresh.weighting)) if noise else None
+        decay = ROOM_DECAY if noise and self.refresh.weight_decay is None else self.refresh.weight_decay
+        cloning = Cloning(
+            self.policy.make_actor(),
+            self.policy.make_actor,
+            lambda n: self._sample_imitated(n, noise, [shown], room),
+            min(N_UPDATES, self.actor_warm_start),
+            weight_decay=decay,
+        )
+        return typical_error(cloning, self._sample_imitated(N_ASKED, parts=[held_out]))
 
     @property
     def clone_decay(self) -> float | None:

@@ -47,6 +47,7 @@ class DemonstrationReplay:
         self.epistemic, self.instrumental = np.zeros((2, len(demonstrations)), dtype=np.float32)
         self.has_signals = self.has_scale = False
         self.room: Room | None = None  # what lies between the episodes; None before that is asked
+        self.noise_helps: bool | None = None  # clones that imitate between them; None before that is asked
 
     def __len__(self) -> int:
         return len(self.demonstrations)

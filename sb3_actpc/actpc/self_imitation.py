@@ -34,7 +34,8 @@ class Refresh:
         (:mod:`sb3_actpc.actpc.room`); not on the working memory's, nor on what the learning actor is refreshed with, which
         has to become precise. 0 for neither (the paper; so it is with a single demonstration); None for 1 where the
         demonstrations leave room (the nearest step of another one is farther than a step leads, by the medians: arms and
-        goals, 2 to 8 times; gaits, 0.03 to 0.7, where this only blurs what to do), else 0
+        goals, 2 to 8 times; gaits, 0.03 to 0.7, where this only blurs what to do) and clones of some of them are then about
+        as precise on the others (:mod:`sb3_actpc.actpc.held_out`), else 0
     :param own_episodes: which of them are imitated too: "paid" (every one, as often as its return says; "best" where steps are
         not drawn by returns, or nothing is demonstrated) or "best" (those that are paid at least what the best one was: the
         paper)
@@ -135,6 +136,13 @@ class Episodes:
             starts=np.repeat(bounds[:, 0], lengths),
             returns=np.repeat(demonstrations.episode_returns, lengths),
         )
+
+    def select(self, is_kept: np.ndarray) -> "Episodes":
+        """:param is_kept: (N,), the same for all rows of an episode
+        :return: those episodes, whose neighbours are not known"""
+        rows = np.flatnonzero(is_kept)
+        observations = map_observations(lambda array: array[rows], self.observations)
+        return Episodes(observations, self.actions[rows], np.searchsorted(rows, self.starts[rows]), self.returns[rows])
 
     def take(self, indices: np.ndarray, history: int = 0) -> ImitationSamples:
         """(B,) rows, each with ``history`` preceding observations of the same episode."""

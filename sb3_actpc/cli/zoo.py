@@ -225,17 +225,19 @@ def _training_arguments(arguments: Sequence[str], folder: Path, optimize: bool) 
 
 def _playing_arguments(arguments: Sequence[str]) -> list[str]:
     """rl_zoo3 looks for runs in a folder of its own, and downloads what is not there; ours are in ``logs``."""
-    from sb3_actpc.experiments.runs.environments import register_tasks
+    from sb3_actpc.experiments.runs.environments import check_env_id
 
     parser = _parser()
     parser.add_argument("-f", "--folder", default=LOG_FOLDER)
+    parser.add_argument("--gym-packages", nargs="+", default=[])
     ours, rest = parser.parse_known_args(list(arguments))
     if ours.env is None:
         raise ValueError("--env is missing: give the Gymnasium id of the trained agent's task")
-    register_tasks(ours.env)
+    check_env_id(ours.env, ours.gym_packages)
     if not Path(ours.folder, ours.algo).is_dir():
         raise FileNotFoundError(f"no runs of {ours.algo} in {ours.folder}: sb3-actpc zoo train makes one; or give --folder")
-    return ["--algo", ours.algo, "--env", ours.env, "--folder", ours.folder, *rest]
+    packages = ["--gym-packages", *ours.gym_packages] if ours.gym_packages else []
+    return [*packages, "--algo", ours.algo, "--env", ours.env, "--folder", ours.folder, *rest]
 
 
 def _parser() -> argparse.ArgumentParser:

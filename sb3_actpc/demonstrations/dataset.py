@@ -19,7 +19,7 @@ from gymnasium import spaces
 from sb3_actpc.demonstrations.minari import read_minari, write_minari
 from sb3_actpc.demonstrations.npz import read_npz, write_npz
 from sb3_actpc.demonstrations.recording import env_name, record_episodes, time_limit, trajectory_columns
-from sb3_actpc.demonstrations.rows import field_error, flat_size, outside_bounds, unchained_indices
+from sb3_actpc.demonstrations.rows import field_error, flat_size, outside_bounds, unchained_indices, whole_columns
 from sb3_actpc.envs import SPARSE_IDS
 
 if TYPE_CHECKING:
@@ -125,11 +125,13 @@ class Demonstrations:
         metadata: Mapping[str, Any] | None = None,
         source: str = "",
     ) -> Demonstrations:
-        """The episodes end to end, from the columns of each, by the names of ``COLUMNS`` (dense rewards count where all have
-        them), recorded in the environment ``env_id``; ``metadata`` are JSON values, ``source`` is for error messages.
-        ValueError when there are none, or they do not fit together."""
+        """The episodes end to end, from the columns of each, by the names of ``COLUMNS``, recorded in the environment
+        ``env_id``; ``metadata`` are JSON values, ``source`` is for error messages. An episode of n actions may have n + 1
+        observations in the place of ``next_observations``; without ``terminations`` none has ended by itself; dense rewards
+        count where all have them. ValueError when there are none, or they do not fit together."""
         if not episodes:
             raise field_error(source, "observations", "at least one episode", "none")
+        episodes = [whole_columns(episode, source) for episode in episodes]
         columns = {}
         for name in COLUMNS:
             if name == "dense_rewards" and not all(episode.get(name) is not None for episode in episodes):

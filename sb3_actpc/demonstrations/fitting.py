@@ -34,7 +34,10 @@ def resolve(
         path, parts = Path(source), PureWindowsPath(source).parts  # which knows both kinds of slash
         is_shipped = not path.exists() and parts[-3:-1] == DATA_FOLDER.parts[-2:]  # where the agent was trained, elsewhere
         return Demonstrations.load(DATA_FOLDER / parts[-1] if is_shipped else path)
-    raise ValueError(f"demonstrations must be a file path, a Minari id or a Demonstrations object, found {source!r}")
+    raise ValueError(
+        f"demonstrations must be a file path, a Minari id or a Demonstrations object, found a {type(source).__name__}: of "
+        "arrays of your own make one with Demonstrations.from_episodes"
+    )
 
 
 def is_minari_id(source: Any) -> bool:

@@ -68,9 +68,15 @@ def _read_entries(content: bytes, source: str) -> dict[str, np.ndarray]:
     except Exception as error:  # whatever the reader raises on bytes that are not its own
         found = f"{len(content)} bytes ({error})"
         if content.startswith(HDF5_SIGNATURE):
-            found = "HDF5: convert it with `sb3-actpc demos convert`"
+            found = (
+                "HDF5: convert it with `sb3-actpc demos convert` if it is of robosuite's Lift or PickPlaceCan; of another "
+                "task read it with h5py, and make Demonstrations.from_episodes of it"
+            )
         raise ValueError(f"{source}: expected a demonstrations .npz file, found {found}") from None
     with archive:
+        if "format_version.npy" not in archive.namelist():
+            expected = "an entry, as Demonstrations.save writes it (for arrays: Demonstrations.from_episodes)"
+            raise field_error(source, "format_version", expected, f"only {', '.join(archive.namelist()) or 'none'}")
         version = _read_array(archive, "format_version", source)
         if version.shape != () or version.dtype.kind not in "iu" or version < 1:
             found = f"type {version.dtype}, shape {version.shape}" if version.shape else repr(version.item())

@@ -67,7 +67,8 @@ def record_episodes(
     if len(episodes) < n_episodes:
         raise ValueError(
             f"only {len(episodes)} of {n_tries} episodes succeeded in {env_name(env)}, {n_episodes} are needed: take a better "
-            "demonstrator (train it longer: --steps), allow more tries (--max-tries), or ask for fewer episodes (--episodes)"
+            "demonstrator (train it longer: --steps), allow more tries (--max-tries, max_tries=), ask for fewer episodes "
+            "(--episodes, n_episodes=), or keep those that fail too (only_successes=False)"
         )
     made_by: dict[str, Any] = {"seed": seed, "n_tries": n_tries, "deterministic": deterministic}
     simulators = [name for name in ("gymnasium", "mujoco", "robosuite") if name in sys.modules]
@@ -142,6 +143,10 @@ def _play(act: Callable[[Any, bool], np.ndarray], env: gym.Env[Any, Any], seed: 
     done = False
     while not done:
         action = act(observation, not rows)
+        if isinstance(action, tuple):
+            raise ValueError(
+                "the demonstrator gives a tuple: return the action alone, or give the agent itself, not its predict"
+            )
         if np.shape(action) != env.action_space.shape:
             wanted = f"{env_name(env)} takes {env.action_space.shape}: return an array of that shape"
             raise ValueError(f"the demonstrator gives an action of shape {np.shape(action)}, {wanted}")

@@ -1,5 +1,6 @@
 """Between the observations of an environment and rows of numbers; how a wrong field of demonstrations is named."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -73,6 +74,19 @@ def transition_columns(rows: np.ndarray, actions: Any, where: str) -> dict[str, 
     if len(rows) != n + 1:
         raise ValueError(f"{where} of {n} actions must have {n + 1} observations, found {len(rows)}")
     return {"observations": rows[:-1], "actions": np.asarray(actions).reshape(n, -1), "next_observations": rows[1:]}
+
+
+def whole_columns(episode: Mapping[str, Any], source: str) -> dict[str, Any]:
+    """An episode's columns, with those that may be left out (see ``Demonstrations.from_episodes``); ValueError when another
+    one is missing."""
+    columns = {name: column for name, column in episode.items() if column is not None}
+    for name in ("observations", "actions", "rewards"):
+        if name not in columns:
+            raise field_error(source, name, "a column of every episode", f"only {', '.join(sorted(columns)) or 'none'}")
+    if "next_observations" not in columns:
+        seen, where = np.asarray(columns["observations"]), "an episode without next_observations,"
+        columns |= transition_columns(seen, columns["actions"], where)
+    return {"terminations": np.zeros(len(columns["rewards"]), dtype=bool), **columns}
 
 
 def unchained_indices(observations: np.ndarray, next_observations: np.ndarray, episode_starts: np.ndarray) -> np.ndarray:

@@ -13,7 +13,7 @@ import pytest
 import yaml
 
 from sb3_actpc.cli import main as command_line
-from sb3_actpc.cli.zoo import NET_ARCHS, convert_actpc_params
+from sb3_actpc.cli.zoo import NET_ARCHS, _playing_arguments, convert_actpc_params
 from sb3_actpc.experiments.runs import Run, resolve
 from tests.recordings import record
 
@@ -188,6 +188,7 @@ def test_sampled_parameters_become_keywords() -> None:
         (["train", "--algo", "actpc"], "--env is missing"),
         (["optimize", "--algo", "bc", "--env", "SparseReacher-v5"], "zoo optimize does not know what to vary for 'bc'"),
         (["enjoy", "--env", "SparseReacher-v5", "--folder", "nowhere"], "no runs of actpc in nowhere"),
+        (["enjoy", "--env", "Mine-v0"], "name that: MODULE:Mine-v0, or --gym-packages MODULE"),
         (["train", "--env", "SparseReacher-v5", "--demonstrations", "no.npz"], "no demonstrations file at no.npz"),
         (["train", "--env", "SparseReacher-v5", "-conf", "c.yml", "--demonstrations", "none"], "--demonstrations none is for"),
         (["optimize", "--env", "SparseReacher-v5", "-conf", "c.yml", "--preset", "td3"], "--preset td3 is for presets, and"),
@@ -199,6 +200,16 @@ def test_mistakes_give_one_line_and_exit_code_2(
     monkeypatch.setattr("sb3_actpc.cli.zoo.register_algorithms", lambda: None)  # leaves rl-zoo3 alone
     assert command_line(["zoo", *arguments]) == 2
     assert message in capsys.readouterr().err
+
+
+def test_modules_of_ones_own_are_found_in_the_working_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "my_tasks_of_zoo.py").write_text("import gymnasium\ngymnasium.register('MineOfZoo-v0', 'nowhere:Env')\n")
+    (tmp_path / "logs" / "actpc").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.path", [*sys.path])
+    arguments = ["--env", "MineOfZoo-v0", "--gym-packages", "my_tasks_of_zoo", "--no-render"]
+    passed = _playing_arguments(arguments)
+    assert passed[:2] == ["--gym-packages", "my_tasks_of_zoo"] and passed[-1] == "--no-render"
 
 
 def test_without_rl_zoo3_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

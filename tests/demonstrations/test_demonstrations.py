@@ -729,3 +729,40 @@ def test_metadata_is_readable_without_the_package(saved: Path) -> None:
     with np.load(saved, allow_pickle=False) as archive:
         assert json.loads(archive["metadata"].item()) == make_fields()["metadata"]
         assert json.loads(archive["env_id"].item()) == "TinyReach-v0"
+
+
+def test_an_episode_of_ones_own_arrays() -> None:
+    """n + 1 observations say what followed each step; nobody says that it ended by itself."""
+    seen = np.arange(8.0).reshape(4, 2)
+    one = {"observations": seen, "actions": np.array([0.1, 0.2, 0.3]), "rewards": np.array([0.0, 0.0, 1.0])}
+    made = Demonstrations.from_episodes([one, one], "Mine-v0")
+    assert (
+        made.observations.tolist() == [*seen[:3].tolist()] * 2 and made.next_observations.tolist() == [*seen[1:].tolist()] * 2
+    )
+    assert made.actions.shape == (6, 1) and not made.terminations.any() and made.episode_starts.tolist() == [0, 3]
+    ended = Demonstrations.from_episodes([{**one, "terminations": np.array([False, False, True])}], "Mine-v0")
+    assert ended.terminations.tolist() == [False, False, True]
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        ({"observations": np.zeros((3, 2))}, "must have 4 observations, found 3"),
+        ({"rewards": None}, "'rewards': expected a column of every episode, found only actions, observations"),
+        ({"actions": None}, "'actions': expected a column of every episode"),
+    ],
+)
+def test_columns_that_are_missing_are_named(change: dict[str, Any], named: str) -> None:
+    one = {"observations": np.zeros((4, 2)), "actions": np.zeros((3, 1)), "rewards": np.ones(3), **change}
+    with pytest.raises(ValueError, match=named):
+        Demonstrations.from_episodes([one], "Mine-v0")
+
+
+def test_what_is_no_file_is_not_printed_whole(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="found a dict: of arrays of your own make one with"):
+        resolve({"observations": np.zeros((500, 3))})  # type: ignore[arg-type]
+    np.savez(tmp_path / "mine.npz", observations=np.zeros((5, 3)))
+    with pytest.raises(
+        ValueError, match=r"an entry, as Demonstrations.save writes it .*from_episodes.*found only observations"
+    ):
+        resolve(tmp_path / "mine.npz")

@@ -168,6 +168,11 @@ def test_a_model_sees_observations_as_its_vec_normalize_shows_them() -> None:
     assert not np.allclose(shown.actions, model.predict(shown.observations, deterministic=True)[0])
 
 
+def test_a_demonstrator_that_gives_what_predict_gives_is_told_to_give_the_action() -> None:
+    with pytest.raises(ValueError, match="gives a tuple: return the action alone"):
+        Demonstrations.record(lambda _: (np.zeros(1), None), Corridor(), 1)
+
+
 def test_an_episode_that_goes_on_and_on_is_said_to(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(recording, "ENDLESS", 4)
     with pytest.warns(UserWarning, match="gone on for 4 steps.*TimeLimit"):

@@ -84,9 +84,11 @@ def check_env_id(env_id: str, gym_packages: Sequence[str] = ()) -> None:
         importlib.import_module(package)
     register_tasks(env_id)
     if ":" not in env_id:
+        own = f"; if a module of yours registers it, name that: MODULE:{env_id}, or --gym-packages MODULE"
+        hint = "" if gym_packages else own
         try:
             gym.spec(env_id)
-        except gym.error.UnregisteredEnv:  # it names others itself
-            raise
+        except gym.error.UnregisteredEnv as error:  # it names others itself
+            raise type(error)(f"{error}{hint}") from error
         except gym.error.Error as error:
-            raise gym.error.Error(f"{error}{nearest(env_id, gym.registry)}") from error
+            raise gym.error.Error(f"{error}{nearest(env_id, gym.registry)}{hint}") from error
