@@ -1135,6 +1135,8 @@ class ActPC(OffPolicyAlgorithm):
             parts = split(expert.episodes)
             expert.noise_helps = True
             if parts is not None and self.actor_warm_start:
+                if self.verbose:
+                    print("two short clones are asked whether to imitate steps between the demonstrations")
                 with random_numbers_of_its_own(self.device):
                     without, between = (self._error_when_held_out(noise, *parts) for noise in (0.0, 1.0))
                 expert.noise_helps = between <= MOST_BLUR * without
