@@ -1120,7 +1120,7 @@ class ActPC(OffPolicyAlgorithm):
     @property
     def clone_noise(self) -> float:
         """Noise on what clones imitate: as asked for, or by default 1 where the demonstrations leave room, unless clones of
-        some of them tell worse then what is done in the others, and 0 where not; 0 with a single demonstration, which has no
+        some of them then tell worse what is done in the others, and 0 where not; 0 with a single demonstration, which has no
         neighbours."""
         if self.expert is not None and self.refresh.noise is not None:
             return self.refresh.noise if self.expert.demonstrations.n_episodes > 1 else 0.0
@@ -1144,13 +1144,12 @@ class ActPC(OffPolicyAlgorithm):
 
     def _error_when_held_out(self, noise: float, shown: Episodes, held_out: Episodes) -> float:
         room = Room(shown, self._features_of, is_by_return([shown], self.refresh.weighting)) if noise else None
-        decay = ROOM_DECAY if noise and self.refresh.weight_decay is None else self.refresh.weight_decay
         cloning = Cloning(
             self.policy.make_actor(),
             self.policy.make_actor,
             lambda n: self._sample_imitated(n, noise, [shown], room),
             min(N_UPDATES, self.actor_warm_start),
-            weight_decay=decay,
+            weight_decay=self._decay_beside(noise),
         )
         return typical_error(cloning, self._sample_imitated(N_ASKED, parts=[held_out]))
 
@@ -1158,7 +1157,10 @@ class ActPC(OffPolicyAlgorithm):
     def clone_decay(self) -> float | None:
         """Decay of clones' synapses: as asked for, or by default ``ROOM_DECAY`` where they imitate steps between
         demonstrations and None, which is their circuits' own, where not."""
-        return ROOM_DECAY if self.refresh.weight_decay is None and self.clone_noise else self.refresh.weight_decay
+        return self._decay_beside(self.clone_noise)
+
+    def _decay_beside(self, noise: float) -> float | None:
+        return ROOM_DECAY if self.refresh.weight_decay is None and noise else self.refresh.weight_decay
 
     def _features_of(self, episodes: Episodes, rows: np.ndarray) -> th.Tensor:
         """(B, n_features) of (B,) rows, some at a time: there can be many images."""
