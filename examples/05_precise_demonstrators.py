@@ -144,7 +144,7 @@ for task in (TwoLinks, Cart, Fetch):
             imitates = {"ensemble_size": 1, "noise": noise}
             model = ActPC("MlpPolicy", task(), demonstrations=shown, refresh_kwargs=imitates, actor_warm_start=3000, seed=3)
             if noise is None:
-                found.append(model.clone_noise)
+                found.append(model.imitation.noise)
                 continue
             model.pretrain()
             found.append(success(model, task()))

@@ -58,6 +58,7 @@ SIMULATORS, RESUMES = "checkpoints/simulators.py", "tests/checkpoints/test_exact
 ENCODING, HELD = "checkpoints/encoding.py", "tests/checkpoints/test_environments.py"
 CLONING, CLONES = "actpc/cloning.py", "tests/actpc/test_cloning.py"
 ROOM, ROOMS = "actpc/room.py", "tests/actpc/test_room.py"
+IMITATED = "actpc/imitation.py"
 WITHIN, WITHINS = "actpc/within_episodes.py", "tests/actpc/test_within_episodes.py"
 STRANGERS = "tests/actpc/test_strangers.py"
 HELD_OUT, HELD_OUTS = "actpc/held_out.py", "tests/actpc/test_held_out.py"
@@ -321,9 +322,9 @@ MUTANTS = [
     ),
     Mutant(
         "refresh never draws the agent's own episodes",
-        AGENT,
-        "else [self.expert.episodes, *own]",
-        "else [self.expert.episodes]",
+        IMITATED,
+        "else [agent.expert.episodes, *own]",
+        "else [agent.expert.episodes]",
         f"{LEARNS} -k 'refresh or own or imitat'",
     ),
     Mutant(
@@ -675,8 +676,8 @@ MUTANTS = [
     Mutant(
         "a clone is the old actor",
         AGENT,
-        "self._clone_into(self.policy.make_actor())",
-        "self._clone_into(self.actor.circuit)",
+        "self.imitation.clone_into(self.policy.make_actor(), ",
+        "self.imitation.clone_into(self.actor.circuit, ",
         f"{HABIT} -k begins",
     ),
     Mutant(
@@ -715,16 +716,20 @@ MUTANTS = [
         f"{HABIT} -k another_habit",
     ),
     Mutant("own episodes keep old neighbours", AGENT, "memory.episodes.neighbours = None", "pass", f"{HABIT} -k anew"),
-    Mutant("a given noise is ignored", AGENT, "return self.refresh.noise if", "return 1.0 if", f"{ROOMS} -k without_a_word"),
-    Mutant("clones imitate without noise", AGENT, "_imitated(n, self.clone_noise)", "_imitated(n)", f"{HABIT} -k noise"),
+    Mutant("a given noise is ignored", IMITATED, "return float(asked_for) if", "return 1.0 if", f"{ROOMS} -k without_a_word"),
+    Mutant("clones imitate without noise", IMITATED, "self.sample(n, noise),", "self.sample(n),", f"{HABIT} -k noise"),
     Mutant(
-        "the learning actor is blurred", AGENT, "n: int, noise: float = 0.0, parts", "n: int, noise: float = 0.5, parts", HABIT
+        "the learning actor is blurred",
+        IMITATED,
+        "n: int, noise: float = 0.0, parts",
+        "n: int, noise: float = 0.5, parts",
+        HABIT,
     ),
     Mutant(
         "one teacher for all", CLONING, "self.teachers.append(self.make_circuit())", "self.teachers.append(self.clone)", CLONES
     ),
     Mutant("clones keep their circuit's decay", CLONING, "memory)), self.weight_decay)", "memory)))", f"{CLONES} -k decay"),
-    Mutant("clones decay everywhere", AGENT, "is None and noise else", "is None else", f"{ROOMS} -k smaller_synapses"),
+    Mutant("clones decay everywhere", IMITATED, "is None and noise else", "is None else", f"{ROOMS} -k smaller_synapses"),
     Mutant(
         "the decay of this once is ignored", CIRCUIT, " if weight_decay is None else weight_decay)", ")", f"{LEARNING} -k once"
     ),
@@ -844,9 +849,21 @@ MUTANTS = [
         "        pass\n    for",
         WITHINS,
     ),
-    Mutant("noise whatever is held out", AGENT, "between <= MOST_BLUR * without", "True", HELD_OUTS),
-    Mutant("no noise where it costs anything", AGENT, "between <= MOST_BLUR * without", "between <= without", HELD_OUTS),
-    Mutant("asked at every step", AGENT, "if expert.noise_helps is None:", "if True:", f"{HELD_OUTS} -k imitate_between"),
+    Mutant("noise whatever is held out", IMITATED, "between <= MOST_BLUR * without", "True", HELD_OUTS),
+    Mutant("no noise where it costs anything", IMITATED, "between <= MOST_BLUR * without", "between <= without", HELD_OUTS),
+    Mutant("asked at every step", IMITATED, "if self._noise_helps is None:", "if True:", f"{HELD_OUTS} -k imitate_between"),
+    Mutant("all clones imitate one way", IMITATED, "is_open and number % 2", "False", f"{HELD_OUTS} -k other_way"),
+    Mutant(
+        "the other way where asked for",
+        IMITATED,
+        "refresh.noise is None and self.guesses",
+        "guesses",
+        f"{HELD_OUTS} -k other_way",
+    ),
+    Mutant("the other way without room", IMITATED, " and self.guesses\n", "\n", f"{HELD_OUTS} -k other_way"),
+    Mutant(
+        "clones are not counted", AGENT, "self.refresh.n_clones - 1 - self.trials.n_clones", "0", f"{HELD_OUTS} -k in_turn"
+    ),
     Mutant("held out and shown too", HELD_OUT, "shown.select(~is_held)", "shown", HELD_OUTS),
     Mutant("the mean error", HELD_OUT, ".mean(1).median()", ".mean(1).mean()", f"{HELD_OUTS} -k typical"),
     Mutant(
@@ -856,7 +873,7 @@ MUTANTS = [
         "            pass",
         HELD_OUTS,
     ),
-    Mutant("asked with the decay of none", AGENT, "weight_decay=self._decay_beside(noise)", "weight_decay=None", HELD_OUTS),
+    Mutant("asked with the decay of none", IMITATED, "weight_decay=self._decay_beside(noise)", "weight_decay=None", HELD_OUTS),
     Mutant(
         "episodes begin where they began",
         IMITATION,
@@ -899,7 +916,7 @@ MUTANTS = [
     Mutant(
         "features are weighed by default alone", AGENT, 'if self.observation_normalization == "episodes"', "if True", WITHINS
     ),
-    Mutant("noise where there is no room", AGENT, " and self.room.is_wide", "", f"{ROOMS} -k without_a_word"),
+    Mutant("noise where there is no room", IMITATED, " and self.room.is_wide", "", f"{ROOMS} -k without_a_word"),
     Mutant("room in any unit", ROOM, "> self.step", "> 0.5", f"{ROOMS} -k without_a_word"),
     Mutant("noise of one size", ROOM, "size * way.abs() * th.randn_like(features)", "size * th.randn_like(features)", ROOMS),
     Mutant("noise as wide as the room", ROOM, "nan_to_num(0.0).clamp_max(1.0)", "nan_to_num(0.0).clamp(1.0, 1.0)", ROOMS),
@@ -983,7 +1000,7 @@ MUTANTS = [
         "self.deviation / self.radius - 1.0",
         REGIONS,
     ),
-    Mutant("clones that guess are sure", AGENT, "spread, self.clones_guess", "spread, False", f"{ROOMS} -k unless"),
+    Mutant("clones that guess are sure", AGENT, "spread, self.imitation.guesses", "spread, False", f"{ROOMS} -k unless"),
     Mutant("twenty episodes say it all", TRIALS, "NOISY_RETURNS = 100, 2", "NOISY_RETURNS = 20, 2", f"{HABIT} -k unlucky"),
     Mutant("a small spread is as small a unit", REGION, "spread.clamp(SMALLEST_UNIT, 1.0)", "spread", REGIONS),
     Mutant("lost states count as well", REGION, "(squares * weights).mean()", "squares.mean() * weights.mean()", REGIONS),
@@ -991,7 +1008,7 @@ MUTANTS = [
     Mutant(
         "normalised twice",
         AGENT,
-        "if not self._normalises_observations():",
+        "if not self.inputs.are_normalised:",
         "if True:",
         "tests/actpc/test_agent.py -k normalises",
     ),
@@ -1011,8 +1028,8 @@ MUTANTS = [
     ),
     Mutant(
         "the room stays as VecNormalize began",
-        AGENT,
-        "            self.expert.room = None",
+        IMITATED,
+        "            self._room = None",
         "            pass",
         f"{LEARNS} -k anew",
     ),
@@ -1262,9 +1279,9 @@ MUTANTS = [
     Mutant("own episodes below the best stay out", IMITATION, "self.takes_all or ", "", f"{STORES} -k enters"),
     Mutant(
         "own episodes count for nothing",
-        AGENT,
-        "imitated_return(self._imitated(), ",
-        "imitated_return(self._imitated()[:1], ",
+        IMITATED,
+        "imitated_return(self.parts(), ",
+        "imitated_return(self.parts()[:1], ",
         f"{HABIT} -k own_episodes_too",
     ),
     Mutant(
@@ -1278,9 +1295,9 @@ MUTANTS = [
     Mutant("lost returns weigh", IMITATION, "np.maximum(self.returns, 0.0)", "np.abs(self.returns)", f"{STORES} -k paid"),
     Mutant(
         "refresh ignores what was paid",
-        AGENT,
-        "n, self.memory_history, self.refresh.weighting)",
-        "n, self.memory_history)",
+        IMITATED,
+        "n, agent.memory_history, agent.refresh.weighting)",
+        "n, agent.memory_history)",
         f"{LEARNS} -k paid",
     ),
     Mutant(

@@ -51,19 +51,10 @@ from sb3_actpc.actpc.demonstration_replay import DemonstrationReplay
 from sb3_actpc.actpc.diagnostics import Diagnostics
 from sb3_actpc.actpc.features import Batch, CircuitInputs
 from sb3_actpc.actpc.habit import Trials
-from sb3_actpc.actpc.held_out import N_ASKED, N_UPDATES, random_numbers_of_its_own, split, typical_error
+from sb3_actpc.actpc.imitation import Imitation
 from sb3_actpc.actpc.policies import POLICIES, ActPCActor, ActPCPolicy, Critics, check_policy, check_policy_kwargs
 from sb3_actpc.actpc.reward_signals import InternalSignals, summed_squared_errors
-from sb3_actpc.actpc.room import Room
-from sb3_actpc.actpc.self_imitation import (
-    Episodes,
-    Observations,
-    Refresh,
-    imitated_return,
-    is_by_return,
-    map_observations,
-    sample_union,
-)
+from sb3_actpc.actpc.self_imitation import Episodes, Observations, Refresh, is_by_return, map_observations
 from sb3_actpc.actpc.trust_region import spread_of
 from sb3_actpc.actpc.within_episodes import feature_weights
 from sb3_actpc.checkpoints import Restored, between_updates, load_checkpoint, load_weights, save_weights
@@ -84,8 +75,6 @@ FROM_DEMONSTRATIONS = ("demonstrations", "episodes")  # normalisations
 NEED_DEMONSTRATIONS = ("demonstration_fraction", "actor_warm_start", "n_demonstrations", "n_demonstration_transitions")
 EXPERT_SIGNALS_INTERVAL = 1000  # updates between two evaluations of the demonstrations' signals
 PRETRAINING_INTERVAL = 1000  # updates between two lines about pre-training
-ROOM_DECAY = 1.0  # of clones' synapses where they imitate steps between demonstrations
-MOST_BLUR = 1.5  # of their error on episodes that are held out, over that of clones that imitate what is shown alone
 TARGET_NOISE_CLIP = 2.5  # standard deviations, as TD3's 0.5 for 0.2
 AVERAGING_RATE = 0.001  # per update, of the average of the actor that becomes the habit
 LARGEST_BOUND = 1e6  # of an observation; larger ones stand for none
@@ -418,6 +407,7 @@ class ActPC(OffPolicyAlgorithm):
     def _setup_demonstrations(self) -> None:
         """Check the demonstrations against the environment, cut them, and derive what follows from having them."""
         self.expert: DemonstrationReplay | None = None
+        self.imitation = Imitation(self)
         self._followed = self.demonstrations, self.n_demonstrations, self.n_demonstration_transitions
         if self.demonstrations is None:
             idle = [name for name in NEED_DEMONSTRATIONS if getattr(self, name)]
@@ -443,7 +433,7 @@ class ActPC(OffPolicyAlgorithm):
         self.expert = DemonstrationReplay(demonstrations, self.observation_space, self.action_space, self.memory_history)
         if self.observation_normalization in FROM_DEMONSTRATIONS and not self.pretrained:
             self.actor.normalizer.begin()
-            if not self._normalises_observations():
+            if not self.inputs.are_normalised:
                 self._fit_to_demonstrations(self.expert.episodes)
 
     def _is_trained(self) -> bool:
@@ -451,14 +441,10 @@ class ActPC(OffPolicyAlgorithm):
 
     def _fit_to_demonstrations(self, shown: Episodes) -> None:
         normalizer, rows = self.actor.normalizer, np.arange(len(shown))
-        normalizer.fit(self._features_of(shown, rows))
+        normalizer.fit(self.imitation.features_of(shown, rows))
         if self.observation_normalization == "episodes":
-            features, actions = self._features_of(shown, rows), self.inputs.tensor(shown.actions)
+            features, actions = self.imitation.features_of(shown, rows), self.inputs.tensor(shown.actions)
             normalizer.weigh(feature_weights(features, actions, shown.starts))
-
-    def _normalises_observations(self) -> bool:
-        """Whether VecNormalize does; at first it knows nothing of what it will make of the demonstrations."""
-        return self._vec_normalize_env is not None and self._vec_normalize_env.norm_obs
 
     def _fit_to_bounds(self) -> None:
         """The mean and standard deviation of the lowest and the highest observation map them to -1 and 1."""
@@ -466,7 +452,7 @@ class ActPC(OffPolicyAlgorithm):
             return
         space = self.observation_space
         bounds = np.stack([space.low, space.high]) if isinstance(space, spaces.Box) else np.full(1, np.inf)
-        if bounds.ndim != 2 or not np.all(np.abs(bounds) < LARGEST_BOUND) or self._normalises_observations():
+        if bounds.ndim != 2 or not np.all(np.abs(bounds) < LARGEST_BOUND) or self.inputs.are_normalised:
             raise ValueError(
                 f"observation_normalization='bounds' needs a flat Box whose bounds are below {LARGEST_BOUND:g}, and no "
                 f"VecNormalize(norm_obs=True): observation_space={space}; where there are no bounds, use "
@@ -628,26 +614,9 @@ class ActPC(OffPolicyAlgorithm):
         return (
             f"reward: {ext:g} x task (alpha_ext) + {ep:g} x epistemic (alpha_ep) + {inst:g} x instrumental signal (alpha_in)\n"
             f"demonstrations: {'none' if self.expert is None else self.expert.demonstrations!r}\n"
-            f"imitated: {self._describe_imitated()}\n"
-            f"noise on what clones imitate: {self.clone_noise:g} of a step's length"
-            f"{', and steps between the episodes' if self.clone_noise else ''}\n"
+            f"{self.imitation.describe()}\n"
             f"off: {', '.join(name for name, value in parts.items() if not value) or 'nothing'}"
         )
-
-    def _describe_imitated(self) -> str:
-        assert self.replay_buffer is not None
-        is_of_nothing = self.expert is None and self.replay_buffer.self_imitation is None
-        if is_of_nothing or not (self.refresh_weight or self.actor_warm_start):
-            return "nothing"
-        own = "" if self.expert is not None else "own episodes, "
-        if self.refresh.weighting == "uniform":
-            return f"{own}every step alike"
-        if self.expert is None:
-            return f"{own}by their returns"
-        n = self.expert.episodes.effective_number()
-        if not n:
-            return "every step alike, as no demonstration's return is positive"
-        return f"by returns, as if {n:.1f} of {self.expert.demonstrations.n_episodes} episodes"
 
     def pretrain(self, before_update: Callable[[], None] = lambda: None, progress_bar: bool = False) -> None:
         """
@@ -661,7 +630,7 @@ class ActPC(OffPolicyAlgorithm):
         n_prior = self.prior_updates - int(self.policy.n_prior_updates) if self.alpha_in else 0
         if self.expert is None or (self.pretrained and n_prior <= 0):
             return
-        if self._normalises_observations():
+        if self.inputs.are_normalised:
             warnings.warn(
                 "VecNormalize's observation statistics drift under what is learned now, and those of the demonstrations "
                 "(observation_normalization) are not used: use VecNormalize(norm_obs=False)",
@@ -670,7 +639,7 @@ class ActPC(OffPolicyAlgorithm):
         if self.cloning is None and not self.pretrained:
             self.n_cloning_updates = 0  # an agent that was saved meanwhile begins again: its teachers are not in the file
             self._show_to_vec_normalize()
-            self.cloning = self._clone_into(self.actor.circuit)
+            self.cloning = self.imitation.clone_into(self.actor.circuit)
         n_updates = max(n_prior, 0) + (0 if self.cloning is None else len(self.cloning) - self.n_cloning_updates)
         for update in tqdm(range(n_updates), "pre-training", disable=not progress_bar):
             if self.verbose and update % PRETRAINING_INTERVAL == 0:
@@ -707,18 +676,6 @@ class ActPC(OffPolicyAlgorithm):
         if self._last_original_obs is not None:
             self._last_obs = normalize.normalize_obs(self._last_original_obs)
 
-    def _clone_into(self, circuit: NGCCircuit) -> Cloning:
-        """What makes an actor's circuit a clone of whatever is imitated by now."""
-        if self.expert is not None and self._normalises_observations():  # which knows more by now than when it was measured
-            self.expert.room = None
-            for part in self._imitated():
-                part.neighbours = None
-        size, decay = self.refresh.ensemble_size, self.clone_decay if self.actor_warm_start else None
-        return Cloning(circuit, self.policy.make_actor, self._sample_for_clones, self.actor_warm_start, size, decay)
-
-    def _sample_for_clones(self, n: int) -> Imitated:
-        return self._sample_imitated(n, self.clone_noise)
-
     def _start_from(self, clone: NGCCircuit) -> None:
         """Learning begins with this actor."""
         if clone is not self.actor.circuit:
@@ -728,7 +685,7 @@ class ActPC(OffPolicyAlgorithm):
             self.actor.circuit.optimizer.state.clear()  # its moments are those of other learning rates
             self.policy.spread.copy_(spread_of(self._imitation_residuals()))
             if self.policy.trust_region is not None:
-                self.policy.trust_region.measure_by(self.policy.spread, self.clones_guess)
+                self.policy.trust_region.measure_by(self.policy.spread, self.imitation.guesses)
 
     def _update_prior(self, batch_size: int) -> None:
         assert self.expert is not None
@@ -829,7 +786,7 @@ class ActPC(OffPolicyAlgorithm):
                     )
                 continue
             if self.trials.n_clones:
-                self.trials.imitated_return = imitated_return(self._imitated(), self.refresh.weighting)
+                self.trials.imitated_return = self.imitation.mean_return()
             pressed_since = max(self.critic_warmup, self.trials.begun_at)
             verdict = self.trials.end(env, has_learned=self._n_updates > pressed_since + CANDIDATE_AGE)
             region, is_paid = self.policy.trust_region, self.trials.habit_return != 0.0
@@ -857,10 +814,12 @@ class ActPC(OffPolicyAlgorithm):
         if not self.trials.is_clone:
             _copy(self.policy.actor_average, self.policy.candidate)
             return
+        number = self.refresh.n_clones - 1 - self.trials.n_clones
         if self.verbose:
             paid, imitated = self.trials.habit_return, self.trials.imitated_return
-            print(f"another clone is tried: the habit is paid {paid:.4g}, what it imitates {imitated:.4g}")
-        cloning = self._clone_into(self.policy.make_actor())
+            how = f"noise of {self.imitation.noise_of(number):g} of a step's length"
+            print(f"another clone is tried ({how}): the habit is paid {paid:.4g}, what it imitates {imitated:.4g}")
+        cloning = self.imitation.clone_into(self.policy.make_actor(), number)
         try:
             for update in tqdm(range(len(cloning)), "another clone", disable=not self._has_bar, leave=False):
                 cloning.update(update)
@@ -980,7 +939,7 @@ class ActPC(OffPolicyAlgorithm):
 
     def _update_actor(self, batch: Batch) -> None:
         """Motor-action circuit: pressure of the critic (line 19) plus refresh (line 26), in one step of the optimiser."""
-        imitated = self._sample_imitated(len(batch.features)) if self.refresh_weight and self._imitated() else None
+        imitated = self.imitation.sample(len(batch.features)) if self.refresh_weight and self.imitation.parts() else None
         pressure = self.actor_pressure if self._n_updates > self.critic_warmup else 0.0
         changes = self._actor_changes(batch, imitated, self.refresh_weight, pressure or None)
         if changes is not None:
@@ -1004,6 +963,12 @@ class ActPC(OffPolicyAlgorithm):
             self.diagnostics.change_norms("pressure", pressure.scale_(weight))
             changes = pressure if changes is None else changes.add_(pressure)
         return changes
+
+    def _refresh_changes(self, imitated: Imitated) -> HebbianChanges:
+        """Settle the actor on imitated actions."""
+        state = self.actor.circuit.settle(*imitated)
+        self.diagnostics.settled("actor", state)
+        return self.actor.circuit.hebbian_update(state)
 
     @property
     def pressure(self) -> float:
@@ -1072,100 +1037,6 @@ class ActPC(OffPolicyAlgorithm):
         interval, now = self.target_update_interval, self.num_timesteps
         if interval > 1 and now // interval > (now - self.n_envs) // interval:
             self._update_targets(self.tau)
-
-    # ------------------------------------------------------------------ demonstrations and self-imitation
-
-    def _imitated(self) -> list[Episodes]:
-        """What refresh draws from: the demonstrations and the self-imitation memory."""
-        assert self.replay_buffer is not None
-        memory = self.replay_buffer.self_imitation
-        own = [] if memory is None or memory.episodes is None else [memory.episodes]
-        return own if self.expert is None else [self.expert.episodes, *own]
-
-    def _refresh_changes(self, imitated: Imitated) -> HebbianChanges:
-        """Settle the actor on imitated actions."""
-        state = self.actor.circuit.settle(*imitated)
-        self.diagnostics.settled("actor", state)
-        return self.actor.circuit.hebbian_update(state)
-
-    def _sample_imitated(
-        self, n: int, noise: float = 0.0, parts: list[Episodes] | None = None, room: Room | None = None
-    ) -> Imitated:
-        """Features, actions and working memory of ``n`` imitated steps, or of steps of ``parts``; with noise, of steps between
-        the demonstrations, or those of ``room``."""
-        inputs, parts = self.inputs, parts or self._imitated()
-        room = (room or self.room) if noise else None
-        if room is not None:
-            for part in parts:
-                room.measure(part)
-        samples = sample_union(parts, n, self.memory_history, self.refresh.weighting)
-        features, actions = inputs.features(inputs.observations(samples.observations)), inputs.tensor(samples.actions)
-        if room is not None and samples.neighbours is not None:
-            features, actions = room.between(features, actions, samples.neighbours, noise)
-        return features, actions, inputs.memory(*inputs.past(samples.history, samples.history_mask))
-
-    @property
-    def room(self) -> Room | None:
-        """What lies between the demonstrations; None without any."""
-        if self.expert is not None and self.expert.room is None:
-            shown = self.expert.episodes
-            self.expert.room = Room(shown, self._features_of, is_by_return([shown], self.refresh.weighting))
-        return None if self.expert is None else self.expert.room
-
-    @property
-    def clones_guess(self) -> bool:
-        """Whether the demonstrations leave room, so that clones guess what is done between them."""
-        return self.room is not None and self.room.is_wide
-
-    @property
-    def clone_noise(self) -> float:
-        """Noise on what clones imitate: as asked for, or by default 1 where the demonstrations leave room, unless clones of
-        some of them then tell worse what is done in the others, and 0 where not; 0 with a single demonstration, which has no
-        neighbours."""
-        if self.expert is not None and self.refresh.noise is not None:
-            return self.refresh.noise if self.expert.demonstrations.n_episodes > 1 else 0.0
-        return float(self.clones_guess and self._noise_helps())
-
-    def _noise_helps(self) -> bool:
-        """Whether a clone that imitates between demonstrations is about as precise where none was shown as one that does not,
-        or more. Asked once; what is drawn for it is drawn by nobody else."""
-        expert = self.expert
-        assert expert is not None
-        if expert.noise_helps is None:
-            parts = split(expert.episodes)
-            expert.noise_helps = True
-            if parts is not None and self.actor_warm_start:
-                if self.verbose:
-                    print("two short clones are asked whether to imitate steps between the demonstrations")
-                with random_numbers_of_its_own(self.device):
-                    without, between = (self._error_when_held_out(noise, *parts) for noise in (0.0, 1.0))
-                expert.noise_helps = between <= MOST_BLUR * without
-        return expert.noise_helps
-
-    def _error_when_held_out(self, noise: float, shown: Episodes, held_out: Episodes) -> float:
-        room = Room(shown, self._features_of, is_by_return([shown], self.refresh.weighting)) if noise else None
-        cloning = Cloning(
-            self.policy.make_actor(),
-            self.policy.make_actor,
-            lambda n: self._sample_imitated(n, noise, [shown], room),
-            min(N_UPDATES, self.actor_warm_start),
-            weight_decay=self._decay_beside(noise),
-        )
-        return typical_error(cloning, self._sample_imitated(N_ASKED, parts=[held_out]))
-
-    @property
-    def clone_decay(self) -> float | None:
-        """Decay of clones' synapses: as asked for, or by default ``ROOM_DECAY`` where they imitate steps between
-        demonstrations and None, which is their circuits' own, where not."""
-        return self._decay_beside(self.clone_noise)
-
-    def _decay_beside(self, noise: float) -> float | None:
-        return ROOM_DECAY if self.refresh.weight_decay is None and noise else self.refresh.weight_decay
-
-    def _features_of(self, episodes: Episodes, rows: np.ndarray) -> th.Tensor:
-        """(B, n_features) of (B,) rows, some at a time: there can be many images."""
-        parts = [episodes.take(some).observations for some in np.array_split(rows, 1 + len(rows) // 1024)]
-        return th.cat([self.inputs.features(self.inputs.observations(part)) for part in parts])
 
     # ------------------------------------------------------------------ logging, saving
 
@@ -1267,7 +1138,7 @@ class ActPC(OffPolicyAlgorithm):
         self.n_cloning_updates = state["n_cloning_updates"]
         self.cloning = None
         if state["cloning"] is not None:
-            self.cloning = self._clone_into(self.actor.circuit)
+            self.cloning = self.imitation.clone_into(self.actor.circuit)
             self.cloning.restore_checkpoint_state(state["cloning"])
         self._rollout_state, self._rollout_starts = state["rollout_state"], state["rollout_starts"]
         self.signals.restore_checkpoint_state(state["signals"])
@@ -1327,7 +1198,7 @@ class ActPC(OffPolicyAlgorithm):
 
     def _excluded_save_params(self) -> list[str]:
         aliases = ["actor", "critic", "generator", "prior", "actor_target", "critic_target"]
-        derived = ["expert", "_followed", "diagnostics", "_compiled", "refresh", "cloning"]
+        derived = ["expert", "imitation", "_followed", "diagnostics", "_compiled", "refresh", "cloning"]
         return [*super()._excluded_save_params(), *aliases, *derived]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:

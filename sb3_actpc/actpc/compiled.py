@@ -72,7 +72,8 @@ class CompiledUpdate:
         for name in ("actor_pressure", "refresh_weight"):
             if not getattr(agent, name):
                 return f"{name}=0"
-        return "" if agent._imitated() else "nothing is imitated (no demonstrations=, and no paid episode of its own yet)"
+        is_imitating = bool(agent.imitation.parts())
+        return "" if is_imitating else "nothing is imitated (no demonstrations=, and no paid episode of its own yet)"
 
     @th.no_grad()
     def __call__(self, actor: Batch | None, critic: Batch, generator: Batch) -> bool:
@@ -83,7 +84,7 @@ class CompiledUpdate:
         """
         agent = self.agent
         # drawn in the order of the eager update
-        imitated = None if actor is None else agent._sample_imitated(len(actor.features))
+        imitated = None if actor is None else agent.imitation.sample(len(actor.features))
         refresh, pressure = (th.tensor(float(w), device=agent.device) for w in (agent.refresh_weight, agent.actor_pressure))
         given = _Given((refresh, pressure), actor, critic, generator, imitated, agent._target_noise(critic))
         circuits = [*agent.critic, *([agent.generator] if agent.alpha_ep else [])]

@@ -10,7 +10,6 @@ from gymnasium import spaces
 
 from sb3_actpc.actpc.features import Batch, CircuitInputs
 from sb3_actpc.actpc.reward_signals import STORED, Normalize
-from sb3_actpc.actpc.room import Room
 from sb3_actpc.actpc.self_imitation import Episodes
 from sb3_actpc.demonstrations.dataset import Demonstrations
 from sb3_actpc.demonstrations.rows import split_observations
@@ -46,8 +45,6 @@ class DemonstrationReplay:
         )
         self.epistemic, self.instrumental = np.zeros((2, len(demonstrations)), dtype=np.float32)
         self.has_signals = self.has_scale = False
-        self.room: Room | None = None  # what lies between the episodes; None before that is asked
-        self.noise_helps: bool | None = None  # clones that imitate between them; None before that is asked
 
     def __len__(self) -> int:
         return len(self.demonstrations)

@@ -63,6 +63,11 @@ class CircuitInputs:
     def __init__(self, actor: ActPCActor, vec_normalize: VecNormalize | None) -> None:
         self.actor, self.vec_normalize = actor, vec_normalize
 
+    @property
+    def are_normalised(self) -> bool:
+        """Whether VecNormalize does; at first it knows nothing of what it will make of the demonstrations."""
+        return self.vec_normalize is not None and bool(self.vec_normalize.norm_obs)
+
     def tensor(self, array: np.ndarray) -> th.Tensor:
         """The array as float32 on the agent's device."""
         return th.as_tensor(array, dtype=th.float32, device=self.actor.normalizer.mean.device)

@@ -486,7 +486,7 @@ def test_the_actor_imitates_the_episodes_that_were_paid(weighting, share):
     unpaid = np.arange(len(data)) < 50
     data = dataclasses.replace(data, rewards=np.where(unpaid, 0.0, 1.0).astype(np.float32))
     model = make(demonstrations=data, refresh_kwargs={"weighting": weighting})
-    features = model._sample_imitated(2000)[0]
+    features = model.imitation.sample(2000)[0]
     from_unpaid = (features[:, None] == th.as_tensor(data.observations[unpaid])[None]).all(-1).any(1)
     assert from_unpaid.float().mean().item() == pytest.approx(share, abs=0.05)
 
@@ -656,7 +656,7 @@ def test_what_vec_normalize_normalises_is_not_normalised_again(norm_obs, fitted)
     model = imitating(env)
     assert model.observation_normalization == "episodes"
     shown = demonstrations().observations
-    features = model._features_of(model.expert.episodes, np.arange(len(model.expert))).numpy()
+    features = model.imitation.features_of(model.expert.episodes, np.arange(len(model.expert))).numpy()
     assert np.allclose(features.mean(0), 0.0, atol=1e-4) == fitted
     assert np.allclose(features, env.normalize_obs(shown), atol=1e-5) != fitted
 
@@ -673,13 +673,13 @@ def test_the_room_between_demonstrations_is_measured_anew_by_what_vec_normalize_
     for norm_obs in (True, False):
         env = VecNormalize(DummyVecEnv([CountingEnv]), norm_obs=norm_obs)
         model = imitating(env, refresh_kwargs={"noise": 1.0})
-        model._sample_for_clones(8)
-        early = model.room.step
+        model.imitation.sample(8, 1.0)
+        early = model.imitation.room.step
         env.obs_rms = VecNormalize(DummyVecEnv([CountingEnv])).obs_rms
         env.obs_rms.update(100.0 * np.random.default_rng(0).normal(size=(1000, 3)))
-        model._clone_into(model.policy.make_actor())
+        model.imitation.clone_into(model.policy.make_actor())
         assert (model.expert.episodes.neighbours is None) == norm_obs
-        assert (model.room.step < 0.1 * early) == norm_obs and (model.room.step == early) != norm_obs
+        assert (model.imitation.room.step < 0.1 * early) == norm_obs and (model.imitation.room.step == early) != norm_obs
 
 
 def test_a_batch_of_demonstrations_alone_has_a_memory_too():

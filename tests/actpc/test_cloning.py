@@ -9,6 +9,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from sb3_actpc import ActPC
 from sb3_actpc.actpc import cloning as cloning_module
 from sb3_actpc.actpc.cloning import BATCH_SIZE, TEACHING_NOISE, Cloning, taught
+from sb3_actpc.actpc.imitation import Imitation
 from sb3_actpc.ngc import NGCCircuit
 from tests.actpc.agents import differ, imitating, weights_of
 from tests.actpc.envs import CountingEnv
@@ -205,8 +206,8 @@ def test_an_interrupted_clone_leaves_nobody_on_trial(monkeypatch):
 
 
 def test_batches_are_of_one_size(monkeypatch):
-    seen, original = [], ActPC._sample_imitated
-    monkeypatch.setattr(ActPC, "_sample_imitated", lambda self, n, noise=0.0: (seen.append(n), original(self, n, noise))[1])
+    seen, original = [], Imitation.sample
+    monkeypatch.setattr(Imitation, "sample", lambda self, n, noise=0.0: (seen.append(n), original(self, n, noise))[1])
     imitating().pretrain()
     assert seen == [BATCH_SIZE] * 20 and BATCH_SIZE == 256
 
@@ -282,7 +283,7 @@ def test_parameters_that_have_imitated_are_not_trained_over():
 def test_without_a_warm_start_there_is_nothing_to_measure():
     model = imitating(actor_warm_start=0)
     model.pretrain()
-    assert model.pretrained and model.expert.room is None
+    assert model.pretrained and model.imitation._room is None
 
 
 def test_settings_are_checked():

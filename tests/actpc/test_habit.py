@@ -31,6 +31,7 @@ from sb3_actpc.actpc.habit import (
     QuietEpisode,
     Trials,
 )
+from sb3_actpc.actpc.imitation import Imitation
 from sb3_actpc.actpc.self_imitation import imitated_return
 from sb3_actpc.actpc.trust_region import FIRST_MULTIPLIER, RADIUS_FACTORS, spread_of
 from tests.actpc.agents import QUICK, differ, imitating, make, weights_of
@@ -509,13 +510,11 @@ def test_a_clone_is_needed_where_a_tenth_of_what_is_imitated_is_missing(imitated
 
 
 def test_clones_imitate_with_noise_and_the_learning_actor_without(monkeypatch):
-    seen, original = [], ActPC._sample_imitated
-    monkeypatch.setattr(
-        ActPC, "_sample_imitated", lambda self, n, noise=0.0: (seen.append(noise), original(self, n, noise))[1]
-    )
+    seen, original = [], Imitation.sample
+    monkeypatch.setattr(Imitation, "sample", lambda self, n, noise=0.0: (seen.append(noise), original(self, n, noise))[1])
     model = imitating(refresh_kwargs={"noise": 0.5}, policy_delay=1)
-    shown = model._features_of(model.expert.episodes, np.arange(len(model.expert)))
-    refreshed, cloned = (original(model, 64, *noise)[0][:, None] for noise in ((), (0.5,)))
+    shown = model.imitation.features_of(model.expert.episodes, np.arange(len(model.expert)))
+    refreshed, cloned = (original(model.imitation, 64, *noise)[0][:, None] for noise in ((), (0.5,)))
     assert [bool((one == shown).all(2).any(1).all()) for one in (refreshed, cloned)] == [True, False]
     model.learn(20)
     n = 4 * model.actor_warm_start  # of three members and the clone
@@ -529,13 +528,13 @@ def test_clones_imitate_with_noise_and_the_learning_actor_without(monkeypatch):
 def test_own_episodes_are_measured_anew_from_other_demonstrations():
     model = imitating(refresh_kwargs={"noise": 0.5}, env=lambda: CountingEnv(returns=(1.0,)))
     model.learn(60)
-    model._sample_imitated(9, 0.5)
+    model.imitation.sample(9, 0.5)
     own, shown = model.replay_buffer.self_imitation, model.expert.episodes
     before = own.episodes.neighbours[:5].copy()
     data = demonstrations()
     model.demonstrations = dataclasses.replace(data, observations=data.observations + 3.0)
     model.learn(0, reset_num_timesteps=False)  # nothing is stored
-    model._sample_imitated(9, 0.5)
+    model.imitation.sample(9, 0.5)
     assert model.expert.episodes is not shown
     assert (own.episodes.neighbours[:5] != before).any()
 
@@ -784,7 +783,7 @@ def test_what_is_imitated_is_paid_as_its_steps_are_drawn(paid, weighting, imitat
         settings = {"refresh_kwargs": {"weighting": weighting, "n_clones": 3}, "actor_warm_start": updates}
         model = ActPC("MlpPolicy", CountingEnv(), demonstrations=data, **{**QUICK, **settings})
         model.pretrain()
-        assert imitated_return(model._imitated(), weighting) == pytest.approx(imitated)
+        assert imitated_return(model.imitation.parts(), weighting) == pytest.approx(imitated)
         assert model.trials.n_clones == n_clones
 
 
@@ -792,7 +791,7 @@ def test_what_is_imitated_counts_own_episodes_too():
     """As soon as one has ended: the demonstrated ones are paid 1 each, the agent's own of nine steps 3."""
     model = imitating(lambda: CountingEnv(returns=(0.0, 3.0)))
     model.learn(14)  # episodes of five and nine steps
-    demonstrated, own = (part.returns for part in model._imitated())
+    demonstrated, own = (part.returns for part in model.imitation.parts())
     assert set(own) == {3.0} and len(own) == 9 and set(demonstrated) == {1.0}
     expected = (len(demonstrated) * 1.0 + 9 * 3.0**5) / (len(demonstrated) * 1.0 + 9 * 3.0**4)
     assert model.trials.imitated_return == pytest.approx(expected)
@@ -1042,17 +1041,17 @@ def test_a_signal_while_a_clone_is_made_waits_for_it_and_loses_nothing(tmp_path,
     data = demonstrations()
     data = dataclasses.replace(data, rewards=5.0 * data.rewards)
     settings = {"demonstrations": data, "critic_warmup": 1000, "buffer_size": 200}
-    original, steps, signals = ActPC._clone_into, [], []
+    original, steps, signals = Imitation.clone_into, [], []
 
-    def clone_into(self, circuit):
-        cloning = original(self, circuit)
-        if self.num_timesteps:  # not the warm start
-            steps.append(self.num_timesteps)
+    def clone_into(self, circuit, number=0):
+        cloning = original(self, circuit, number)
+        if number:  # not the warm start
+            steps.append(self.agent.num_timesteps)
             if signals:
                 os.kill(os.getpid(), signals.pop())
         return cloning
 
-    monkeypatch.setattr(ActPC, "_clone_into", clone_into)
+    monkeypatch.setattr(Imitation, "clone_into", clone_into)
     straight = learn_straight(lambda: imitating(**settings), tmp_path / "straight", 120)
     first, n_clones = steps[0], len(steps)
     signals.append(signal.SIGTERM)

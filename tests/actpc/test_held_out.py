@@ -7,10 +7,10 @@ import torch as th
 from gymnasium import spaces
 
 from sb3_actpc import Demonstrations
-from sb3_actpc.actpc import actpc as actpc_module
-from sb3_actpc.actpc.actpc import ROOM_DECAY
+from sb3_actpc.actpc import imitation as imitation_module
 from sb3_actpc.actpc.cloning import Cloning
 from sb3_actpc.actpc.held_out import random_numbers_of_its_own, split, typical_error
+from sb3_actpc.actpc.imitation import ROOM_DECAY, Imitation
 from sb3_actpc.actpc.self_imitation import Episodes
 from tests.actpc.agents import imitating
 
@@ -113,12 +113,12 @@ def test_clones_do_not_imitate_between_where_that_makes_them_less_precise(withou
         assert len(shown) == 3 * LENGTH and len(held) == LENGTH
         return between if noise else without
 
-    monkeypatch.setattr(actpc_module.ActPC, "_error_when_held_out", error)
+    monkeypatch.setattr(Imitation, "_error_when_held_out", error)
     model = reaching(4)
-    assert model.clones_guess
-    assert model.clone_noise == noise and model.clone_noise == noise
+    assert model.imitation.guesses
+    assert model.imitation.noise == noise and model.imitation.noise == noise
     assert asked == [0.0, 1.0]  # once
-    assert model.clone_decay == (1.0 if noise else None)
+    assert model.imitation._decay_beside(model.imitation.noise) == (1.0 if noise else None)
 
 
 @pytest.mark.parametrize(
@@ -126,15 +126,15 @@ def test_clones_do_not_imitate_between_where_that_makes_them_less_precise(withou
     [(3, {}, 1.0), (4, {"refresh_kwargs": {"noise": 0.7}}, 0.7), (4, {"actor_warm_start": 0}, 1.0)],
 )
 def test_nobody_is_asked_without_need_or_by_few(n_episodes, keywords, noise, monkeypatch):
-    monkeypatch.setattr(actpc_module.ActPC, "_error_when_held_out", None)
-    assert reaching(n_episodes, **keywords).clone_noise == noise
+    monkeypatch.setattr(Imitation, "_error_when_held_out", None)
+    assert reaching(n_episodes, **keywords).imitation.noise == noise
 
 
 def test_both_are_asked_with_the_decay_that_they_would_have(monkeypatch):
     made = []
-    monkeypatch.setattr(actpc_module, "typical_error", lambda cloning, held: made.append(cloning) or 1.0)
+    monkeypatch.setattr(imitation_module, "typical_error", lambda cloning, held: made.append(cloning) or 1.0)
     for decay in (None, 0.3):
-        assert reaching(4, refresh_kwargs={"weight_decay": decay}).clone_noise == 1.0
+        assert reaching(4, refresh_kwargs={"weight_decay": decay}).imitation.noise == 1.0
     assert [one.weight_decay for one in made] == [None, ROOM_DECAY, 0.3, 0.3]
     assert {len(one) for one in made} == {5}  # no more than the warm start
 
@@ -144,9 +144,9 @@ def test_asking_changes_no_random_number_of_the_agent():
     for is_asked in (False, True):
         model = reaching(4)
         if is_asked:
-            assert model.clone_noise in (0.0, 1.0) and model.expert.noise_helps is not None
+            assert model.imitation.noise in (0.0, 1.0) and model.imitation._noise_helps is not None
         else:
-            model.expert.noise_helps = True
+            model.imitation._noise_helps = True
         drawn.append((np.random.random(), float(th.rand(()))))
     assert drawn[0] == drawn[1]
 
@@ -154,5 +154,40 @@ def test_asking_changes_no_random_number_of_the_agent():
 @pytest.mark.parametrize("seed", [0, 1])
 def test_a_precise_controller_is_imitated_as_it_is_shown(seed):
     model = reaching(16, policy_kwargs={"net_arch": [64, 64]}, actor_warm_start=600, seed=seed)
-    assert model.clones_guess
-    assert model.clone_noise == 0.0
+    assert model.imitation.guesses
+    assert model.imitation.noise == 0.0
+
+
+@pytest.mark.parametrize(("helps", "noises"), [(True, [1.0, 0.0, 1.0, 0.0]), (False, [0.0, 1.0, 0.0, 1.0])])
+def test_every_other_further_clone_imitates_the_other_way(helps, noises):
+    model = reaching(4)
+    model.imitation._noise_helps = helps
+    assert [model.imitation.noise_of(number) for number in range(4)] == noises
+    cloning = model.imitation.clone_into(model.policy.make_actor(), 1)
+    assert cloning.weight_decay == (None if helps else ROOM_DECAY)
+    shown = model.imitation.features_of(model.expert.episodes, np.arange(len(model.expert)))
+    is_shown = (cloning.sample(50)[0][:, None] == shown).all(2).any(1)
+    assert bool(is_shown.all() if helps else not is_shown.any())
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.3])
+def test_no_clone_imitates_the_other_way_where_one_is_asked_for(noise):
+    model = reaching(4, refresh_kwargs={"noise": noise})
+    assert [model.imitation.noise_of(number) for number in range(3)] == [noise] * 3
+
+
+def test_no_clone_imitates_the_other_way_where_there_is_no_room():
+    model = imitating()
+    assert not model.imitation.guesses
+    assert [model.imitation.noise_of(number) for number in range(3)] == [0.0] * 3
+
+
+def test_clones_are_tried_in_turn(monkeypatch):
+    made, original = [], Imitation.clone_into
+    monkeypatch.setattr(Imitation, "clone_into", lambda *given: (made.append(given[2:]), original(*given))[1])
+    model = reaching(4, refresh_kwargs={"n_clones": 4})
+    model.pretrain()
+    for n_left in (2, 1, 0):
+        model.trials.n_clones, model.trials.on_trial, model.trials.is_clone = n_left, True, True
+        model._make_candidate()
+    assert made == [(), (1,), (2,), (3,)]

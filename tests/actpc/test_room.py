@@ -7,8 +7,8 @@ import pytest
 import torch as th
 
 from sb3_actpc.actpc import room as room_module
-from sb3_actpc.actpc.actpc import ROOM_DECAY
 from sb3_actpc.actpc.cloning import Cloning
+from sb3_actpc.actpc.imitation import ROOM_DECAY
 from sb3_actpc.actpc.room import Room, evenly, nearest_steps
 from sb3_actpc.actpc.self_imitation import Episodes
 from sb3_actpc.actpc.trust_region import SMALLEST_UNIT
@@ -102,9 +102,9 @@ def test_without_a_word_on_it_there_is_noise_where_the_next_episode_is_farther_t
     """Whatever the unit."""
     data = parallel_lines(apart, scale)
     model = make(demonstrations=data)
-    assert model.clone_noise == noise
+    assert model.imitation.noise == noise
     assert f"noise on what clones imitate: {noise:g} of" in model.describe()
-    assert make(demonstrations=data, refresh_kwargs={"noise": 0.3}).clone_noise == 0.3
+    assert make(demonstrations=data, refresh_kwargs={"noise": 0.3}).imitation.noise == 0.3
 
 
 @pytest.mark.parametrize(
@@ -147,10 +147,10 @@ def test_the_trust_region_counts_by_the_demonstrations_spread_unless_the_clone_g
 @pytest.mark.parametrize("lengths", [(40,), (1, 1, 1)])
 def test_one_episode_or_episodes_of_one_step_leave_no_room(lengths):
     data = demonstrations(n_episodes=len(lengths), length=lengths[0])
-    assert make(demonstrations=data).clone_noise == 0.0
-    assert not make().clone_noise
+    assert make(demonstrations=data).imitation.noise == 0.0
+    assert not make().imitation.noise
     asked_for = make(demonstrations=data, refresh_kwargs={"noise": 0.3})
-    assert asked_for.clone_noise == (0.3 if len(lengths) > 1 else 0.0)
+    assert asked_for.imitation.noise == (0.3 if len(lengths) > 1 else 0.0)
 
 
 def test_neighbours_in_long_sets_are_some_of_their_steps(monkeypatch):
@@ -181,9 +181,9 @@ def test_own_episodes_are_moved_towards_the_demonstrations():
     data = dataclasses.replace(data, observations=np.zeros_like(data.observations))
     model = make(demonstrations=data)
     for place in (7.0, -9.0):  # far from both and from each other
-        model._sample_imitated(10, 0.5)
+        model.imitation.sample(10, 0.5)
         model.replay_buffer.self_imitation.store(np.full_like(data.observations, place), data.actions, 1.0)
-    features = model._sample_imitated(20_000, 0.5)[0]
+    features = model.imitation.sample(20_000, 0.5)[0]
     for place in (7.0, -9.0):
         own = features[features[:, 0] / place > 0.0]
         assert len(own) == pytest.approx(20_000 / 3, rel=0.05)  # three times a hundred steps
