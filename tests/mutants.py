@@ -729,7 +729,13 @@ MUTANTS = [
         "one teacher for all", CLONING, "self.teachers.append(self.make_circuit())", "self.teachers.append(self.clone)", CLONES
     ),
     Mutant("clones keep their circuit's decay", CLONING, "memory)), self.weight_decay)", "memory)))", f"{CLONES} -k decay"),
-    Mutant("clones decay everywhere", IMITATED, "is None and noise else", "is None else", f"{ROOMS} -k smaller_synapses"),
+    Mutant(
+        "clones decay everywhere",
+        IMITATED,
+        "return ROOM_DECAY if self.guesses or",
+        "return ROOM_DECAY if True or",
+        f"{ROOMS} -k smaller_synapses",
+    ),
     Mutant(
         "the decay of this once is ignored", CIRCUIT, " if weight_decay is None else weight_decay)", ")", f"{LEARNING} -k once"
     ),
@@ -873,7 +879,7 @@ MUTANTS = [
         "            pass",
         HELD_OUTS,
     ),
-    Mutant("asked with the decay of none", IMITATED, "weight_decay=self._decay_beside(noise)", "weight_decay=None", HELD_OUTS),
+    Mutant("asked with the decay of none", IMITATED, "weight_decay=self.decay", "weight_decay=None", HELD_OUTS),
     Mutant(
         "episodes begin where they began",
         IMITATION,

@@ -13,7 +13,7 @@ from sb3_actpc.actpc.room import Room
 from sb3_actpc.actpc.self_imitation import Episodes, imitated_return, is_by_return, sample_union
 from sb3_actpc.ngc import NGCCircuit
 
-ROOM_DECAY = 1.0  # of clones' synapses where they imitate steps between demonstrations
+ROOM_DECAY = 1.0  # of clones' synapses where the demonstrations leave room, which small synapses guess better
 MOST_BLUR = 1.5  # of their error on episodes that are held out, over that of clones that imitate what is shown alone
 
 
@@ -81,7 +81,7 @@ class Imitation:
             lambda n: self.sample(n, noise),
             agent.actor_warm_start,
             agent.refresh.ensemble_size,
-            self._decay_beside(noise),
+            self.decay if agent.actor_warm_start else None,
         )
 
     @property
@@ -137,20 +137,20 @@ class Imitation:
 
     def _error_when_held_out(self, noise: float, shown: Episodes, held_out: Episodes) -> float:
         make_actor, room = self.agent.policy.make_actor, self._room_of(shown) if noise else None
+        n_updates = min(N_UPDATES, self.agent.actor_warm_start)
         cloning = Cloning(
-            make_actor(),
-            make_actor,
-            lambda n: self.sample(n, noise, [shown], room),
-            min(N_UPDATES, self.agent.actor_warm_start),
-            weight_decay=self._decay_beside(noise),
+            make_actor(), make_actor, lambda n: self.sample(n, noise, [shown], room), n_updates, weight_decay=self.decay
         )
         return typical_error(cloning, self.sample(N_ASKED, parts=[held_out]))
 
-    def _decay_beside(self, noise: float) -> float | None:
-        """Of clones' synapses: as asked for, or by default ``ROOM_DECAY`` where they imitate steps between demonstrations and
-        None, which is their circuits' own, where not."""
-        decay: float | None = self.agent.refresh.weight_decay
-        return ROOM_DECAY if decay is None and noise else decay
+    @property
+    def decay(self) -> float | None:
+        """Of clones' synapses: as asked for, or by default ``ROOM_DECAY`` where they guess, or imitate steps between
+        demonstrations, and None, which is their circuits' own, where not."""
+        refresh = self.agent.refresh
+        if refresh.weight_decay is not None:
+            return float(refresh.weight_decay)
+        return ROOM_DECAY if self.guesses or (refresh.noise is not None and self.noise) else None
 
     # ------------------------------------------------------------------ in words
 

@@ -35,12 +35,13 @@ class Refresh:
         has to become precise. 0 for neither (the paper; so it is with a single demonstration); None for 1 where the
         demonstrations leave room (the nearest step of another one is farther than a step leads, by the medians: arms and
         goals, 2 to 8 times; gaits, 0.03 to 0.7, where this only blurs what to do) and clones of some of them are then about
-        as precise on the others (:mod:`sb3_actpc.actpc.held_out`), else 0
+        as precise on the others (:mod:`sb3_actpc.actpc.held_out`), else 0; every other further clone then imitates the other
+        way
     :param own_episodes: which of them are imitated too: "paid" (every one, as often as its return says; "best" where steps are
         not drawn by returns, or nothing is demonstrated) or "best" (those that are paid at least what the best one was: the
         paper)
-    :param weight_decay: λ of the synapses of clones and their teachers, in the place of their circuit's; None for 1 where they
-        imitate steps between demonstrations, which small synapses guess better, else as the circuit's
+    :param weight_decay: λ of the synapses of clones and their teachers, in the place of their circuit's; None for 1 where the
+        demonstrations leave room, in which small synapses guess better, or with a noise that is given, else as the circuit's
     :param ensemble_size: others that teach a clone what to do around the imitated steps, 2 or more; 1 for none (the
         paper). See :mod:`sb3_actpc.actpc.cloning`
     :param n_clones: clones that are tried at most, the first included, while the habit is paid less than nine tenths of what

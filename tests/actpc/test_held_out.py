@@ -118,7 +118,7 @@ def test_clones_do_not_imitate_between_where_that_makes_them_less_precise(withou
     assert model.imitation.guesses
     assert model.imitation.noise == noise and model.imitation.noise == noise
     assert asked == [0.0, 1.0]  # once
-    assert model.imitation._decay_beside(model.imitation.noise) == (1.0 if noise else None)
+    assert model.imitation.decay == 1.0  # either way
 
 
 @pytest.mark.parametrize(
@@ -135,7 +135,7 @@ def test_both_are_asked_with_the_decay_that_they_would_have(monkeypatch):
     monkeypatch.setattr(imitation_module, "typical_error", lambda cloning, held: made.append(cloning) or 1.0)
     for decay in (None, 0.3):
         assert reaching(4, refresh_kwargs={"weight_decay": decay}).imitation.noise == 1.0
-    assert [one.weight_decay for one in made] == [None, ROOM_DECAY, 0.3, 0.3]
+    assert [one.weight_decay for one in made] == [ROOM_DECAY, ROOM_DECAY, 0.3, 0.3]
     assert {len(one) for one in made} == {5}  # no more than the warm start
 
 
@@ -164,7 +164,7 @@ def test_every_other_further_clone_imitates_the_other_way(helps, noises):
     model.imitation._noise_helps = helps
     assert [model.imitation.noise_of(number) for number in range(4)] == noises
     cloning = model.imitation.clone_into(model.policy.make_actor(), 1)
-    assert cloning.weight_decay == (None if helps else ROOM_DECAY)
+    assert cloning.weight_decay == ROOM_DECAY
     shown = model.imitation.features_of(model.expert.episodes, np.arange(len(model.expert)))
     is_shown = (cloning.sample(50)[0][:, None] == shown).all(2).any(1)
     assert bool(is_shown.all() if helps else not is_shown.any())

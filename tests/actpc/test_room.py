@@ -111,7 +111,8 @@ def test_without_a_word_on_it_there_is_noise_where_the_next_episode_is_farther_t
     ("apart", "keywords", "expected"),
     [
         (0.12, {}, ROOM_DECAY),
-        (0.12, {"noise": 0.0}, None),
+        (0.12, {"noise": 0.0}, ROOM_DECAY),
+        (0.08, {"noise": 0.0}, None),
         (0.08, {"noise": 0.3}, ROOM_DECAY),
         (0.08, {}, None),
         (0.08, {"weight_decay": 0.0}, 0.0),
