@@ -8,7 +8,7 @@ import torch as th
 
 from sb3_actpc import ActPC, shipped_demonstrations
 from sb3_actpc.actpc import within_episodes
-from sb3_actpc.actpc.within_episodes import error_of_neighbours, feature_weights, share_within
+from sb3_actpc.actpc.within_episodes import CONTEXT, error_of_neighbours, feature_weights, share_within
 from sb3_actpc.demonstrations.dataset import Demonstrations
 from tests.actpc.agents import imitating, make, plain
 from tests.actpc.envs import demonstrations
@@ -40,26 +40,23 @@ def test_episodes_of_different_lengths_count_by_their_steps():
     assert share_within(features, np.array([0, 0, 0, 0, 1]))[0] == pytest.approx((within / np.var([0, 2, 4, 6, 9])) ** 0.5)
 
 
+def nearly(own):
+    """What each episode alone has, and changes little within it: less than a third of its deviation."""
+    return own + 0.3 * th.as_tensor(np.random.default_rng(5).normal(size=len(own)), dtype=th.float32)
+
+
 def test_what_names_the_episode_is_taken_smaller_where_it_tells_nothing_of_what_is_done():
     position, own = steps()
-    features, actions = th.stack([position, own + 0.1 * th.randn(len(own))], dim=1), (2.0 * position).tanh()[:, None]
+    features, actions = th.stack([position, nearly(own)], dim=1), (2.0 * position).tanh()[:, None]
     weights = feature_weights(features, actions, EPISODES)
-    assert weights[0] > 0.9 and weights[1] < 0.2
+    assert weights[0] > 0.9 and CONTEXT < weights[1] < 0.35
     assert weights.tolist() == share_within(features, EPISODES).tolist()
 
 
-def test_a_goal_stays_the_same_within_an_episode_and_keeps_its_size():
+def test_what_is_needed_keeps_its_size():
     position, goal = steps()
-    weights = feature_weights(th.stack([position, goal], dim=1), (goal - position).tanh()[:, None], EPISODES)
+    weights = feature_weights(th.stack([position, nearly(goal)], dim=1), (goal - position).tanh()[:, None], EPISODES)
     assert weights.tolist() == [1.0, 1.0]
-
-
-def test_a_goal_beside_a_name():
-    """Both stay the same, and are taken smaller, or not, together: what is needed decides."""
-    position, goal = steps()
-    name = next(iter(list(steps(1))[1:]))
-    actions = (goal - position).tanh()[:, None]
-    assert feature_weights(th.stack([position, goal, name], dim=1), actions, EPISODES).tolist() == [1.0] * 3
 
 
 def sorting(seed):
@@ -77,33 +74,32 @@ def sorting(seed):
     return th.as_tensor(features, dtype=th.float32), th.as_tensor(data[:, 9:], dtype=th.float32)
 
 
+@pytest.mark.parametrize("noise", [0.0, 0.1])
 @pytest.mark.parametrize("seed", [1, 2, 3])
-def test_a_cue_among_names_keeps_its_size(seed):
-    """Lamp and names stay the same within an episode, and without all five of them the others tell better what is done."""
+def test_what_may_be_a_goal_keeps_its_size_though_the_neighbours_tell_better_without_it(noise, seed):
+    """FetchPush was learned by clones that did not see the goal; here it is the lamp."""
     features, actions = sorting(seed)
+    features[:, 4:] += noise * th.as_tensor(np.random.default_rng(seed).normal(size=(len(features), 5)), dtype=th.float32)
     share = share_within(features, EPISODES)
     errors = [error_of_neighbours(features * weights, actions, EPISODES) for weights in (th.ones_like(share), share)]
-    assert share[4:].max() < 1e-3 and errors[1] < 0.9 * errors[0]
-    weights, others = feature_weights(features, actions, EPISODES), [0, 1, 2, 3, 5, 6, 7, 8]
-    assert weights[4] == 1.0
-    assert weights[others].tolist() == share[others].tolist()
+    assert share[4:].max() < CONTEXT and errors[1] < 0.9 * errors[0]
+    assert feature_weights(features, actions, EPISODES)[4:].tolist() == [1.0] * 5
 
 
 def test_a_small_gain_changes_nothing(monkeypatch):
     """So it is with gaits, which are the same in every episode: what was measured of them stays as it was."""
     position, own = steps()
-    features, actions = th.stack([position, own], dim=1), (2.0 * position).tanh()[:, None]
+    features, actions = th.stack([position, nearly(own)], dim=1), (2.0 * position).tanh()[:, None]
     assert feature_weights(features, actions, EPISODES)[1] < 1.0
     monkeypatch.setattr(within_episodes, "SMALLEST_GAIN", 1.0)
     assert feature_weights(features, actions, EPISODES).tolist() == [1.0, 1.0]
 
 
-@pytest.mark.parametrize("number", [1, 2])
-def test_few_episodes_say_nothing(number):
-    """One has no others to be asked; of two each asks the other, however far that is."""
-    rows = slice(0, number * LENGTH)
+def test_one_episode_says_nothing():
+    """It has no others to be asked."""
+    rows = slice(0, LENGTH)
     position, own = (one[rows] for one in steps())
-    features, actions = th.stack([position, own], dim=1), (2.0 * position).tanh()[:, None]
+    features, actions = th.stack([position, nearly(own)], dim=1), (2.0 * position).tanh()[:, None]
     assert feature_weights(features, actions, EPISODES[rows]).tolist() == [1.0, 1.0]
 
 
@@ -128,16 +124,16 @@ def test_of_many_steps_some_are_asked(monkeypatch):
     monkeypatch.setattr(within_episodes, "MOST_ASKED", 30)
     monkeypatch.setattr(within_episodes, "MOST_ANSWERING", 150)
     position, own = steps()
-    weights = feature_weights(th.stack([position, own], dim=1), (2.0 * position).tanh()[:, None], EPISODES)
-    assert asked == [(30, 150)] * 3 and weights[1] < 0.05  # as they are, all by their share, and the name at its size
+    weights = feature_weights(th.stack([position, nearly(own)], dim=1), (2.0 * position).tanh()[:, None], EPISODES)
+    assert asked == [(30, 150)] * 2 and weights[1] < 1.0
 
 
 def named(n_episodes=6, length=30):
-    """Demonstrations whose third observation is the episode's own, and whose actions follow the first."""
+    """Demonstrations whose third observation is nearly the episode's own, and whose actions follow the first."""
     data = demonstrations(n_episodes=n_episodes, length=length)
     generator = np.random.default_rng(3)
     observations = generator.uniform(-1.0, 1.0, size=data.observations.shape).astype(np.float32)
-    observations[:, 2] = np.repeat(np.arange(n_episodes), length)
+    observations[:, 2] = np.repeat(np.arange(n_episodes), length) + 0.5 * observations[:, 2]
     actions = np.repeat(np.tanh(observations[:, :1]), data.actions.shape[1], axis=1).astype(np.float32)
     return dataclasses.replace(data, observations=observations, actions=actions)
 
@@ -152,7 +148,7 @@ def test_the_agent_takes_them_smaller_unless_told_not_to():
     std = data.observations.std(0)
     assert scales["demonstrations"].tolist() == pytest.approx((1.0 / std).tolist(), rel=1e-5)
     assert th.equal(scales[None], scales["episodes"])
-    assert (scales[None] * std)[2] < 1e-3 and ((scales[None] * std)[:2] > 0.9).all()
+    assert CONTEXT < (scales[None] * std)[2] < 0.25 and ((scales[None] * std)[:2] > 0.9).all()
 
 
 @pytest.mark.parametrize(
