@@ -45,7 +45,7 @@ def success(model: ActPC) -> float:
 
 shown = Demonstrations.record(pick_and_place, ENV_ID, n_episodes=N_EPISODES, seed=1000)
 print(shown)
-model = ActPC("MultiInputPolicy", ENV_ID, demonstrations=shown, gamma=0.95, seed=SEED, verbose=1)
+model = ActPC("MultiInputPolicy", ENV_ID, demonstrations=shown, gamma=0.95, seed=SEED)
 model.learn(1)
 print(f"success of the first clone: {success(model):.2f}")
 for _ in range(4):

@@ -41,10 +41,13 @@ def run(args: argparse.Namespace) -> int:
     from sb3_actpc.experiments.comparison.plan import OWN_KEYS, read_comparison_file, with_options
     from sb3_actpc.experiments.comparison.schedule import run_comparison
     from sb3_actpc.experiments.runs import Run
+    from sb3_actpc.experiments.runs.presets import missing_demonstrations
 
     from_file = {} if args.file is None else read_comparison_file(Path(args.file))
     comparison = read_comparison(with_options(from_file, given(args, (*OWN_KEYS, *Run.known_keys()))))
     runs, folder = plan_runs(comparison), Path(comparison.output)
+    for missing in dict.fromkeys(filter(None, map(missing_demonstrations, runs))):
+        print(missing)
     if args.dry_run:
         print(describe_runs(runs))
         return 0

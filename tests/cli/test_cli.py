@@ -87,6 +87,14 @@ def test_a_run_says_when_nothing_is_shipped_for_its_environment(
     assert ("Pendulum-v1: no demonstrations are shipped for it" in capsys.readouterr().out) == is_said
 
 
+def test_a_comparison_says_so_too_of_algorithms_that_would_imitate(capsys: pytest.CaptureFixture[str]) -> None:
+    tasks = ("--envs", "Pendulum-v1", "SparseHopper-v5", "--seeds", "2", "--dry-run")
+    assert main(["compare", "--algos", "actpc", "refresh_alone", *tasks]) == 0
+    assert capsys.readouterr().out.count("no demonstrations are shipped") == 1
+    assert main(["compare", "--algos", "ppo", *tasks]) == 0
+    assert "no demonstrations" not in capsys.readouterr().out
+
+
 def test_evaluations_are_of_the_dense_task_from_step_zero_to_the_last() -> None:
     assert train("--demonstrations", "none", "--eval-freq", "25") == 0
     rows = rows_of(RUN)

@@ -228,6 +228,14 @@ def find_demonstrations(env_id: str, choice: str) -> Path | str | None:
     return shipped_demonstrations(env_id) if env_id.rpartition(":")[2].startswith("Sparse") else None
 
 
+def missing_demonstrations(run: Run) -> str:
+    """A sentence where the algorithm would take shipped demonstrations and the task has none, else an empty string."""
+    takes_some = "demonstrations" in constructor_keywords(load_algorithm(run.algo))
+    if run.demonstrations != "shipped" or not takes_some or find_demonstrations(run.env, run.demonstrations) is not None:
+        return ""
+    return f"{run.env}: no demonstrations are shipped for it, so there are none (--demonstrations FILE gives some)"
+
+
 def demonstrations_hash(run: Run) -> str | None:
     """SHA-256 of what a run's demonstrations hold, None for none; FileNotFoundError when they are not there."""
     found = find_demonstrations(run.env, run.demonstrations)

@@ -27,6 +27,7 @@ from sb3_actpc.experiments.runs.presets import (
     demonstrations_hash,
     find_demonstrations,
     fitting_policy,
+    missing_demonstrations,
     resolve,
 )
 from sb3_actpc.experiments.runs.provenance import git_state, package_versions
@@ -177,10 +178,9 @@ def _train(
     if not resumes:
         commit, dirty = git_state()
         policy = fitting_policy(run.policy or "MlpPolicy", model.observation_space)
-        source = find_demonstrations(run.env, run.demonstrations)
-        if source is None and run.demonstrations == "shipped" and hasattr(model, "demonstrations"):
-            report(f"{run.env}: no demonstrations are shipped for it, so there are none (--demonstrations FILE gives some)")
-        reference = demonstrators_return(source)
+        if missing := missing_demonstrations(run):
+            report(missing)
+        reference = demonstrators_return(find_demonstrations(run.env, run.demonstrations))
         filled = {"policy": policy, "demonstrators_return": reference, "versions": package_versions()}
         run = run.model_copy(update={**filled, "git_commit": commit, "dirty": dirty})
     (folder / RESULT).unlink(missing_ok=True)  # of a finished run that gets more steps, as the settings then say
