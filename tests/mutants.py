@@ -851,8 +851,8 @@ MUTANTS = [
     Mutant(
         "what names the episode is small anyhow",
         WITHIN,
-        "return weights if after < (1.0 - SMALLEST_GAIN) * before else as_it_is",
-        "return weights",
+        "        return as_it_is\n    for",
+        "        pass\n    for",
         WITHINS,
     ),
     Mutant("noise whatever is held out", IMITATED, "between <= MOST_BLUR * without", "True", HELD_OUTS),
@@ -887,8 +887,10 @@ MUTANTS = [
         "self.starts[rows]",
         HELD_OUTS,
     ),
-    Mutant("a goal is taken smaller", WITHIN, "share < CONTEXT", "share < 0.0", f"{WITHINS} -k goal"),
-    Mutant("a goal seen with noise is taken smaller", WITHIN, "share < CONTEXT", "share < 1e-6", f"{WITHINS} -k goal"),
+    Mutant("a goal is taken smaller", WITHIN, "weights < CONTEXT", "weights < 0.0", f"{WITHINS} -k never_changes"),
+    Mutant("whatever is small keeps its size", WITHIN, "weights < CONTEXT", "weights < 0.5", f"{WITHINS} -k cue"),
+    Mutant("no feature is asked for on its own", WITHIN, "< SMALL_SHARE", "< 0.0", f"{WITHINS} -k cue"),
+    Mutant("any need will do", WITHIN, "(1.0 - SMALLEST_NEED) * ", "2.0 * ", f"{WITHINS} -k cue"),
     Mutant("every so manieth step", ROOM, "np.linspace(0, n - 1, min(n, most))", "np.arange(0, n, -(-n // most))", ROOMS),
     Mutant("neighbours of the step's own episode", ROOM, "np.where(own, -1, part.neighbours)", "part.neighbours", ROOMS),
     Mutant("change is absolute", POLICIES, "SMALLEST_CHANGE * features.abs().amax(0)", "1e-4 + 0.0 * features[0]", STRANGERS),
@@ -914,7 +916,7 @@ MUTANTS = [
     Mutant(
         "loaded synapses aside", CIRCUIT, "    circuit._list_synapses()", "    pass", "tests/ngc/test_settling.py -k loaded"
     ),
-    Mutant("any gain will do", WITHIN, "after < (1.0 - SMALLEST_GAIN) * before", "after < before", f"{WITHINS} -k small_gain"),
+    Mutant("any gain will do", WITHIN, "(1.0 - SMALLEST_GAIN) * ", "", f"{WITHINS} -k small_gain"),
     Mutant("absent neighbours answer", WITHIN, " * known)", ")", f"{WITHINS} -k each_step"),
     Mutant("episodes count alike", WITHIN, ".square().mean(0), features", ".square().mean(0) * 0.9, features", WITHINS),
     Mutant("the share of the variance", WITHIN, "(within / total).sqrt()", "(within / total)", WITHINS),

@@ -3,8 +3,9 @@
 With ten demonstrations whatever changes little throughout each of them, as how a can was turned when it was put there, names
 the episode, and whoever imitates them may go by that name. Features that vary less within episodes than between them (by the
 intraclass correlation) are taken smaller, where the nearest steps of other episodes then tell better what is done at each
-step. A goal stays the same, and that test does not see that it is needed: velocities tell what is done as well, until one has
-to act without the demonstrator. So what stays the same, or nearly, keeps its size whatever it is.
+step. That is asked of all of them together, and of each that would hardly be left. A goal stays the same, and such a test does
+not see that it is needed: velocities tell what is done as well, until one has to act without the demonstrator. So what never
+changes within an episode keeps its size whatever it is.
 """
 
 import numpy as np
@@ -12,8 +13,10 @@ import torch as th
 
 from sb3_actpc.actpc.room import N_NEIGHBOURS, evenly, nearest_steps
 
-SMALLEST_GAIN = 0.05  # of the squared error, of taking features smaller: where it is less they stay as they are
-CONTEXT = 0.15  # share of deviation within episodes below which a feature may be a goal, seen with some noise
+# of the squared error: of taking features smaller, where it is less they stay as they are; and of one that keeps its size
+SMALLEST_GAIN, SMALLEST_NEED = 0.05, 0.1
+SMALL_SHARE = 0.5  # of a feature that is asked for on its own
+CONTEXT = 1e-4  # a share below which there is rounding alone: the feature never changes within an episode, and may be a goal
 MOST_ASKED, MOST_ANSWERING = 1000, 4000  # steps
 
 
@@ -24,15 +27,27 @@ def feature_weights(features: th.Tensor, actions: th.Tensor, episodes: np.ndarra
     :param features: (N, n_features) of demonstrated steps, normalised
     :param actions: (N, A) shown there
     :param episodes: (N,) numbers of their episodes
-    :return: (n_features,), in [0, 1]; 1 for all where that tells as well what is done, and for what may be a goal
+    :return: (n_features,), in [0, 1]; 1 for all where that tells as well what is done, for each that is needed, and for what
+        may be a goal
     """
-    share = share_within(features, episodes)
-    as_it_is = th.ones_like(share)
+    weights = share_within(features, episodes)
+    as_it_is = th.ones_like(weights)
+    weights = th.where(weights < CONTEXT, as_it_is, weights)
     if len(np.unique(episodes)) < 2:
         return as_it_is
-    weights = th.where(share < CONTEXT, as_it_is, share)
-    before, after = (error_of_neighbours(features * one, actions, episodes) for one in (as_it_is, weights))
-    return weights if after < (1.0 - SMALLEST_GAIN) * before else as_it_is
+
+    def error(of_weights: th.Tensor) -> float:
+        return error_of_neighbours(features * of_weights, actions, episodes)
+
+    smallest = error(weights)
+    if smallest >= (1.0 - SMALLEST_GAIN) * error(as_it_is):
+        return as_it_is
+    for feature in weights.argsort().tolist():
+        if weights[feature] < SMALL_SHARE:
+            needed = weights.index_fill(0, th.tensor(feature, device=weights.device), 1.0)
+            if (with_it := error(needed)) < (1.0 - SMALLEST_NEED) * smallest:
+                weights, smallest = needed, with_it
+    return weights
 
 
 def error_of_neighbours(features: th.Tensor, actions: th.Tensor, episodes: np.ndarray) -> float:

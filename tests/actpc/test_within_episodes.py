@@ -74,16 +74,26 @@ def sorting(seed):
     return th.as_tensor(features, dtype=th.float32), th.as_tensor(data[:, 9:], dtype=th.float32)
 
 
-@pytest.mark.parametrize("noise", [0.0, 0.1])
 @pytest.mark.parametrize("seed", [1, 2, 3])
-def test_what_may_be_a_goal_keeps_its_size_though_the_neighbours_tell_better_without_it(noise, seed):
-    """FetchPush was learned by clones that did not see the goal; here it is the lamp."""
+def test_what_never_changes_keeps_its_size_though_the_neighbours_tell_better_without_it(seed):
+    """It may be a goal: FetchPush was learned by clones that did not see theirs. Here it is the lamp."""
     features, actions = sorting(seed)
-    features[:, 4:] += noise * th.as_tensor(np.random.default_rng(seed).normal(size=(len(features), 5)), dtype=th.float32)
     share = share_within(features, EPISODES)
     errors = [error_of_neighbours(features * weights, actions, EPISODES) for weights in (th.ones_like(share), share)]
-    assert share[4:].max() < CONTEXT and errors[1] < 0.9 * errors[0]
+    assert share[4:].max() < 0.1 * CONTEXT and errors[1] < 0.9 * errors[0]  # rounding, far from either side
     assert feature_weights(features, actions, EPISODES)[4:].tolist() == [1.0] * 5
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_cue_among_names_that_all_change_a_little_keeps_its_size(seed):
+    """Without all five of them the others tell better what is done, and better still with the lamp."""
+    features, actions = sorting(seed)
+    features[:, 4:] += 0.01 * th.as_tensor(np.random.default_rng(seed).normal(size=(len(features), 5)), dtype=th.float32)
+    share = share_within(features, EPISODES)
+    weights, others = feature_weights(features, actions, EPISODES), [0, 1, 2, 3, 5, 6, 7, 8]
+    assert 10.0 * CONTEXT < share[4:].min() and share[4:].max() < 0.02
+    assert weights[4] == 1.0
+    assert weights[others].tolist() == share[others].tolist()
 
 
 def test_a_small_gain_changes_nothing(monkeypatch):
@@ -125,7 +135,7 @@ def test_of_many_steps_some_are_asked(monkeypatch):
     monkeypatch.setattr(within_episodes, "MOST_ANSWERING", 150)
     position, own = steps()
     weights = feature_weights(th.stack([position, nearly(own)], dim=1), (2.0 * position).tanh()[:, None], EPISODES)
-    assert asked == [(30, 150)] * 2 and weights[1] < 1.0
+    assert asked == [(30, 150)] * 3 and weights[1] < 1.0  # as they are, by their shares, and the name at its size
 
 
 def named(n_episodes=6, length=30):
