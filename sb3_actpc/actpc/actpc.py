@@ -1077,7 +1077,7 @@ class ActPC(OffPolicyAlgorithm):
         """
         As in SB3, which unpickles: load files that you trust.
 
-        :raises ValueError: for a file of a version whose classes are not here
+        :raises ValueError: for a file of a version whose classes are not here, or of another algorithm
         """
         of_another_version = f"{path} is of another version of sb3_actpc ({{}}): load it with that one"
         try:
@@ -1086,6 +1086,10 @@ class ActPC(OffPolicyAlgorithm):
             if not (error.name or "").startswith("sb3_actpc"):
                 raise
             raise ValueError(of_another_version.format(error)) from error
+        except ValueError as error:
+            if not str(error).startswith("policy="):
+                raise
+            raise ValueError(f"{path} holds no ActPC: load it with the class that saved it ({error})") from error
         except RuntimeError as error:
             if "in state_dict" not in str(error):
                 raise

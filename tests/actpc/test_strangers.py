@@ -251,3 +251,9 @@ def test_buffers_of_others_are_refused(tmp_path):
     model.save_replay_buffer(tmp_path / "own")
     model.load_replay_buffer(tmp_path / "own")
     assert model.replay_buffer is not mine and model.replay_buffer.pos == 12
+
+
+def test_a_file_of_another_algorithm_is_refused(tmp_path):
+    TD3("MlpPolicy", "Pendulum-v1", policy_kwargs={"net_arch": [4]}, buffer_size=10).save(tmp_path / "td3")
+    with pytest.raises(ValueError, match=r"td3 holds no ActPC: load it with the class that saved it .policy=<class"):
+        ActPC.load(tmp_path / "td3")
