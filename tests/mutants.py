@@ -53,12 +53,12 @@ class Mutant(NamedTuple):
 CIRCUIT, DYNAMICS, PLASTICITY = "ngc/circuit.py", "ngc/dynamics.py", "ngc/plasticity.py"
 AGENT, POLICIES, FEATURES = (f"actpc/{name}.py" for name in ("actpc", "policies", "features"))
 SIGNALS, SHOWN = "actpc/reward_signals.py", "actpc/demonstration_replay.py"
-BUFFERS, IMITATION = "actpc/buffers.py", "actpc/self_imitation.py"
+BUFFERS, SELF_IMITATION = "actpc/buffers.py", "actpc/self_imitation.py"
 SIMULATORS, RESUMES = "checkpoints/simulators.py", "tests/checkpoints/test_exact_resume.py"
 ENCODING, HELD = "checkpoints/encoding.py", "tests/checkpoints/test_environments.py"
 CLONING, CLONES = "actpc/cloning.py", "tests/actpc/test_cloning.py"
 ROOM, ROOMS = "actpc/room.py", "tests/actpc/test_room.py"
-IMITATED = "actpc/imitation.py"
+IMITATION = "actpc/imitation.py"
 WITHIN, WITHINS = "actpc/within_episodes.py", "tests/actpc/test_within_episodes.py"
 STRANGERS = "tests/actpc/test_strangers.py"
 HELD_OUT, HELD_OUTS = "actpc/held_out.py", "tests/actpc/test_held_out.py"
@@ -322,7 +322,7 @@ MUTANTS = [
     ),
     Mutant(
         "refresh never draws the agent's own episodes",
-        IMITATED,
+        IMITATION,
         "else [agent.expert.episodes, *own]",
         "else [agent.expert.episodes]",
         f"{LEARNS} -k 'refresh or own or imitat'",
@@ -682,7 +682,7 @@ MUTANTS = [
     ),
     Mutant(
         "what is imitated is paid alike",
-        IMITATION,
+        SELF_IMITATION,
         "if is_by_return(parts, weighting) else None",
         "if False else None",
         f"{HABIT} -k paid_as",
@@ -716,11 +716,13 @@ MUTANTS = [
         f"{HABIT} -k another_habit",
     ),
     Mutant("own episodes keep old neighbours", AGENT, "memory.episodes.neighbours = None", "pass", f"{HABIT} -k anew"),
-    Mutant("a given noise is ignored", IMITATED, "return float(asked_for) if", "return 1.0 if", f"{ROOMS} -k without_a_word"),
-    Mutant("clones imitate without noise", IMITATED, "self.sample(n, noise),", "self.sample(n),", f"{HABIT} -k noise"),
+    Mutant("a given noise is ignored", IMITATION, "return float(asked_for) if", "return 1.0 if", f"{ROOMS} -k without_a_word"),
+    Mutant(
+        "clones imitate without noise", IMITATION, "now.sample(n, now.noise_of(number))", "now.sample(n)", f"{HABIT} -k noise"
+    ),
     Mutant(
         "the learning actor is blurred",
-        IMITATED,
+        IMITATION,
         "n: int, noise: float = 0.0, parts",
         "n: int, noise: float = 0.5, parts",
         HABIT,
@@ -731,7 +733,7 @@ MUTANTS = [
     Mutant("clones keep their circuit's decay", CLONING, "memory)), self.weight_decay)", "memory)))", f"{CLONES} -k decay"),
     Mutant(
         "clones decay everywhere",
-        IMITATED,
+        IMITATION,
         "return ROOM_DECAY if self.guesses or",
         "return ROOM_DECAY if True or",
         f"{ROOMS} -k smaller_synapses",
@@ -855,21 +857,25 @@ MUTANTS = [
         "        pass\n    for",
         WITHINS,
     ),
-    Mutant("noise whatever is held out", IMITATED, "between <= MOST_BLUR * without", "True", HELD_OUTS),
-    Mutant("no noise where it costs anything", IMITATED, "between <= MOST_BLUR * without", "between <= without", HELD_OUTS),
-    Mutant("asked at every step", IMITATED, "if self._noise_helps is None:", "if True:", f"{HELD_OUTS} -k imitate_between"),
-    Mutant("all clones imitate one way", IMITATED, "is_open and number % 2", "False", f"{HELD_OUTS} -k other_way"),
+    Mutant("noise whatever is held out", IMITATION, "between <= MOST_BLUR * without", "True", HELD_OUTS),
+    Mutant("no noise where it costs anything", IMITATION, "between <= MOST_BLUR * without", "between <= without", HELD_OUTS),
+    Mutant("asked at every step", IMITATION, "if self._noise_helps is None:", "if True:", f"{HELD_OUTS} -k imitate_between"),
+    Mutant("all clones imitate one way", IMITATION, "is_open and number % 2", "False", f"{HELD_OUTS} -k other_way"),
     Mutant(
         "the other way where asked for",
-        IMITATED,
-        "refresh.noise is None and self.guesses",
-        "guesses",
+        IMITATION,
+        "self.agent.refresh.noise is None and self.guesses",
+        "self.guesses",
         f"{HELD_OUTS} -k other_way",
     ),
-    Mutant("the other way without room", IMITATED, " and self.guesses\n", "\n", f"{HELD_OUTS} -k other_way"),
-    Mutant(
-        "clones are not counted", AGENT, "self.refresh.n_clones - 1 - self.trials.n_clones", "0", f"{HELD_OUTS} -k in_turn"
-    ),
+    Mutant("the other way without room", IMITATION, " and self.guesses\n", "\n", f"{HELD_OUTS} -k other_way"),
+    Mutant("clones are not counted", TRIALS, "self.n_tried + self.is_clone", "self.n_tried", f"{HELD_OUTS} -k in_turn"),
+    Mutant("a clone that was not made counts", AGENT, "self.trials.n_clones + 1, self.trials.n_tried - 1", "0, 0", HELD_OUTS),
+    Mutant("an answer that was not given", IMITATION, "self._noise_helps = helps", "self._noise_helps = True", HELD_OUTS),
+    Mutant("the answer is not in a checkpoint", IMITATION, "self._noise_helps = state", "pass", f"{HELD_OUTS} -k checkpoint"),
+    Mutant("asked before VecNormalize knows", IMITATION, " if number else None", "", f"{HELD_OUTS} -k vec_normalize"),
+    Mutant("clones of the old demonstrations", IMITATION, "now = agent.imitation", "now = self", f"{HELD_OUTS} -k replaced"),
+    Mutant("means lose their digits", WITHIN, "features.double()", "features", f"{WITHINS} -k long"),
     Mutant("held out and shown too", HELD_OUT, "shown.select(~is_held)", "shown", HELD_OUTS),
     Mutant("the mean error", HELD_OUT, ".mean(1).median()", ".mean(1).mean()", f"{HELD_OUTS} -k typical"),
     Mutant(
@@ -879,10 +885,10 @@ MUTANTS = [
         "            pass",
         HELD_OUTS,
     ),
-    Mutant("asked with the decay of none", IMITATED, "weight_decay=self.decay", "weight_decay=None", HELD_OUTS),
+    Mutant("asked with the decay of none", IMITATION, "weight_decay=self.decay", "weight_decay=None", HELD_OUTS),
     Mutant(
         "episodes begin where they began",
-        IMITATION,
+        SELF_IMITATION,
         "np.searchsorted(rows, self.starts[rows])",
         "self.starts[rows]",
         HELD_OUTS,
@@ -918,13 +924,13 @@ MUTANTS = [
     ),
     Mutant("any gain will do", WITHIN, "(1.0 - SMALLEST_GAIN) * ", "", f"{WITHINS} -k small_gain"),
     Mutant("absent neighbours answer", WITHIN, " * known)", ")", f"{WITHINS} -k each_step"),
-    Mutant("episodes count alike", WITHIN, ".square().mean(0), features", ".square().mean(0) * 0.9, features", WITHINS),
+    Mutant("episodes count alike", WITHIN, ".square().mean(0), exact", ".square().mean(0) * 0.9, exact", WITHINS),
     Mutant("the share of the variance", WITHIN, "(within / total).sqrt()", "(within / total)", WITHINS),
     Mutant("weights take the scales' place", POLICIES, "self.scale.mul_(weights)", "self.scale.copy_(weights)", WITHINS),
     Mutant(
         "features are weighed by default alone", AGENT, 'if self.observation_normalization == "episodes"', "if True", WITHINS
     ),
-    Mutant("noise where there is no room", IMITATED, " and self.room.is_wide", "", f"{ROOMS} -k without_a_word"),
+    Mutant("noise where there is no room", IMITATION, " and self.room.is_wide", "", f"{ROOMS} -k without_a_word"),
     Mutant("room in any unit", ROOM, "> self.step", "> 0.5", f"{ROOMS} -k without_a_word"),
     Mutant("noise of one size", ROOM, "size * way.abs() * th.randn_like(features)", "size * th.randn_like(features)", ROOMS),
     Mutant("noise as wide as the room", ROOM, "nan_to_num(0.0).clamp_max(1.0)", "nan_to_num(0.0).clamp(1.0, 1.0)", ROOMS),
@@ -1036,7 +1042,7 @@ MUTANTS = [
     ),
     Mutant(
         "the room stays as VecNormalize began",
-        IMITATED,
+        IMITATION,
         "            self._room = None",
         "            pass",
         f"{LEARNS} -k anew",
@@ -1265,7 +1271,7 @@ MUTANTS = [
     ),
     Mutant(
         "an equally good episode does not enter",
-        IMITATION,
+        SELF_IMITATION,
         "or episode_return >= self.best_return",
         "or episode_return > self.best_return",
         f"{STORES} -k enters",
@@ -1284,10 +1290,10 @@ MUTANTS = [
         "else self.quiet_due[env]",
         f"{HABIT} -k as_many_steps",
     ),
-    Mutant("own episodes below the best stay out", IMITATION, "self.takes_all or ", "", f"{STORES} -k enters"),
+    Mutant("own episodes below the best stay out", SELF_IMITATION, "self.takes_all or ", "", f"{STORES} -k enters"),
     Mutant(
         "own episodes count for nothing",
-        IMITATED,
+        IMITATION,
         "imitated_return(self.parts(), ",
         "imitated_return(self.parts()[:1], ",
         f"{HABIT} -k own_episodes_too",
@@ -1299,28 +1305,32 @@ MUTANTS = [
         "memory.takes_all = is_weighted or",
         f"{HABIT} -k every_paid",
     ),
-    Mutant("refresh squares returns", IMITATION, "** RETURN_EXPONENT", "** 2", f"{STORES} -k paid"),
-    Mutant("lost returns weigh", IMITATION, "np.maximum(self.returns, 0.0)", "np.abs(self.returns)", f"{STORES} -k paid"),
+    Mutant("refresh squares returns", SELF_IMITATION, "** RETURN_EXPONENT", "** 2", f"{STORES} -k paid"),
+    Mutant("lost returns weigh", SELF_IMITATION, "np.maximum(self.returns, 0.0)", "np.abs(self.returns)", f"{STORES} -k paid"),
     Mutant(
         "refresh ignores what was paid",
-        IMITATED,
+        IMITATION,
         "n, agent.memory_history, agent.refresh.weighting)",
         "n, agent.memory_history)",
         f"{LEARNS} -k paid",
     ),
     Mutant(
-        "an unpaid episode enters", IMITATION, "episode_return > 0.0 and", "episode_return >= 0.0 and", f"{STORES} -k enters"
+        "an unpaid episode enters",
+        SELF_IMITATION,
+        "episode_return > 0.0 and",
+        "episode_return >= 0.0 and",
+        f"{STORES} -k enters",
     ),
     Mutant(
         "imitation forgets an episode's first step",
-        IMITATION,
+        SELF_IMITATION,
         "(earlier >= self.starts[indices][:, None])",
         "(earlier > self.starts[indices][:, None])",
         f"{STORES} -k history",
     ),
     Mutant(
         "only the first part of the union is drawn",
-        IMITATION,
+        SELF_IMITATION,
         "np.random.randint(0, ends[-1], size=n)",
         "np.random.randint(0, ends[0], size=n)",
         f"{STORES} -k union",

@@ -161,8 +161,8 @@ class ActPC(OffPolicyAlgorithm):
         as in DQN are ``tau=1, target_update_interval=C``
     :param observation_normalization: "none" (the paper), "demonstrations" (their mean and standard deviation, fixed),
         "episodes" (the same, and what varies less within episodes than between them is taken smaller where the demonstrations
-        then tell better what is done: :mod:`sb3_actpc.actpc.within_episodes`) or "bounds" (those of the observation space,
-        which must be finite, become -1 and 1)
+        then tell better what is done, but for what never changes within one: :mod:`sb3_actpc.actpc.within_episodes`) or
+        "bounds" (those of the observation space, which must be finite, become -1 and 1)
     :param compile: run the updates of circuits that sweep, or settle by eq. 1, as one graph of ``torch.compile`` (see
         :mod:`~sb3_actpc.actpc.compiled`): True, False or "auto", where the run is long enough to earn it
     :param policy_kwargs: keywords of :class:`~sb3_actpc.actpc.policies.ActPCPolicy`: ``net_arch``, ``n_critics``, ``habit``,
@@ -814,16 +814,16 @@ class ActPC(OffPolicyAlgorithm):
         if not self.trials.is_clone:
             _copy(self.policy.actor_average, self.policy.candidate)
             return
-        number = self.refresh.n_clones - 1 - self.trials.n_clones
-        if self.verbose:
-            paid, imitated = self.trials.habit_return, self.trials.imitated_return
-            how = f"noise of {self.imitation.noise_of(number):g} of a step's length"
-            print(f"another clone is tried ({how}): the habit is paid {paid:.4g}, what it imitates {imitated:.4g}")
-        cloning = self.imitation.clone_into(self.policy.make_actor(), number)
         try:
+            cloning = self.imitation.clone_into(self.policy.make_actor(), self.trials.n_tried)
+            if self.verbose:
+                paid, imitated = self.trials.habit_return, self.trials.imitated_return
+                how = f"noise of {self.imitation.noise_of(self.trials.n_tried):g} of a step's length"
+                print(f"another clone is tried ({how}): the habit is paid {paid:.4g}, what it imitates {imitated:.4g}")
             for update in tqdm(range(len(cloning)), "another clone", disable=not self._has_bar, leave=False):
                 cloning.update(update)
-        except BaseException:  # Ctrl-C: nobody is on trial then, and every environment begins anew
+        except BaseException:  # Ctrl-C: nobody is on trial then, nor was, and every environment begins anew
+            self.trials.n_clones, self.trials.n_tried = self.trials.n_clones + 1, self.trials.n_tried - 1
             self.trials, self._last_obs = self.trials.forgotten(self.n_envs), None
             raise
         _copy(cloning.clone, self.policy.candidate)
@@ -1123,6 +1123,7 @@ class ActPC(OffPolicyAlgorithm):
             "expert_signals": None if expert is None else [expert.epistemic, expert.instrumental, expert.has_signals],
             "diagnostics": dict(self.diagnostics.values),
             "trials": None if self.trials is None else self.trials.checkpoint_state(),
+            "imitation": self.imitation.checkpoint_state(),
         }
 
     def restore_checkpoint_state(self, state: dict[str, Any]) -> None:
@@ -1148,6 +1149,7 @@ class ActPC(OffPolicyAlgorithm):
         self.signals.restore_checkpoint_state(state["signals"])
         self.diagnostics.values = dict(state["diagnostics"])
         self.trials = None if state["trials"] is None else Trials(**state["trials"])
+        self.imitation.restore_checkpoint_state(state.get("imitation"))  # none in a checkpoint of before
 
     @classmethod
     def load_checkpoint(cls: type[SelfActPC], path: str | PathLike[str], env: GymEnv | str, **keywords: Any) -> Restored:

@@ -91,6 +91,7 @@ class Trials:
     habit_steps: int = 0
     imitated_return: float = 0.0  # what the imitated episodes were paid
     n_clones: int = 0  # that may still be tried
+    n_tried: int = 0  # that were
     begun_at: int = 0  # update at which learning began with the present clone
     on_trial: bool = False  # there is a candidate that is not judged yet
     is_clone: bool = False  # it is one, not the learning actor's average
@@ -118,7 +119,7 @@ class Trials:
         :param n_envs: environments
         :param goes_on: whether the running episodes do; they count for nothing
         """
-        new = Trials(n_envs, n_clones=self.n_clones, begun_at=self.begun_at)
+        new = Trials(n_envs, n_clones=self.n_clones, n_tried=self.n_tried, begun_at=self.begun_at)
         new.skipped = [env for env in range(n_envs) if goes_on and (self.lengths[env] or env in self.skipped)]
         return new
 
@@ -212,7 +213,7 @@ class Trials:
         if self.roles[env] != "candidate" or self.on_trial:
             return False
         self.on_trial, self.is_clone = True, self.needs_clone()
-        self.n_clones -= self.is_clone
+        self.n_clones, self.n_tried = self.n_clones - self.is_clone, self.n_tried + self.is_clone
         return True
 
     def _judge(self) -> Verdict | None:

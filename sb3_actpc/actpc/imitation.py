@@ -69,20 +69,19 @@ class Imitation:
         :param circuit: the actor
         :param number: 0 for the first clone, 1 for the first further one
         """
-        agent = self.agent
+        agent, n_updates = self.agent, self.agent.actor_warm_start
         if agent.expert is not None and agent.inputs.are_normalised:  # which knows more by now than when it was measured
             self._room = None
+            self._noise_helps = self._noise_helps if number else None
             for part in self.parts():
                 part.neighbours = None
-        noise = self.noise_of(number) if agent.actor_warm_start else 0.0
-        return Cloning(
-            circuit,
-            agent.policy.make_actor,
-            lambda n: self.sample(n, noise),
-            agent.actor_warm_start,
-            agent.refresh.ensemble_size,
-            self.decay if agent.actor_warm_start else None,
-        )
+
+        def sample(n: int) -> Imitated:
+            now = agent.imitation  # another one where the demonstrations were replaced meanwhile
+            return now.sample(n, now.noise_of(number))
+
+        decay = self.decay if n_updates else None
+        return Cloning(circuit, agent.policy.make_actor, sample, n_updates, agent.refresh.ensemble_size, decay)
 
     @property
     def room(self) -> Room | None:
@@ -125,14 +124,14 @@ class Imitation:
         or more. Asked once; what is drawn for it is drawn by nobody else."""
         agent = self.agent
         if self._noise_helps is None:
-            parts = split(agent.expert.episodes)
-            self._noise_helps = True
+            parts, helps = split(agent.expert.episodes), True
             if parts is not None and agent.actor_warm_start:
                 if agent.verbose:
                     print("two short clones are asked whether to imitate steps between the demonstrations")
                 with random_numbers_of_its_own(agent.device):
                     without, between = (self._error_when_held_out(noise, *parts) for noise in (0.0, 1.0))
-                self._noise_helps = between <= MOST_BLUR * without
+                helps = between <= MOST_BLUR * without
+            self._noise_helps = helps
         return self._noise_helps
 
     def _error_when_held_out(self, noise: float, shown: Episodes, held_out: Episodes) -> float:
@@ -152,14 +151,23 @@ class Imitation:
             return float(refresh.weight_decay)
         return ROOM_DECAY if self.guesses or (refresh.noise is not None and self.noise) else None
 
+    def checkpoint_state(self) -> bool | None:
+        """What was asked of the demonstrations, for a checkpoint."""
+        return self._noise_helps
+
+    def restore_checkpoint_state(self, state: bool | None) -> None:
+        """:param state: what :meth:`checkpoint_state` returned"""
+        self._noise_helps = state
+
     # ------------------------------------------------------------------ in words
 
     def describe(self) -> str:
         """What is imitated, and how clones do; two lines."""
         return (
             f"imitated: {self._describe_parts()}\n"
-            f"noise on what clones imitate: {self.noise:g} of a step's length"
+            f"noise on what the first clone imitates: {self.noise:g} of a step's length"
             f"{', and steps between the episodes' if self.noise else ''}"
+            f"{'; every other further clone the other way' if self.noise_of(1) != self.noise else ''}"
         )
 
     def _describe_parts(self) -> str:

@@ -35,8 +35,8 @@ class Refresh:
         has to become precise. 0 for neither (the paper; so it is with a single demonstration); None for 1 where the
         demonstrations leave room (the nearest step of another one is farther than a step leads, by the medians: arms and
         goals, 2 to 8 times; gaits, 0.03 to 0.7, where this only blurs what to do) and clones of some of them are then about
-        as precise on the others (:mod:`sb3_actpc.actpc.held_out`), else 0; every other further clone then imitates the other
-        way
+        as precise on the others (:mod:`sb3_actpc.actpc.held_out`), else 0. Where there is room and it is None, every other
+        further clone imitates the other way
     :param own_episodes: which of them are imitated too: "paid" (every one, as often as its return says; "best" where steps are
         not drawn by returns, or nothing is demonstrated) or "best" (those that are paid at least what the best one was: the
         paper)

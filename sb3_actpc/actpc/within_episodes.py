@@ -74,7 +74,7 @@ def share_within(features: th.Tensor, episodes: np.ndarray) -> th.Tensor:
     :return: (n_features,), in [0, 1]; 1 for a feature that never changes
     """
     numbers = th.as_tensor(np.unique(episodes, return_inverse=True)[1], device=features.device)
-    lengths = th.bincount(numbers)[:, None]
-    means = features.new_zeros(len(lengths), features.shape[1]).index_add_(0, numbers, features) / lengths
-    within, total = (features - means[numbers]).square().mean(0), features.var(0, correction=0)
-    return (within / total).sqrt().clamp_max(1.0).where(total > 1e-8, th.ones_like(total))
+    lengths, exact = th.bincount(numbers)[:, None], features.double()  # sums of long episodes would lose their digits
+    means = exact.new_zeros(len(lengths), features.shape[1]).index_add_(0, numbers, exact) / lengths
+    within, total = (exact - means[numbers]).square().mean(0), exact.var(0, correction=0)
+    return (within / total).sqrt().clamp_max(1.0).where(total > 1e-8, th.ones_like(total)).to(features.dtype)

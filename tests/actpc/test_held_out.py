@@ -1,14 +1,18 @@
 """Whether clones are to imitate steps between the demonstrations is asked of episodes that are held out."""
 
+import dataclasses
+
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_actpc import Demonstrations
 from sb3_actpc.actpc import imitation as imitation_module
 from sb3_actpc.actpc.cloning import Cloning
+from sb3_actpc.actpc.habit import Trials
 from sb3_actpc.actpc.held_out import random_numbers_of_its_own, split, typical_error
 from sb3_actpc.actpc.imitation import ROOM_DECAY, Imitation
 from sb3_actpc.actpc.self_imitation import Episodes
@@ -76,6 +80,9 @@ LENGTH = 40
 
 class Goal(gym.Env):
     observation_space, action_space = spaces.Box(-np.inf, np.inf, (6,)), spaces.Box(-1.0, 1.0, (2,))
+
+    def reset(self, **_):
+        return np.zeros(6, dtype=np.float32), {}
 
 
 def to_a_goal(n_episodes, gain=4.0):
@@ -182,12 +189,63 @@ def test_no_clone_imitates_the_other_way_where_there_is_no_room():
     assert [model.imitation.noise_of(number) for number in range(3)] == [0.0] * 3
 
 
-def test_clones_are_tried_in_turn(monkeypatch):
+def test_clones_are_tried_in_turn_whatever_their_number_is_by_then(monkeypatch):
+    """Also where it was set anew, as for a loaded agent."""
     made, original = [], Imitation.clone_into
     monkeypatch.setattr(Imitation, "clone_into", lambda *given: (made.append(given[2:]), original(*given))[1])
     model = reaching(4, refresh_kwargs={"n_clones": 4})
     model.pretrain()
-    for n_left in (2, 1, 0):
-        model.trials.n_clones, model.trials.on_trial, model.trials.is_clone = n_left, True, True
+    for n_left in (3, 5, 1):
+        model.trials = Trials(1, n_clones=n_left, n_tried=model.trials.n_tried, imitated_return=1.0, tests_habit=False)
+        assert model.trials.begin(0) and model.trials.is_clone and model.trials.n_clones == n_left - 1
         model._make_candidate()
+        assert model.trials.forgotten(1).n_tried == model.trials.n_tried
     assert made == [(), (1,), (2,), (3,)]
+
+
+def test_an_interrupted_question_is_asked_again(monkeypatch):
+    model = reaching(4)
+    monkeypatch.setattr(Imitation, "_error_when_held_out", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+    with pytest.raises(KeyboardInterrupt):
+        model.imitation.noise  # noqa: B018
+    monkeypatch.setattr(Imitation, "_error_when_held_out", lambda self, noise, *_: 9.0 if noise else 1.0)
+    assert model.imitation.noise == 0.0
+
+
+def test_a_question_that_is_interrupted_leaves_nobody_on_trial(monkeypatch):
+    model = reaching(4)
+    model.pretrain()
+    model.trials.on_trial, model.trials.is_clone, model.trials.n_clones, model.trials.n_tried = True, True, 3, 2
+    monkeypatch.setattr(Imitation, "clone_into", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+    with pytest.raises(KeyboardInterrupt):
+        model._make_candidate()
+    assert not model.trials.on_trial and (model.trials.n_clones, model.trials.n_tried) == (4, 1)
+
+
+def test_a_checkpoint_keeps_the_answer():
+    """By the time it is asked again VecNormalize may know something else."""
+    model, resumed = (reaching(4).learn(0) for _ in range(2))
+    model.imitation._noise_helps, resumed.imitation._noise_helps = False, None
+    resumed.restore_checkpoint_state(model.checkpoint_state())
+    assert resumed.imitation._noise_helps is False
+
+
+def test_what_was_answered_before_vec_normalize_knew_anything_is_asked_again(monkeypatch):
+    asked = []
+    monkeypatch.setattr(Imitation, "_error_when_held_out", lambda self, noise, *_: asked.append(noise) or 1.0)
+    model = imitating(VecNormalize(DummyVecEnv([Goal])), demonstrations=to_a_goal(4))
+    for number, n_asked in ((None, 2), (0, 4), (1, 4)):  # described, first clone, further one
+        if number is not None:
+            model.imitation.clone_into(model.policy.make_actor(), number).sample(3)
+        assert model.imitation.noise == 1.0 and len(asked) == n_asked
+
+
+def test_a_warm_start_goes_on_with_demonstrations_that_were_replaced():
+    """It was interrupted; what lies between is measured anew."""
+    model = reaching(4, refresh_kwargs={"noise": 1.0})
+    cloning = model.imitation.clone_into(model.policy.make_actor())
+    cloning.sample(20)
+    others = to_a_goal(4)
+    model.demonstrations = dataclasses.replace(others, observations=others.observations + 100.0)
+    model._follow_demonstrations()
+    assert cloning.sample(200)[0].abs().max() < 5.0

@@ -103,7 +103,7 @@ def test_without_a_word_on_it_there_is_noise_where_the_next_episode_is_farther_t
     data = parallel_lines(apart, scale)
     model = make(demonstrations=data)
     assert model.imitation.noise == noise
-    assert f"noise on what clones imitate: {noise:g} of" in model.describe()
+    assert f"noise on what the first clone imitates: {noise:g} of" in model.describe()
     assert make(demonstrations=data, refresh_kwargs={"noise": 0.3}).imitation.noise == 0.3
 
 

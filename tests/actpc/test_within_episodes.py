@@ -45,6 +45,12 @@ def nearly(own):
     return own + 0.3 * th.as_tensor(np.random.default_rng(5).normal(size=len(own)), dtype=th.float32)
 
 
+def test_a_goal_of_long_episodes_never_changes_either():
+    """Sums of 40,000 steps lose their digits."""
+    goals = th.tensor([0.123456, -1.7, 0.9, 1.1]).repeat_interleave(40_000)[:, None]
+    assert share_within(goals, np.arange(160_000) // 40_000)[0] < 0.1 * CONTEXT
+
+
 def test_what_names_the_episode_is_taken_smaller_where_it_tells_nothing_of_what_is_done():
     position, own = steps()
     features, actions = th.stack([position, nearly(own)], dim=1), (2.0 * position).tanh()[:, None]
