@@ -1086,11 +1086,32 @@ MUTANTS = [
     Mutant("the multiplier is let go", REGION, ".clamp_max_(self.largest)", "", REGIONS),
     Mutant("the multiplier goes to nothing", REGION, ".clamp_min_(MULTIPLIERS[0])", "", REGIONS),
     Mutant(
-        "where clones guess as much pressure",
-        REGION,
-        "LARGEST_UNHELD if guesses else MULTIPLIERS[1]",
-        "MULTIPLIERS[1]",
-        REGIONS,
+        "nothing was imitated, and as much pressure", REGION, "th.tensor(LARGEST_UNHELD)", "th.tensor(MULTIPLIERS[1])", REGIONS
+    ),
+    Mutant("what was imitated bounds the pressure", REGION, "self.largest.fill_(MULTIPLIERS[1])", "pass", REGIONS),
+    Mutant(
+        "a guess is as sure as what was shown", REGION, "GUESSED_UNIT) if guesses else", "GUESSED_UNIT) if False else", REGIONS
+    ),
+    Mutant(
+        "the habit teaches everywhere",
+        AGENT,
+        "self.actor_pressure and self.imitation.guesses",
+        "self.actor_pressure",
+        f"{ROOMS} -k teaches",
+    ),
+    Mutant(
+        "the habit teaches imitation alone",
+        AGENT,
+        "self.actor_pressure and self.imitation.guesses",
+        "self.imitation.guesses",
+        f"{ROOMS} -k teaches",
+    ),
+    Mutant(
+        "the learner teaches itself",
+        AGENT,
+        "taught = habit.project(",
+        "taught = self.actor.circuit.project(",
+        f"{ROOMS} -k teaches",
     ),
     Mutant("ties change nothing", REGION, '"tied": 2.0', '"tied": 1.0', REGIONS),
     Mutant("unpaid ties widen", AGENT, "verdict is not None and is_paid", "verdict is not None", f"{HABIT} -k resized"),

@@ -939,11 +939,25 @@ class ActPC(OffPolicyAlgorithm):
 
     def _update_actor(self, batch: Batch) -> None:
         """Motor-action circuit: pressure of the critic (line 19) plus refresh (line 26), in one step of the optimiser."""
-        imitated = self.imitation.sample(len(batch.features)) if self.refresh_weight and self.imitation.parts() else None
+        imitated = self._imitated(batch) if self.refresh_weight and self.imitation.parts() else None
         pressure = self.actor_pressure if self._n_updates > self.critic_warmup else 0.0
         changes = self._actor_changes(batch, imitated, self.refresh_weight, pressure or None)
         if changes is not None:
             self.actor.circuit.apply_changes(changes)
+
+    def _imitated(self, batch: Batch) -> Imitated:
+        """
+        What refresh imitates: as many steps as the batch has that are worth it. Where clones guess between the demonstrations
+        a region that is small enough for an arm's grip is soon used up by what refresh alone does elsewhere, so that no
+        pressure is left: there the habit teaches what is done in the batch's states.
+        """
+        imitated, habit = self.imitation.sample(len(batch.features)), self.actor.habit
+        if habit is None or not (self.policy.trust_region is not None and self.actor_pressure and self.imitation.guesses):
+            return imitated
+        features, actions, memory = imitated
+        taught = habit.project(batch.features, batch.memory)
+        both = None if memory is None or batch.memory is None else th.cat([memory, batch.memory])
+        return th.cat([features, batch.features]), th.cat([actions, taught]), both
 
     def _actor_changes(
         self, batch: Batch, imitated: Imitated | None, refresh_weight: Weighing, actor_pressure: Weighing | None

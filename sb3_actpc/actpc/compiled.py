@@ -84,7 +84,7 @@ class CompiledUpdate:
         """
         agent = self.agent
         # drawn in the order of the eager update
-        imitated = None if actor is None else agent.imitation.sample(len(actor.features))
+        imitated = None if actor is None else agent._imitated(actor)
         refresh, pressure = (th.tensor(float(w), device=agent.device) for w in (agent.refresh_weight, agent.actor_pressure))
         given = _Given((refresh, pressure), actor, critic, generator, imitated, agent._target_noise(critic))
         circuits = [*agent.critic, *([agent.generator] if agent.alpha_ep else [])]

@@ -11,7 +11,7 @@ from sb3_actpc.actpc.cloning import Cloning
 from sb3_actpc.actpc.imitation import ROOM_DECAY
 from sb3_actpc.actpc.room import Room, evenly, nearest_steps
 from sb3_actpc.actpc.self_imitation import Episodes
-from sb3_actpc.actpc.trust_region import SMALLEST_UNIT
+from sb3_actpc.actpc.trust_region import GUESSED_UNIT, SMALLEST_UNIT
 from tests.actpc.agents import imitating, make
 from tests.actpc.envs import demonstrations
 
@@ -141,8 +141,34 @@ def test_the_trust_region_counts_by_the_demonstrations_spread_unless_the_clone_g
     region, spread = model.policy.trust_region, model.policy.spread
     assert region.unit.tolist() == [1.0] * len(spread)
     model.pretrain()
-    expected = np.ones(len(spread)) if guesses else np.clip(spread, SMALLEST_UNIT, 1.0)
+    expected = np.full(len(spread), GUESSED_UNIT) if guesses else np.clip(spread, SMALLEST_UNIT, 1.0)
     assert region.unit.tolist() == pytest.approx(expected) and (spread < 1.0).all()
+
+
+@pytest.mark.parametrize(
+    ("apart", "keywords", "teaches"),
+    [
+        (0.12, {}, True),
+        (0.08, {}, False),
+        (0.12, {"actor_pressure": 0.0}, False),
+        (0.12, {"policy_kwargs": {"habit": False}}, False),
+        (0.12, {"policy_kwargs": {"trust_radius": 0.0}}, False),
+        (0.12, {"policy_kwargs": {"memory_history": 2}}, True),
+    ],
+)
+def test_where_clones_guess_and_a_critic_presses_the_habit_teaches_what_it_does_in_the_batchs_states(apart, keywords, teaches):
+    model = imitating(demonstrations=parallel_lines(apart), observation_normalization="none", **keywords)
+    model.learn(40)
+    habit, batch = model.actor.habit, model._sample_batch(16)
+    for weights in [] if habit is None else habit.synapses[0]:
+        weights.data.mul_(0.5)  # that it is another one
+    features, actions, memory = model._imitated(batch)
+    assert len(features) == len(actions) == (32 if teaches else 16)
+    assert (memory is None) == (not model.memory_history) and (memory is None or len(memory) == len(features))
+    if teaches:
+        assert th.equal(features[16:], batch.features)
+        assert th.equal(actions[16:], habit.project(batch.features, batch.memory))
+        assert not th.allclose(actions[16:], model.actor.circuit.project(batch.features, batch.memory))
 
 
 @pytest.mark.parametrize("lengths", [(40,), (1, 1, 1)])

@@ -8,6 +8,7 @@ import torch as th
 from sb3_actpc.actpc.trust_region import (
     DEVIATION_RATE,
     FALL,
+    GUESSED_UNIT,
     LARGEST_UNHELD,
     MULTIPLIERS,
     RADII,
@@ -62,11 +63,18 @@ def test_a_small_spread_counts_as_the_smallest_unit():
     assert float(region.deviation) == pytest.approx(DEVIATION_RATE)
 
 
-@pytest.mark.parametrize("region", [TrustRegion(1, 2), measured_by([th.inf] * 2), measured_by([0.1, 0.1], guesses=True)])
+@pytest.mark.parametrize("region", [TrustRegion(1, 2), measured_by([th.inf] * 2)])
 def test_an_unknown_spread_counts_as_one(region):
-    """Before anything is imitated, and where the clone guesses what is done between the demonstrations."""
+    """Before anything is imitated."""
     region.regulate(th.full((4, 2), 0.5), ZEROS, WORTH)
     assert float(region.deviation) == pytest.approx(0.25 * DEVIATION_RATE)
+
+
+def test_where_the_clone_guesses_its_error_where_it_was_shown_something_is_no_unit():
+    for spread in (0.1, 0.9):
+        region = measured_by([spread] * 2, guesses=True)
+        region.regulate(th.full((4, 2), GUESSED_UNIT), ZEROS, WORTH)
+        assert float(region.deviation) == pytest.approx(DEVIATION_RATE)
 
 
 def test_the_multiplier_grows_inside_falls_outside_and_rests_on_the_border():
@@ -89,11 +97,18 @@ def test_a_wider_radius_is_reached_by_an_actor_that_follows_the_pressure():
         assert float(region.multiplier) == pytest.approx(math.sqrt(radius), rel=0.01)
 
 
-@pytest.mark.parametrize(("guesses", "largest"), [(False, MULTIPLIERS[1]), (True, LARGEST_UNHELD)])
-def test_multiplier_and_radius_stay_within_bounds(guesses, largest):
-    """Where clones guess the region is too wide to hold the actor: the multiplier has a bound of its own."""
+@pytest.mark.parametrize(
+    ("make", "largest"),
+    [
+        (lambda: measured_by([1.0, 1.0]), MULTIPLIERS[1]),
+        (lambda: measured_by([1.0, 1.0], guesses=True), MULTIPLIERS[1]),
+        (lambda: TrustRegion(1, 2), LARGEST_UNHELD),
+    ],
+)
+def test_multiplier_and_radius_stay_within_bounds(make, largest):
+    """Where nothing was imitated the region is too wide to hold the actor: the multiplier has a bound of its own."""
     for verdict, actions, radius, multiplier in (("tied", ZEROS, 1, largest), ("rejected", ZEROS + 1e6, 0, MULTIPLIERS[0])):
-        region = measured_by([1.0, 1.0], guesses)
+        region = make()
         for _ in range(3000):
             region.regulate(actions, ZEROS, WORTH)
             region.resize(verdict)
