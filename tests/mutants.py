@@ -1086,26 +1086,20 @@ MUTANTS = [
     Mutant("the multiplier is let go", REGION, ".clamp_max_(self.largest)", "", REGIONS),
     Mutant("the multiplier goes to nothing", REGION, ".clamp_min_(MULTIPLIERS[0])", "", REGIONS),
     Mutant(
-        "nothing was imitated, and as much pressure", REGION, "th.tensor(LARGEST_UNHELD)", "th.tensor(MULTIPLIERS[1])", REGIONS
+        "where clones guess as much pressure",
+        REGION,
+        "LARGEST_UNHELD if guesses and not is_held else MULTIPLIERS[1]",
+        "MULTIPLIERS[1]",
+        REGIONS,
     ),
-    Mutant("what was imitated bounds the pressure", REGION, "self.largest.fill_(MULTIPLIERS[1])", "pass", REGIONS),
+    Mutant("the habit holds, and the pressure is bounded", REGION, " and not is_held else", " else", REGIONS),
+    Mutant("a learner that is held has all the room", REGION, "HELD_UNIT if is_held else 1.0", "1.0", REGIONS),
     Mutant(
-        "a guess is as sure as what was shown", REGION, "GUESSED_UNIT) if guesses else", "GUESSED_UNIT) if False else", REGIONS
+        "the habit holds everywhere", IMITATION, "self.guesses and self._is_all_or_nothing", "self._is_all_or_nothing", ROOMS
     ),
-    Mutant(
-        "the habit teaches everywhere",
-        AGENT,
-        "self.actor_pressure and self.imitation.guesses",
-        "self.actor_pressure",
-        f"{ROOMS} -k teaches",
-    ),
-    Mutant(
-        "the habit teaches imitation alone",
-        AGENT,
-        "self.actor_pressure and self.imitation.guesses",
-        "self.imitation.guesses",
-        f"{ROOMS} -k teaches",
-    ),
+    Mutant("the habit holds whatever is paid", IMITATION, "self.guesses and self._is_all_or_nothing", "self.guesses", ROOMS),
+    Mutant("failures are another payment", IMITATION, "returns.tolist()} - {0.0}", "returns.tolist()}", ROOMS),
+    Mutant("the habit holds imitation alone", IMITATION, " or not agent.actor_pressure:", ":", f"{ROOMS} -k teaches"),
     Mutant(
         "the learner teaches itself",
         AGENT,

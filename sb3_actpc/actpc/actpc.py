@@ -685,7 +685,7 @@ class ActPC(OffPolicyAlgorithm):
             self.actor.circuit.optimizer.state.clear()  # its moments are those of other learning rates
             self.policy.spread.copy_(spread_of(self._imitation_residuals()))
             if self.policy.trust_region is not None:
-                self.policy.trust_region.measure_by(self.policy.spread, self.imitation.guesses)
+                self.policy.trust_region.measure_by(self.policy.spread, self.imitation.guesses, self.imitation.is_held)
 
     def _update_prior(self, batch_size: int) -> None:
         assert self.expert is not None
@@ -947,12 +947,12 @@ class ActPC(OffPolicyAlgorithm):
 
     def _imitated(self, batch: Batch) -> Imitated:
         """
-        What refresh imitates: as many steps as the batch has that are worth it. Where clones guess between the demonstrations
-        a region that is small enough for an arm's grip is soon used up by what refresh alone does elsewhere, so that no
-        pressure is left: there the habit teaches what is done in the batch's states.
+        What refresh imitates: as many steps as the batch has that are worth it and, where the habit holds the learning actor,
+        what that does in the batch's states. A region that is small enough for an arm's grip is else soon used up by what
+        refresh alone does where nothing was shown, so that no pressure is left.
         """
         imitated, habit = self.imitation.sample(len(batch.features)), self.actor.habit
-        if habit is None or not (self.policy.trust_region is not None and self.actor_pressure and self.imitation.guesses):
+        if habit is None or not self.imitation.is_held:
             return imitated
         features, actions, memory = imitated
         taught = habit.project(batch.features, batch.memory)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -98,6 +99,21 @@ class Imitation:
     def guesses(self) -> bool:
         """Whether the demonstrations leave room, so that clones guess what is done between them."""
         return self.room is not None and self.room.is_wide
+
+    @property
+    def is_held(self) -> bool:
+        """Whether the habit teaches the learning actor what to do in the states that are replayed: where clones guess and all
+        that is paid is paid the same, as a lifted cube is. Nothing else holds it there, and that a grip was lost is seen
+        hundreds of steps later, if at all."""
+        agent = self.agent
+        if agent.actor.habit is None or agent.policy.trust_region is None or not agent.actor_pressure:
+            return False
+        return self.guesses and self._is_all_or_nothing
+
+    @cached_property
+    def _is_all_or_nothing(self) -> bool:
+        """Whether all demonstrated episodes that are paid are paid the same."""
+        return len({*self.agent.expert.episodes.returns.tolist()} - {0.0}) == 1
 
     @property
     def noise(self) -> float:

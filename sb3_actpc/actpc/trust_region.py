@@ -5,15 +5,15 @@ from torch import nn
 
 # of actions in [-1, 1], where demonstrations hardly spread around their clone: for the noise, and as the trust region's unit
 SMALLEST_SPREAD, SMALLEST_UNIT = 0.02, 0.05
-# where clones guess between the demonstrations: about what they miss by on episodes of an arm that they have not seen
-GUESSED_UNIT = 0.15
+# where the habit holds a learning actor that guesses: about what clones of an arm's episodes miss by on others
+HELD_UNIT = 0.15
 SMALLEST_VALUE = 1e-6
 DEVIATION_RATE = 0.02  # of the running deviation, per update
 # of the multiplier's logarithm, per update: while nothing of the radius is used, and while twice of it is. A critic that has
 # just begun points anywhere, so that pressure comes slowly and goes at once
 RISE, FALL = 0.003, 0.01
 MULTIPLIERS, FIRST_MULTIPLIER = (0.02, 200.0), 0.05
-# the largest where nothing was imitated: there the region is too wide to hold the actor
+# the largest where the unit is unknown: there the region is too wide to hold the actor, and refresh must still be felt
 LARGEST_UNHELD = 3.0
 RADII = 0.1, 1000.0  # below a third of a standard deviation nothing is learned
 # what a verdict about a candidate (:mod:`sb3_actpc.actpc.habit`) does to the radius
@@ -33,12 +33,13 @@ class TrustRegion(nn.Module):
     The critic's pressure as the multiplier of a trust region, regulated as SAC regulates its temperature.
 
     The deviation is the mean squared difference of the learning actor's actions from the habit's, in units of the variance
-    that the demonstrated actions have around their clone, dimension by dimension (of ``GUESSED_UNIT`` where the clone guesses
-    between the demonstrations; of 1, half of the actions' range, where nothing was imitated). A state counts by what the
-    critic says it is worth, from the batch's worst up: where all is lost nothing is imitated, and refresh alone lets the actor
-    drift there. The multiplier grows slowly while the deviation is below the radius, and falls quickly while it is above. So a
-    set of demonstrations that holds one action for a state allows little, one that holds many allows much; and the radius
-    follows outcomes: it widens with candidates that hold their own, and shrinks with those that do not.
+    that the demonstrated actions have around their clone, dimension by dimension. Where the clone guesses between the
+    demonstrations that says little, and the unit is 1, half of the actions' range, or ``HELD_UNIT`` where the habit holds the
+    learning actor. A state counts by what the critic says it is worth, from the batch's worst up: where all is lost nothing is
+    imitated, and refresh alone lets the actor drift there. The multiplier grows slowly while the deviation is below the
+    radius, and falls quickly while it is above. So a set of demonstrations that holds one action for a state allows little,
+    one that holds many allows much; and the radius follows outcomes: it widens with candidates that hold their own, and
+    shrinks with those that do not. Where the unit is 1 the multiplier has a bound of its own (``LARGEST_UNHELD``).
 
     :param radius: at first, a mean squared distance in that unit
     :param n_actions: A
@@ -68,14 +69,16 @@ class TrustRegion(nn.Module):
         self.deviation.zero_()
         self.multiplier.fill_(FIRST_MULTIPLIER)
 
-    def measure_by(self, spread: th.Tensor, guesses: bool) -> None:
+    def measure_by(self, spread: th.Tensor, guesses: bool, is_held: bool = False) -> None:
         """
         :param spread: standard deviations of the demonstrated actions around their clone, (A,)
         :param guesses: whether the clone has to guess between the demonstrations (:mod:`sb3_actpc.actpc.room`): how well it
-            knows the steps that are shown then says nothing about the others
+            knows the steps that are shown then says nothing about the others, and the unit is unknown
+        :param is_held: whether the habit teaches the learning actor what it does between them
         """
-        self.largest.fill_(MULTIPLIERS[1])
-        self.unit.copy_(th.full_like(spread, GUESSED_UNIT) if guesses else spread.clamp(SMALLEST_UNIT, 1.0))
+        self.largest.fill_(LARGEST_UNHELD if guesses and not is_held else MULTIPLIERS[1])
+        known = th.full_like(spread, HELD_UNIT if is_held else 1.0) if guesses else spread.clamp(SMALLEST_UNIT, 1.0)
+        self.unit.copy_(known)
 
     def regulate(self, actions: th.Tensor, habit_actions: th.Tensor, values: th.Tensor) -> th.Tensor:
         """

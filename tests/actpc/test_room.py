@@ -11,7 +11,7 @@ from sb3_actpc.actpc.cloning import Cloning
 from sb3_actpc.actpc.imitation import ROOM_DECAY
 from sb3_actpc.actpc.room import Room, evenly, nearest_steps
 from sb3_actpc.actpc.self_imitation import Episodes
-from sb3_actpc.actpc.trust_region import GUESSED_UNIT, SMALLEST_UNIT
+from sb3_actpc.actpc.trust_region import HELD_UNIT, LARGEST_UNHELD, SMALLEST_UNIT
 from tests.actpc.agents import imitating, make
 from tests.actpc.envs import demonstrations
 
@@ -87,13 +87,14 @@ def test_steps_that_are_never_drawn_are_no_neighbours():
         assert room.shown.neighbours[0].tolist() == expected
 
 
-def parallel_lines(apart, scale=1.0):
+def parallel_lines(apart, scale=1.0, paid=(1.0, 1.0)):
     """Two, in steps of 0.1."""
     data = demonstrations(n_episodes=2, length=30)
     observations = np.zeros_like(data.observations)
     observations[:, 0] = np.tile(np.arange(30), 2) / 10
     observations[30:, 1] = apart
-    return dataclasses.replace(data, observations=scale * observations)
+    rewards = data.rewards * np.repeat(paid, 30)
+    return dataclasses.replace(data, observations=scale * observations, rewards=rewards)
 
 
 @pytest.mark.parametrize("scale", [1.0, 1000.0])
@@ -134,15 +135,26 @@ def test_clones_that_imitate_between_demonstrations_have_smaller_synapses(apart,
 
 
 @pytest.mark.parametrize("noise", [None, 0.0])
-@pytest.mark.parametrize(("apart", "guesses"), [(0.08, False), (0.12, True)])
-def test_the_trust_region_counts_by_the_demonstrations_spread_unless_the_clone_guesses_between_them(apart, guesses, noise):
+@pytest.mark.parametrize(
+    ("apart", "paid", "unit"),
+    [
+        (0.08, (1.0, 1.0), None),
+        (0.08, (1.0, 2.0), None),
+        (0.12, (1.0, 1.0), HELD_UNIT),
+        (0.12, (1.0, 2.0), 1.0),
+        (0.12, (0.0, 0.0), 1.0),
+    ],
+)
+def test_the_trust_region_counts_by_the_demonstrations_spread_unless_the_clone_guesses_between_them(apart, paid, unit, noise):
+    """Where all that is paid is paid the same the habit holds the learner."""
     keywords = {"observation_normalization": "none", "refresh_kwargs": {"noise": noise}}
-    model = imitating(demonstrations=parallel_lines(apart), **keywords)
+    model = imitating(demonstrations=parallel_lines(apart, paid=paid), **keywords)
     region, spread = model.policy.trust_region, model.policy.spread
     assert region.unit.tolist() == [1.0] * len(spread)
     model.pretrain()
-    expected = np.full(len(spread), GUESSED_UNIT) if guesses else np.clip(spread, SMALLEST_UNIT, 1.0)
+    expected = np.clip(spread, SMALLEST_UNIT, 1.0) if unit is None else np.full(len(spread), unit)
     assert region.unit.tolist() == pytest.approx(expected) and (spread < 1.0).all()
+    assert (float(region.largest) == LARGEST_UNHELD) == (unit == 1.0)
 
 
 @pytest.mark.parametrize(
@@ -150,14 +162,18 @@ def test_the_trust_region_counts_by_the_demonstrations_spread_unless_the_clone_g
     [
         (0.12, {}, True),
         (0.08, {}, False),
+        (0.12, {"demonstrations": parallel_lines(0.12, paid=(1.0, 2.0))}, False),
+        (0.12, {"demonstrations": parallel_lines(0.12, paid=(2.0, 0.0)), "refresh_kwargs": {"weighting": "uniform"}}, True),
         (0.12, {"actor_pressure": 0.0}, False),
         (0.12, {"policy_kwargs": {"habit": False}}, False),
         (0.12, {"policy_kwargs": {"trust_radius": 0.0}}, False),
         (0.12, {"policy_kwargs": {"memory_history": 2}}, True),
     ],
 )
-def test_where_clones_guess_and_a_critic_presses_the_habit_teaches_what_it_does_in_the_batchs_states(apart, keywords, teaches):
-    model = imitating(demonstrations=parallel_lines(apart), observation_normalization="none", **keywords)
+def test_where_clones_guess_and_all_is_paid_the_same_the_habit_teaches_what_it_does_in_the_batchs_states(
+    apart, keywords, teaches
+):
+    model = imitating(**{"demonstrations": parallel_lines(apart), "observation_normalization": "none", **keywords})
     model.learn(40)
     habit, batch = model.actor.habit, model._sample_batch(16)
     for weights in [] if habit is None else habit.synapses[0]:

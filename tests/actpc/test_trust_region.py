@@ -8,7 +8,7 @@ import torch as th
 from sb3_actpc.actpc.trust_region import (
     DEVIATION_RATE,
     FALL,
-    GUESSED_UNIT,
+    HELD_UNIT,
     LARGEST_UNHELD,
     MULTIPLIERS,
     RADII,
@@ -25,10 +25,10 @@ ZEROS = th.zeros(4, 2)
 WORTH = th.full((4,), 7.0)  # all states the same
 
 
-def measured_by(spread, guesses=False):
+def measured_by(spread, guesses=False, is_held=False):
     """Of radius 1."""
     region = TrustRegion(1, 2)
-    region.measure_by(th.tensor(spread), guesses)
+    region.measure_by(th.tensor(spread), guesses, is_held)
     return region
 
 
@@ -63,17 +63,17 @@ def test_a_small_spread_counts_as_the_smallest_unit():
     assert float(region.deviation) == pytest.approx(DEVIATION_RATE)
 
 
-@pytest.mark.parametrize("region", [TrustRegion(1, 2), measured_by([th.inf] * 2)])
+@pytest.mark.parametrize("region", [TrustRegion(1, 2), measured_by([th.inf] * 2), measured_by([0.1, 0.1], guesses=True)])
 def test_an_unknown_spread_counts_as_one(region):
-    """Before anything is imitated."""
+    """Before anything is imitated, and where the clone guesses what is done between the demonstrations."""
     region.regulate(th.full((4, 2), 0.5), ZEROS, WORTH)
     assert float(region.deviation) == pytest.approx(0.25 * DEVIATION_RATE)
 
 
-def test_where_the_clone_guesses_its_error_where_it_was_shown_something_is_no_unit():
-    for spread in (0.1, 0.9):
-        region = measured_by([spread] * 2, guesses=True)
-        region.regulate(th.full((4, 2), GUESSED_UNIT), ZEROS, WORTH)
+def test_where_the_habit_holds_a_learner_that_guesses_the_unit_is_small_whatever_its_spread():
+    for spread in (0.01, 0.9):
+        region = measured_by([spread] * 2, guesses=True, is_held=True)
+        region.regulate(th.full((4, 2), HELD_UNIT), ZEROS, WORTH)
         assert float(region.deviation) == pytest.approx(DEVIATION_RATE)
 
 
@@ -101,12 +101,13 @@ def test_a_wider_radius_is_reached_by_an_actor_that_follows_the_pressure():
     ("make", "largest"),
     [
         (lambda: measured_by([1.0, 1.0]), MULTIPLIERS[1]),
-        (lambda: measured_by([1.0, 1.0], guesses=True), MULTIPLIERS[1]),
+        (lambda: measured_by([1.0, 1.0], guesses=True, is_held=True), MULTIPLIERS[1]),
+        (lambda: measured_by([1.0, 1.0], guesses=True), LARGEST_UNHELD),
         (lambda: TrustRegion(1, 2), LARGEST_UNHELD),
     ],
 )
 def test_multiplier_and_radius_stay_within_bounds(make, largest):
-    """Where nothing was imitated the region is too wide to hold the actor: the multiplier has a bound of its own."""
+    """Where the unit is unknown the region is too wide to hold the actor: the multiplier has a bound of its own."""
     for verdict, actions, radius, multiplier in (("tied", ZEROS, 1, largest), ("rejected", ZEROS + 1e6, 0, MULTIPLIERS[0])):
         region = make()
         for _ in range(3000):
