@@ -143,7 +143,7 @@ class ActPC(OffPolicyAlgorithm):
     :param refresh_weight: weight of the actor's refresh from the demonstrations and its own good episodes
     :param refresh_kwargs: keywords of :class:`~sb3_actpc.actpc.self_imitation.Refresh`, for refresh and warm start:
         ``weighting`` (by "returns"; the paper's is "uniform"), ``own_episodes``, ``noise``, ``weight_decay``,
-        ``ensemble_size`` and ``n_clones``
+        ``ensemble_size``, ``n_clones`` and ``habit``
     :param demonstration_fraction: share of the batch, which all circuits share, that comes from the demonstrations
     :param alpha_ep: weight of the epistemic signal
     :param alpha_in: weight of the instrumental signal

@@ -15,6 +15,7 @@ from sb3_actpc.actpc.self_imitation import Episodes, imitated_return, is_by_retu
 from sb3_actpc.ngc import NGCCircuit
 
 ROOM_DECAY = 1.0  # of clones' synapses where the demonstrations leave room, which small synapses guess better
+HELD = "\nthe habit teaches the learning actor too, in the states that are replayed"
 MOST_BLUR = 1.5  # of their error on episodes that are held out, over that of clones that imitate what is shown alone
 
 
@@ -102,13 +103,13 @@ class Imitation:
 
     @property
     def is_held(self) -> bool:
-        """Whether the habit teaches the learning actor what to do in the states that are replayed: where clones guess and all
-        that is paid is paid the same, as a lifted cube is. Nothing else holds it there, and that a grip was lost is seen
-        hundreds of steps later, if at all."""
-        agent = self.agent
+        """Whether the habit teaches the learning actor what to do in the states that are replayed: as asked for, or by default
+        where clones guess and all that is paid is paid the same, as a lifted cube is. Nothing else holds it there, and that a
+        grip was lost is seen hundreds of steps later, if at all."""
+        agent, asked_for = self.agent, self.agent.refresh.habit
         if agent.actor.habit is None or agent.policy.trust_region is None or not agent.actor_pressure:
             return False
-        return self.guesses and self._is_all_or_nothing
+        return self.guesses and self._is_all_or_nothing if asked_for is None else asked_for
 
     @cached_property
     def _is_all_or_nothing(self) -> bool:
@@ -178,12 +179,13 @@ class Imitation:
     # ------------------------------------------------------------------ in words
 
     def describe(self) -> str:
-        """What is imitated, and how clones do; two lines."""
+        """What is imitated, how clones do, and whether the habit teaches; two lines or three."""
         return (
             f"imitated: {self._describe_parts()}\n"
             f"noise on what the first clone imitates: {self.noise:g} of a step's length"
             f"{', and steps between the episodes' if self.noise else ''}"
             f"{'; every other further clone the other way' if self.noise_of(1) != self.noise else ''}"
+            f"{HELD if self.is_held else ''}"
         )
 
     def _describe_parts(self) -> str:

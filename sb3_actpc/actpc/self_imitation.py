@@ -48,6 +48,9 @@ class Refresh:
         it imitates, before learning less than half (:mod:`sb3_actpc.actpc.habit`): returns of environment and demonstrations
         must be of one scale. 1 for the warm-started actor alone (the paper); without a habit or a warm start there are no
         others
+    :param habit: whether the habit teaches the learning actor too, in half of each batch and in the states that are replayed,
+        beside a critic that presses; None for where clones guess between the demonstrations and all that is paid is paid the
+        same, as a lifted cube is. False for the paper; without a habit and its trust region there is nobody who could
     :raises ValueError: for another value
     """
 
@@ -60,9 +63,10 @@ class Refresh:
         weight_decay: Annotated[float | None, Between(0)] = None,
         ensemble_size: Annotated[int, Between(1)] = 3,
         n_clones: Annotated[int, Between(1)] = 6,
+        habit: bool | None = None,
     ) -> None:
         self.weighting, self.noise, self.own_episodes = weighting, noise, own_episodes
-        self.weight_decay, self.ensemble_size, self.n_clones = weight_decay, ensemble_size, n_clones
+        self.weight_decay, self.ensemble_size, self.n_clones, self.habit = weight_decay, ensemble_size, n_clones, habit
 
 
 class ImitationSamples(NamedTuple):

@@ -164,7 +164,10 @@ def test_the_trust_region_counts_by_the_demonstrations_spread_unless_the_clone_g
         (0.08, {}, False),
         (0.12, {"demonstrations": parallel_lines(0.12, paid=(1.0, 2.0))}, False),
         (0.12, {"demonstrations": parallel_lines(0.12, paid=(2.0, 0.0)), "refresh_kwargs": {"weighting": "uniform"}}, True),
+        (0.12, {"refresh_kwargs": {"habit": False}}, False),
+        (0.08, {"refresh_kwargs": {"habit": True}}, True),
         (0.12, {"actor_pressure": 0.0}, False),
+        (0.12, {"actor_pressure": 0.0, "refresh_kwargs": {"habit": True}}, False),
         (0.12, {"policy_kwargs": {"habit": False}}, False),
         (0.12, {"policy_kwargs": {"trust_radius": 0.0}}, False),
         (0.12, {"policy_kwargs": {"memory_history": 2}}, True),
@@ -175,6 +178,7 @@ def test_where_clones_guess_and_all_is_paid_the_same_the_habit_teaches_what_it_d
 ):
     model = imitating(**{"demonstrations": parallel_lines(apart), "observation_normalization": "none", **keywords})
     model.learn(40)
+    assert ("the habit teaches the learning actor too" in model.describe()) == teaches
     habit, batch = model.actor.habit, model._sample_batch(16)
     for weights in [] if habit is None else habit.synapses[0]:
         weights.data.mul_(0.5)  # that it is another one
