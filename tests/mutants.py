@@ -1088,23 +1088,48 @@ MUTANTS = [
     Mutant(
         "where clones guess as much pressure",
         REGION,
-        "LARGEST_UNHELD if guesses and not is_held else MULTIPLIERS[1]",
+        "LARGEST_UNHELD if guesses and not holds else MULTIPLIERS[1]",
         "MULTIPLIERS[1]",
         REGIONS,
     ),
-    Mutant("the habit holds, and the pressure is bounded", REGION, " and not is_held else", " else", REGIONS),
-    Mutant("a learner that is held has all the room", REGION, "HELD_UNIT if is_held else 1.0", "1.0", REGIONS),
+    Mutant("the habit holds, and the pressure is bounded", REGION, " and not holds else", " else", REGIONS),
+    Mutant("a learner that is held has all the room", REGION, "HELD_UNIT if holds else 1.0", "1.0", REGIONS),
+    Mutant("whether it holds is forgotten", REGION, "self.holds.fill_(float(holds))", "pass", f"{ROOMS} -k decided_once"),
+    Mutant("the habit holds everywhere", IMITATION, "self.guesses and is_all", "is_all", f"{ROOMS} -k teaches"),
+    Mutant("whether it holds is decided anew", IMITATION, "if agent.pretrained:", "if False:", f"{ROOMS} -k decided_once"),
     Mutant(
-        "the habit holds everywhere", IMITATION, "self.guesses and self._is_all_or_nothing", "self._is_all_or_nothing", ROOMS
+        "the habit holds imitation alone", IMITATION, "agent.actor_pressure and agent.ref", "agent.ref", f"{ROOMS} -k teaches"
     ),
-    Mutant("the habit holds whatever is paid", IMITATION, "self.guesses and self._is_all_or_nothing", "self.guesses", ROOMS),
-    Mutant("failures are another payment", IMITATION, "returns.tolist()} - {0.0}", "returns.tolist()}", ROOMS),
-    Mutant("the habit holds imitation alone", IMITATION, " or not agent.actor_pressure:", ":", f"{ROOMS} -k teaches"),
+    Mutant("a habit of nothing teaches", IMITATION, " and agent.actor_warm_start and", " and", f"{ROOMS} -k teaches"),
+    Mutant(
+        "failures are another payment", TRIALS, "*map(float, returns)} - {0.0}", "*map(float, returns)}", f"{ROOMS} -k teaches"
+    ),
+    Mutant(
+        "what is lost is paid",
+        TRIALS,
+        "len(paid) == 1 and min(paid) > 0.0",
+        "len(paid) == 1",
+        f"{ROOMS} -k trust_region_counts",
+    ),
+    Mutant(
+        "nobody is taught",
+        AGENT,
+        "imitated = self._imitated(batch)",
+        "imitated = self.imitation.sample(len(batch.features))",
+        f"{ROOMS} -k is_learned",
+    ),
+    Mutant(
+        "nobody is taught by a compiled update",
+        "actpc/compiled.py",
+        "agent._imitated(actor)",
+        "agent.imitation.sample(len(actor.features))",
+        f"{ROOMS} -k is_learned",
+    ),
     Mutant(
         "the learner teaches itself",
         AGENT,
-        "taught = habit.project(",
-        "taught = self.actor.circuit.project(",
+        "self.actor.habit.project(batch.features, batch.memory)\n        both",
+        "self.actor.circuit.project(batch.features, batch.memory)\n        both",
         f"{ROOMS} -k teaches",
     ),
     Mutant("ties change nothing", REGION, '"tied": 2.0', '"tied": 1.0', REGIONS),

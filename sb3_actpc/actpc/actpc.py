@@ -302,6 +302,7 @@ class ActPC(OffPolicyAlgorithm):
         self.cloning: Cloning | None = None  # while the actor becomes a clone
         self.trials: Trials | None = None
         self._has_bar = False  # whether learning shows its progress
+        self._is_held = False  # whether the habit teaches the learning actor
         if _init_setup_model:
             self._setup_model()
             self._check_learning_rates()
@@ -546,6 +547,7 @@ class ActPC(OffPolicyAlgorithm):
             print(self.describe())
         self._has_bar = _shows_progress(result[1])
         self.pretrain(between_updates(result[1]), self._has_bar)
+        self._is_held = self.imitation.is_held
         self.start_time = time.time_ns()  # of the frames per second: pre-training has none
         self._compiled = self._compiled or compiled_update(self, self._total_timesteps)  # resumed, as straight
         return result
@@ -948,14 +950,15 @@ class ActPC(OffPolicyAlgorithm):
     def _imitated(self, batch: Batch) -> Imitated:
         """
         What refresh imitates: as many steps as the batch has that are worth it and, where the habit holds the learning actor,
-        what that does in the batch's states. A region that is small enough for an arm's grip is else soon used up by what
+        what that does in the batch's states. A region that is small enough for an arm's grip is otherwise soon used up by what
         refresh alone does where nothing was shown, so that no pressure is left.
         """
-        imitated, habit = self.imitation.sample(len(batch.features)), self.actor.habit
-        if habit is None or not self.imitation.is_held:
+        imitated = self.imitation.sample(len(batch.features))
+        if not self._is_held:
             return imitated
+        assert self.actor.habit is not None
         features, actions, memory = imitated
-        taught = habit.project(batch.features, batch.memory)
+        taught = self.actor.habit.project(batch.features, batch.memory)
         both = None if memory is None or batch.memory is None else th.cat([memory, batch.memory])
         return th.cat([features, batch.features]), th.cat([actions, taught]), both
 

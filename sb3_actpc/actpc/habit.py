@@ -6,6 +6,7 @@ than the habit, by more than chance would have it, it becomes the habit. The war
 agent does is imitation until something better is proven; other clones can be candidates too.
 """
 
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
 from statistics import fmean
 from typing import Any, Literal
@@ -240,8 +241,8 @@ class Trials:
         return "tied" if not is_open else None if has_time else "undecided" if is_coin else "tied"
 
     def _is_all_or_nothing(self) -> bool:
-        """Whether all paid episodes of habit and candidate are paid the same, and the habit has one."""
-        return self.habit_return > 0.0 and len({*self.habit_returns, *self.candidate_returns} - {0.0}) == 1
+        """Of the episodes of habit and candidate, where the habit is paid at all."""
+        return self.habit_return > 0.0 and is_all_or_nothing([*self.habit_returns, *self.candidate_returns])
 
     def _unseen_risk(self) -> float:
         """By how much more likely the candidate's next episode is a first fall than the habit's, by the rule of succession:
@@ -275,6 +276,12 @@ class Trials:
     def checkpoint_state(self) -> dict[str, Any]:
         """Everything, as plain values."""
         return asdict(self)
+
+
+def is_all_or_nothing(returns: Iterable[float]) -> bool:
+    """Whether all episodes that are paid are paid the same, and more than nothing, and there is one."""
+    paid = {*map(float, returns)} - {0.0}
+    return len(paid) == 1 and min(paid) > 0.0
 
 
 def _is_tried(n_episodes: int, n_steps: int) -> bool:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from functools import cached_property
 from typing import Any
 
 import numpy as np
 import torch as th
 
 from sb3_actpc.actpc.cloning import Cloning, Imitated
+from sb3_actpc.actpc.habit import is_all_or_nothing
 from sb3_actpc.actpc.held_out import N_ASKED, N_UPDATES, random_numbers_of_its_own, split, typical_error
 from sb3_actpc.actpc.room import Room
 from sb3_actpc.actpc.self_imitation import Episodes, imitated_return, is_by_return, sample_union
@@ -105,16 +105,15 @@ class Imitation:
     def is_held(self) -> bool:
         """Whether the habit teaches the learning actor what to do in the states that are replayed: as asked for, or by default
         where clones guess and all that is paid is paid the same, as a lifted cube is. Nothing else holds it there, and that a
-        grip was lost is seen hundreds of steps later, if at all."""
-        agent, asked_for = self.agent, self.agent.refresh.habit
-        if agent.actor.habit is None or agent.policy.trust_region is None or not agent.actor_pressure:
+        grip was lost is seen hundreds of steps later, if at all. Decided once, with the trust region's unit."""
+        agent, region, asked_for = self.agent, self.agent.policy.trust_region, self.agent.refresh.habit
+        # a habit that is no clone has nothing to teach
+        has_roles = agent.actor_pressure and agent.refresh_weight and agent.actor_warm_start and agent.expert is not None
+        if region is None or not has_roles:
             return False
-        return self.guesses and self._is_all_or_nothing if asked_for is None else asked_for
-
-    @cached_property
-    def _is_all_or_nothing(self) -> bool:
-        """Whether all demonstrated episodes that are paid are paid the same."""
-        return len({*self.agent.expert.episodes.returns.tolist()} - {0.0}) == 1
+        if agent.pretrained:
+            return bool(region.holds)
+        return self.guesses and is_all_or_nothing(agent.expert.episodes.returns) if asked_for is None else asked_for
 
     @property
     def noise(self) -> float:

@@ -48,9 +48,9 @@ class Refresh:
         it imitates, before learning less than half (:mod:`sb3_actpc.actpc.habit`): returns of environment and demonstrations
         must be of one scale. 1 for the warm-started actor alone (the paper); without a habit or a warm start there are no
         others
-    :param habit: whether the habit teaches the learning actor too, in half of each batch and in the states that are replayed,
-        beside a critic that presses; None for where clones guess between the demonstrations and all that is paid is paid the
-        same, as a lifted cube is. False for the paper; without a habit and its trust region there is nobody who could
+    :param habit: whether the habit, where it began as a clone, teaches the learning actor too, in the batch's states (half of
+        what refresh imitates), if a critic presses; decided at the warm start. None for where clones guess between the
+        demonstrations and all that is paid is paid the same, as a lifted cube is. False for the paper
     :raises ValueError: for another value
     """
 

@@ -39,7 +39,7 @@ class TrustRegion(nn.Module):
     imitated, and refresh alone lets the actor drift there. The multiplier grows slowly while the deviation is below the
     radius, and falls quickly while it is above. So a set of demonstrations that holds one action for a state allows little,
     one that holds many allows much; and the radius follows outcomes: it widens with candidates that hold their own, and
-    shrinks with those that do not. Where the unit is 1 the multiplier has a bound of its own (``LARGEST_UNHELD``).
+    shrinks with those that do not. Where the unit is unknown the multiplier has a bound of its own (``LARGEST_UNHELD``).
 
     :param radius: at first, a mean squared distance in that unit
     :param n_actions: A
@@ -51,6 +51,7 @@ class TrustRegion(nn.Module):
     radius: th.Tensor
     deviation: th.Tensor
     multiplier: th.Tensor
+    holds: th.Tensor
 
     def __init__(self, radius: float, n_actions: int) -> None:
         smallest, largest = RADII
@@ -62,6 +63,7 @@ class TrustRegion(nn.Module):
         self.register_buffer("radius", th.tensor(float(radius)))
         self.register_buffer("deviation", th.tensor(0.0))
         self.register_buffer("multiplier", th.tensor(0.0))
+        self.register_buffer("holds", th.tensor(0.0))  # 1 where the habit teaches the learning actor, which goes with the unit
         self.begin()
 
     def begin(self) -> None:
@@ -69,16 +71,18 @@ class TrustRegion(nn.Module):
         self.deviation.zero_()
         self.multiplier.fill_(FIRST_MULTIPLIER)
 
-    def measure_by(self, spread: th.Tensor, guesses: bool, is_held: bool = False) -> None:
+    def measure_by(self, spread: th.Tensor, guesses: bool, holds: bool) -> None:
         """
         :param spread: standard deviations of the demonstrated actions around their clone, (A,)
         :param guesses: whether the clone has to guess between the demonstrations (:mod:`sb3_actpc.actpc.room`): how well it
-            knows the steps that are shown then says nothing about the others, and the unit is unknown
-        :param is_held: whether the habit teaches the learning actor what it does between them
+            knows the steps that are shown then says nothing about the others
+        :param holds: whether the habit teaches the learning actor
         """
-        self.largest.fill_(LARGEST_UNHELD if guesses and not is_held else MULTIPLIERS[1])
-        known = th.full_like(spread, HELD_UNIT if is_held else 1.0) if guesses else spread.clamp(SMALLEST_UNIT, 1.0)
-        self.unit.copy_(known)
+        self.largest.fill_(LARGEST_UNHELD if guesses and not holds else MULTIPLIERS[1])
+        self.unit.copy_(spread.clamp(SMALLEST_UNIT, 1.0))
+        if guesses:
+            self.unit.fill_(HELD_UNIT if holds else 1.0)
+        self.holds.fill_(float(holds))
 
     def regulate(self, actions: th.Tensor, habit_actions: th.Tensor, values: th.Tensor) -> th.Tensor:
         """

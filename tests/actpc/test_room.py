@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 import torch as th
 
+from sb3_actpc import ActPC
+from sb3_actpc.actpc import compiled as compiled_module
 from sb3_actpc.actpc import room as room_module
 from sb3_actpc.actpc.cloning import Cloning
 from sb3_actpc.actpc.imitation import ROOM_DECAY
@@ -143,6 +145,7 @@ def test_clones_that_imitate_between_demonstrations_have_smaller_synapses(apart,
         (0.12, (1.0, 1.0), HELD_UNIT),
         (0.12, (1.0, 2.0), 1.0),
         (0.12, (0.0, 0.0), 1.0),
+        (0.12, (-1.0, -1.0), 1.0),
     ],
 )
 def test_the_trust_region_counts_by_the_demonstrations_spread_unless_the_clone_guesses_between_them(apart, paid, unit, noise):
@@ -168,6 +171,9 @@ def test_the_trust_region_counts_by_the_demonstrations_spread_unless_the_clone_g
         (0.08, {"refresh_kwargs": {"habit": True}}, True),
         (0.12, {"actor_pressure": 0.0}, False),
         (0.12, {"actor_pressure": 0.0, "refresh_kwargs": {"habit": True}}, False),
+        (0.12, {"refresh_weight": 0.0}, False),
+        (0.12, {"actor_warm_start": 0}, False),  # its habit has learned nothing
+        (0.12, {"actor_warm_start": 0, "refresh_kwargs": {"habit": True}}, False),
         (0.12, {"policy_kwargs": {"habit": False}}, False),
         (0.12, {"policy_kwargs": {"trust_radius": 0.0}}, False),
         (0.12, {"policy_kwargs": {"memory_history": 2}}, True),
@@ -177,8 +183,9 @@ def test_where_clones_guess_and_all_is_paid_the_same_the_habit_teaches_what_it_d
     apart, keywords, teaches
 ):
     model = imitating(**{"demonstrations": parallel_lines(apart), "observation_normalization": "none", **keywords})
+    before = model.describe()
     model.learn(40)
-    assert ("the habit teaches the learning actor too" in model.describe()) == teaches
+    assert [("the habit teaches the learning actor too" in said) for said in (before, model.describe())] == [teaches] * 2
     habit, batch = model.actor.habit, model._sample_batch(16)
     for weights in [] if habit is None else habit.synapses[0]:
         weights.data.mul_(0.5)  # that it is another one
@@ -189,6 +196,36 @@ def test_where_clones_guess_and_all_is_paid_the_same_the_habit_teaches_what_it_d
         assert th.equal(features[16:], batch.features)
         assert th.equal(actions[16:], habit.project(batch.features, batch.memory))
         assert not th.allclose(actions[16:], model.actor.circuit.project(batch.features, batch.memory))
+
+
+@pytest.mark.parametrize("compiled", [False, True])
+def test_what_the_habit_teaches_is_learned(compiled, monkeypatch):
+    """Whatever is taught next: an update of the actor settles the steps that are imitated and as many states of the batch."""
+    monkeypatch.setattr(compiled_module.th, "compile", lambda function, **_: function)
+    model = imitating(demonstrations=parallel_lines(0.12), observation_normalization="none", compile=compiled)
+    model.learn(40)
+    assert (model._compiled is not None) == compiled
+    rows, settle = [], model.actor.circuit.settle
+    monkeypatch.setattr(model.actor.circuit, "settle", lambda *given: rows.append(len(given[0])) or settle(*given))
+    model.train(2, 16)
+    assert rows == [32]
+
+
+@pytest.mark.parametrize("taught", [True, False])
+def test_whether_the_habit_teaches_is_decided_once_with_the_region(taught, tmp_path):
+    """Whatever is asked for later, and whatever the next demonstrations are paid."""
+    line = parallel_lines(0.12, paid=(1.0, 1.0 if taught else 2.0))
+    model = imitating(demonstrations=line, observation_normalization="none")
+    model.learn(40)
+    model.save(tmp_path / "agent")
+    others = {"demonstrations": parallel_lines(0.12, paid=(1.0, 2.0 if taught else 1.0))}
+    for changes in ({"refresh_kwargs": {"habit": not taught}}, others):
+        loaded = ActPC.load(tmp_path / "agent", env=model.env, **changes)
+        loaded.learn(20)
+        assert loaded._is_held == taught
+        assert (float(loaded.policy.trust_region.unit[0]) == pytest.approx(HELD_UNIT)) == taught
+    loaded.actor_pressure = 0.0  # imitation alone is taught by nobody
+    assert not loaded.learn(20)._is_held
 
 
 @pytest.mark.parametrize("lengths", [(40,), (1, 1, 1)])

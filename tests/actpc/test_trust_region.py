@@ -25,10 +25,10 @@ ZEROS = th.zeros(4, 2)
 WORTH = th.full((4,), 7.0)  # all states the same
 
 
-def measured_by(spread, guesses=False, is_held=False):
+def measured_by(spread, guesses=False, holds=False):
     """Of radius 1."""
     region = TrustRegion(1, 2)
-    region.measure_by(th.tensor(spread), guesses, is_held)
+    region.measure_by(th.tensor(spread), guesses, holds)
     return region
 
 
@@ -72,7 +72,7 @@ def test_an_unknown_spread_counts_as_one(region):
 
 def test_where_the_habit_holds_a_learner_that_guesses_the_unit_is_small_whatever_its_spread():
     for spread in (0.01, 0.9):
-        region = measured_by([spread] * 2, guesses=True, is_held=True)
+        region = measured_by([spread] * 2, guesses=True, holds=True)
         region.regulate(th.full((4, 2), HELD_UNIT), ZEROS, WORTH)
         assert float(region.deviation) == pytest.approx(DEVIATION_RATE)
 
@@ -101,7 +101,7 @@ def test_a_wider_radius_is_reached_by_an_actor_that_follows_the_pressure():
     ("make", "largest"),
     [
         (lambda: measured_by([1.0, 1.0]), MULTIPLIERS[1]),
-        (lambda: measured_by([1.0, 1.0], guesses=True, is_held=True), MULTIPLIERS[1]),
+        (lambda: measured_by([1.0, 1.0], guesses=True, holds=True), MULTIPLIERS[1]),
         (lambda: measured_by([1.0, 1.0], guesses=True), LARGEST_UNHELD),
         (lambda: TrustRegion(1, 2), LARGEST_UNHELD),
     ],
