@@ -39,7 +39,9 @@ class TrustRegion(nn.Module):
     imitated, and refresh alone lets the actor drift there. The multiplier grows slowly while the deviation is below the
     radius, and falls quickly while it is above. So a set of demonstrations that holds one action for a state allows little,
     one that holds many allows much; and the radius follows outcomes: it widens with candidates that hold their own, and
-    shrinks with those that do not. Where the unit is unknown the multiplier has a bound of its own (``LARGEST_UNHELD``).
+    shrinks with those that do not. Where the habit holds the learning actor it never shrinks below the first: that one is
+    small, and a critic that has seen a few dozen of an arm's episodes loses trials however small it is made. Where the unit is
+    unknown the multiplier has a bound of its own (``LARGEST_UNHELD``).
 
     :param radius: at first, a mean squared distance in that unit
     :param n_actions: A
@@ -58,6 +60,7 @@ class TrustRegion(nn.Module):
         if not smallest <= radius <= largest:
             raise ValueError(f"trust_radius={radius!r} must be from {smallest:g} to {largest:g}, or 0 for a fixed pressure")
         super().__init__()
+        self.first_radius = radius
         self.register_buffer("unit", th.ones(n_actions))  # standard deviations; half of the range while they are unknown
         self.register_buffer("largest", th.tensor(LARGEST_UNHELD))  # multiplier
         self.register_buffer("radius", th.tensor(float(radius)))
@@ -101,4 +104,5 @@ class TrustRegion(nn.Module):
 
     def resize(self, verdict: str) -> None:
         """:param verdict: about a candidate, a key of ``RADIUS_FACTORS``"""
-        self.radius.mul_(RADIUS_FACTORS[verdict]).clamp_(*RADII)
+        smallest, largest = RADII
+        self.radius.mul_(RADIUS_FACTORS[verdict]).clamp_(self.first_radius if self.holds else smallest, largest)

@@ -25,9 +25,9 @@ ZEROS = th.zeros(4, 2)
 WORTH = th.full((4,), 7.0)  # all states the same
 
 
-def measured_by(spread, guesses=False, holds=False):
-    """Of radius 1."""
-    region = TrustRegion(1, 2)
+def measured_by(spread, guesses=False, holds=False, radius=1):
+    """Of radius 1, if not said otherwise."""
+    region = TrustRegion(radius, 2)
     region.measure_by(th.tensor(spread), guesses, holds)
     return region
 
@@ -108,12 +108,13 @@ def test_a_wider_radius_is_reached_by_an_actor_that_follows_the_pressure():
 )
 def test_multiplier_and_radius_stay_within_bounds(make, largest):
     """Where the unit is unknown the region is too wide to hold the actor: the multiplier has a bound of its own."""
-    for verdict, actions, radius, multiplier in (("tied", ZEROS, 1, largest), ("rejected", ZEROS + 1e6, 0, MULTIPLIERS[0])):
+    for verdict, actions, multiplier in (("tied", ZEROS, largest), ("rejected", ZEROS + 1e6, MULTIPLIERS[0])):
         region = make()
+        smallest = 1.0 if region.holds else RADII[0]
         for _ in range(3000):
             region.regulate(actions, ZEROS, WORTH)
             region.resize(verdict)
-        assert float(region.radius) == pytest.approx(RADII[radius])
+        assert float(region.radius) == pytest.approx(RADII[1] if verdict == "tied" else smallest)
         assert float(region.multiplier) == pytest.approx(multiplier)
 
 
@@ -122,6 +123,20 @@ def test_holding_its_own_widens_the_radius_and_losing_shrinks_it():
         region = TrustRegion(1, 2)
         region.resize(verdict)
         assert (float(region.radius) > 1.0) == grows
+
+
+def test_a_learner_that_the_habit_holds_keeps_its_first_radius_and_what_it_has_won_can_be_lost():
+    """Elsewhere a learner that loses twice has half of it; a learner that is not held any more can lose it too."""
+    region, free = (measured_by([0.1, 0.1], guesses=True, holds=holds, radius=0.5) for holds in (True, False))
+    after = []
+    for verdict in ("rejected", "tied", "rejected", "rejected"):
+        region.resize(verdict)
+        free.resize(verdict)
+        after.append((float(region.radius), float(free.radius)))
+    assert after == [pytest.approx(both) for both in [(0.5, 0.35), (1.0, 0.7), (0.7, 0.49), (0.5, 0.343)]]
+    region.measure_by(th.tensor([0.1, 0.1]), guesses=False, holds=False)
+    region.resize("rejected")
+    assert float(region.radius) == pytest.approx(0.35)
 
 
 def test_what_is_returned_does_not_change_with_the_next_update():
