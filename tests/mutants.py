@@ -1097,28 +1097,64 @@ MUTANTS = [
     Mutant(
         "rejections make the region of a learner that is held small",
         REGION,
-        "self.first_radius if self.holds else smallest",
-        "smallest",
+        "clamp_(self.first_radius, RADII[1])",
+        "clamp_(*RADII)",
         REGIONS,
     ),
-    Mutant("nobody's region shrinks", REGION, "self.first_radius if self.holds else smallest", "self.first_radius", REGIONS),
+    Mutant("verdicts resize a region that follows episodes", REGION, "if not self.holds:", "if True:", REGIONS),
+    Mutant("every region follows episodes", REGION, "if self.holds:", "if True:", REGIONS),
+    Mutant(
+        "a region follows what was before the pressure",
+        AGENT,
+        "and self._n_updates > pressed_since:",
+        "and True:",
+        f"{HABIT} -k radius_follows",
+    ),
+    Mutant(
+        "quiet episodes are followed",
+        TRIALS,
+        'if self.roles[env] != "actor" or self.gen',
+        "if self.gen",
+        f"{HABIT} -k of_before",
+    ),
+    Mutant(
+        "another learner's episodes are followed",
+        TRIALS,
+        " or self.generations[env] != self.generation or",
+        " or",
+        f"{HABIT} -k of_before",
+    ),
+    Mutant(
+        "one episode moves the radius far",
+        TRIALS,
+        "max(-1.0, min(1.0, gain / unit))",
+        "gain / unit",
+        f"{HABIT} -k share_of_what",
+    ),
+    Mutant(
+        "of nothing any episode is a gain", TRIALS, "float((gain > 0.0) - (gain < 0.0))", "1.0", f"{HABIT} -k share_of_what"
+    ),
+    Mutant(
+        "what is lost is a gain",
+        TRIALS,
+        "self.returns[env] - self.habit_return, abs(self.habit_return)",
+        "self.returns[env] - self.habit_return, self.habit_return",
+        f"{HABIT} -k share_of_what",
+    ),
     Mutant("whether it holds is forgotten", REGION, "self.holds.fill_(float(holds))", "pass", f"{ROOMS} -k decided_once"),
-    Mutant("the habit holds everywhere", IMITATION, "self.guesses and is_all", "is_all", f"{ROOMS} -k teaches"),
+    Mutant("the habit holds everywhere", IMITATION, "self.guesses and bool(", "bool(", f"{ROOMS} -k teaches"),
+    Mutant(
+        "what was never paid holds",
+        IMITATION,
+        "self.guesses and bool(agent.expert.episodes.returns.any())",
+        "self.guesses",
+        f"{ROOMS} -k teaches",
+    ),
     Mutant("whether it holds is decided anew", IMITATION, "if agent.pretrained:", "if False:", f"{ROOMS} -k decided_once"),
     Mutant(
         "the habit holds imitation alone", IMITATION, "agent.actor_pressure and agent.ref", "agent.ref", f"{ROOMS} -k teaches"
     ),
     Mutant("a habit of nothing teaches", IMITATION, " and agent.actor_warm_start and", " and", f"{ROOMS} -k teaches"),
-    Mutant(
-        "failures are another payment", TRIALS, "*map(float, returns)} - {0.0}", "*map(float, returns)}", f"{ROOMS} -k teaches"
-    ),
-    Mutant(
-        "what is lost is paid",
-        TRIALS,
-        "len(paid) == 1 and min(paid) > 0.0",
-        "len(paid) == 1",
-        f"{ROOMS} -k trust_region_counts",
-    ),
     Mutant(
         "nobody is taught",
         AGENT,

@@ -779,26 +779,30 @@ class ActPC(OffPolicyAlgorithm):
                 self.trials.skip(env, bool(done))
                 continue
             self.trials.step(env, float(reward))
-            if not done:
-                if self.trials.lengths[env] == ENDLESS:
-                    warnings.warn(
-                        f"an episode has gone on for {ENDLESS} steps: the habit is replaced by what whole episodes are paid, "
-                        "so end them with gymnasium.wrappers.TimeLimit",
-                        stacklevel=2,
-                    )
-                continue
-            if self.trials.n_clones:
-                self.trials.imitated_return = self.imitation.mean_return()
-            pressed_since = max(self.critic_warmup, self.trials.begun_at)
-            verdict = self.trials.end(env, has_learned=self._n_updates > pressed_since + CANDIDATE_AGE)
-            region, is_paid = self.policy.trust_region, self.trials.habit_return != 0.0
-            # nothing is proven where nothing is paid, and a clone proves nothing about the pressure
-            if region is not None and verdict is not None and is_paid and not self.trials.is_clone:
-                region.resize(verdict)
-            if verdict == "accepted":
-                self._accept_candidate()
-            if self.trials.begin(env):
-                self._make_candidate()
+            if done:
+                self._end_episode(self.trials, env)
+            elif self.trials.lengths[env] == ENDLESS:
+                warnings.warn(
+                    f"an episode has gone on for {ENDLESS} steps: the habit is replaced by what whole episodes are paid, "
+                    "so end them with gymnasium.wrappers.TimeLimit",
+                    stacklevel=2,
+                )
+
+    def _end_episode(self, trials: Trials, env: int) -> None:
+        """What follows from the episode of ``env``, and who plays the next one."""
+        if trials.n_clones:
+            trials.imitated_return = self.imitation.mean_return()
+        region, pressed_since = self.policy.trust_region, max(self.critic_warmup, trials.begun_at)
+        if region is not None and self._n_updates > pressed_since:
+            region.follow(trials.noisy_gain(env))
+        verdict = trials.end(env, has_learned=self._n_updates > pressed_since + CANDIDATE_AGE)
+        # nothing is proven where nothing is paid, and a clone proves nothing about the pressure
+        if region is not None and verdict is not None and trials.habit_return != 0.0 and not trials.is_clone:
+            region.resize(verdict)
+        if verdict == "accepted":
+            self._accept_candidate()
+        if trials.begin(env):
+            self._make_candidate()
 
     def _accept_candidate(self) -> None:
         assert self.trials is not None and self.policy.candidate is not None

@@ -6,7 +6,6 @@ than the habit, by more than chance would have it, it becomes the habit. The war
 agent does is imitation until something better is proven; other clones can be candidates too.
 """
 
-from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
 from statistics import fmean
 from typing import Any, Literal
@@ -129,6 +128,16 @@ class Trials:
         """Mean of the habit's last returns; 0 where there is none yet."""
         return fmean(self.habit_returns) if self.habit_returns else 0.0
 
+    def noisy_gain(self, env: int) -> float:
+        """
+        Of the episode of ``env``, which has had its last step, over the habit: within the bounds -1 and 1 a share of the
+        habit's absolute mean return, or of nothing the sign. 0 where it is not the learning actor's, or another one began it.
+        """
+        if self.roles[env] != "actor" or self.generations[env] != self.generation or not self.habit_returns:
+            return 0.0
+        gain, unit = self.returns[env] - self.habit_return, abs(self.habit_return)
+        return max(-1.0, min(1.0, gain / unit)) if unit else float((gain > 0.0) - (gain < 0.0))
+
     def is_ahead(self) -> bool:
         """Whether the learning actor is paid more than the habit, even with noise."""
         return len(self.noisy_returns) >= N_PROOFS and fmean(self.noisy_returns) > self.habit_return
@@ -241,8 +250,8 @@ class Trials:
         return "tied" if not is_open else None if has_time else "undecided" if is_coin else "tied"
 
     def _is_all_or_nothing(self) -> bool:
-        """Of the episodes of habit and candidate, where the habit is paid at all."""
-        return self.habit_return > 0.0 and is_all_or_nothing([*self.habit_returns, *self.candidate_returns])
+        """Whether all paid episodes of habit and candidate are paid the same, and the habit has one."""
+        return self.habit_return > 0.0 and len({*self.habit_returns, *self.candidate_returns} - {0.0}) == 1
 
     def _unseen_risk(self) -> float:
         """By how much more likely the candidate's next episode is a first fall than the habit's, by the rule of succession:
@@ -276,12 +285,6 @@ class Trials:
     def checkpoint_state(self) -> dict[str, Any]:
         """Everything, as plain values."""
         return asdict(self)
-
-
-def is_all_or_nothing(returns: Iterable[float]) -> bool:
-    """Whether all episodes that are paid are paid the same, and more than nothing, and there is one."""
-    paid = {*map(float, returns)} - {0.0}
-    return len(paid) == 1 and min(paid) > 0.0
 
 
 def _is_tried(n_episodes: int, n_steps: int) -> bool:

@@ -8,7 +8,6 @@ import numpy as np
 import torch as th
 
 from sb3_actpc.actpc.cloning import Cloning, Imitated
-from sb3_actpc.actpc.habit import is_all_or_nothing
 from sb3_actpc.actpc.held_out import N_ASKED, N_UPDATES, random_numbers_of_its_own, split, typical_error
 from sb3_actpc.actpc.room import Room
 from sb3_actpc.actpc.self_imitation import Episodes, imitated_return, is_by_return, sample_union
@@ -104,8 +103,9 @@ class Imitation:
     @property
     def is_held(self) -> bool:
         """Whether the habit teaches the learning actor what to do in the states that are replayed: as asked for, or by default
-        where clones guess and all that is paid is paid the same, as a lifted cube is. Nothing else holds it there, and that a
-        grip was lost is seen hundreds of steps later, if at all. Decided once, with the trust region's unit."""
+        where clones guess: refresh alone moves it freely there, and that a grip was lost is seen hundreds of steps later, if
+        at all. Where no demonstration is paid its habit is nothing to be held to. Decided once, with the trust region's
+        unit."""
         agent, region, asked_for = self.agent, self.agent.policy.trust_region, self.agent.refresh.habit
         # a habit that is no clone has nothing to teach
         has_roles = agent.actor_pressure and agent.refresh_weight and agent.actor_warm_start and agent.expert is not None
@@ -113,7 +113,7 @@ class Imitation:
             return False
         if agent.pretrained:
             return bool(region.holds)
-        return self.guesses and is_all_or_nothing(agent.expert.episodes.returns) if asked_for is None else asked_for
+        return self.guesses and bool(agent.expert.episodes.returns.any()) if asked_for is None else asked_for
 
     @property
     def noise(self) -> float:

@@ -50,7 +50,7 @@ class Refresh:
         others
     :param habit: whether the habit, where it began as a clone, teaches the learning actor too, in the batch's states (half of
         what refresh imitates), if a critic presses; decided at the warm start. None for where clones guess between the
-        demonstrations and all that is paid is paid the same, as a lifted cube is. False for the paper
+        demonstrations, of which some are paid. False for the paper
     :raises ValueError: for another value
     """
 

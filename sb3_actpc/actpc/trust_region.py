@@ -1,5 +1,7 @@
 """How far the learning actor may go from its habit, and the pressure that takes it there."""
 
+import math
+
 import torch as th
 from torch import nn
 
@@ -18,6 +20,9 @@ LARGEST_UNHELD = 3.0
 RADII = 0.1, 1000.0  # below a third of a standard deviation nothing is learned
 # what a verdict about a candidate (:mod:`sb3_actpc.actpc.habit`) does to the radius
 RADIUS_FACTORS = {"accepted": 1.25, "tied": 2.0, "undecided": 1.0, "rejected": 0.7}
+# of the radius's logarithm, where the habit holds the learning actor: for an episode of that one which is paid twice what the
+# habit is, or nothing. A few hundred episodes of a gain of a fifth are a radius ten times as wide
+FOLLOWING_RATE = 0.05
 
 
 def spread_of(residuals: th.Tensor) -> th.Tensor:
@@ -34,14 +39,17 @@ class TrustRegion(nn.Module):
 
     The deviation is the mean squared difference of the learning actor's actions from the habit's, in units of the variance
     that the demonstrated actions have around their clone, dimension by dimension. Where the clone guesses between the
-    demonstrations that says little, and the unit is 1, half of the actions' range, or ``HELD_UNIT`` where the habit holds the
-    learning actor. A state counts by what the critic says it is worth, from the batch's worst up: where all is lost nothing is
-    imitated, and refresh alone lets the actor drift there. The multiplier grows slowly while the deviation is below the
-    radius, and falls quickly while it is above. So a set of demonstrations that holds one action for a state allows little,
-    one that holds many allows much; and the radius follows outcomes: it widens with candidates that hold their own, and
-    shrinks with those that do not. Where the habit holds the learning actor it never shrinks below the first: that one is
-    small, and a critic that has seen a few dozen of an arm's episodes loses trials however small it is made. Where the unit is
-    unknown the multiplier has a bound of its own (``LARGEST_UNHELD``).
+    demonstrations that says little, and the unit is ``HELD_UNIT``; or 1, half of the actions' range, where the habit does not
+    hold the learning actor there. A state counts by what the critic says it is worth, from the batch's worst up: where all is
+    lost nothing is imitated, and refresh alone lets the actor drift there. The multiplier grows slowly while the deviation is
+    below the radius, and falls quickly while it is above. So a set of demonstrations that holds one action for a state allows
+    little, one that holds many allows much; and the radius follows outcomes: it widens with candidates that hold their own,
+    and shrinks with those that do not. Where the unit is unknown the multiplier has a bound of its own (``LARGEST_UNHELD``).
+
+    Where the habit holds the learning actor the radius begins small, and follows every episode of that one in the place of
+    verdicts, which are few where clones guess: it widens with what they are paid more than the habit, and shrinks with what
+    they are paid less, to the first radius and no further. A critic that has seen a few dozen of an arm's episodes takes its
+    actor to losses in a region of any size, and learns nothing in one of none.
 
     :param radius: at first, a mean squared distance in that unit
     :param n_actions: A
@@ -103,6 +111,19 @@ class TrustRegion(nn.Module):
         return self.multiplier.clone()
 
     def resize(self, verdict: str) -> None:
-        """:param verdict: about a candidate, a key of ``RADIUS_FACTORS``"""
-        smallest, largest = RADII
-        self.radius.mul_(RADIUS_FACTORS[verdict]).clamp_(self.first_radius if self.holds else smallest, largest)
+        """
+        Where the habit does not hold the learning actor.
+
+        :param verdict: about a candidate, a key of ``RADIUS_FACTORS``
+        """
+        if not self.holds:
+            self.radius.mul_(RADIUS_FACTORS[verdict]).clamp_(*RADII)
+
+    def follow(self, gain: float) -> None:
+        """
+        Where the habit holds the learning actor.
+
+        :param gain: of an episode of the learning actor over the habit's mean return, as a share of that: from -1 to 1
+        """
+        if self.holds:
+            self.radius.mul_(math.exp(FOLLOWING_RATE * gain)).clamp_(self.first_radius, RADII[1])

@@ -437,6 +437,51 @@ def test_noisy_episodes_count_after_a_second_beginning_too():
     assert trials.noisy_returns == [8.0]
 
 
+@pytest.mark.parametrize(
+    ("habit", "paid", "gain"),
+    [
+        ([8.0, 12.0], 11.0, 0.1),
+        ([8.0, 12.0], 4.0, -0.6),
+        ([8.0, 12.0], 90.0, 1.0),
+        ([8.0, 12.0], -5.0, -1.0),
+        ([-40.0], -30.0, 0.25),
+        ([-40.0], -50.0, -0.25),
+        ([0.0], 3.0, 1.0),
+        ([0.0], 0.0, 0.0),
+        ([0.0], -3.0, -1.0),
+        ([], 3.0, 0.0),
+    ],
+)
+def test_what_a_noisy_episode_gains_is_a_share_of_what_the_habit_is_paid(habit, paid, gain):
+    trials = Trials(1, habit_returns=habit)
+    trials.step(0, paid - 1.0)
+    trials.step(0, 1.0)
+    assert trials.noisy_gain(0) == pytest.approx(gain)
+
+
+def test_quiet_episodes_and_those_of_a_learner_of_before_gain_nothing():
+    trials = Trials(2, habit_returns=[1.0], tests_habit=True)
+    play(trials, 3.0)
+    trials.step(0, 3.0)
+    trials.step(1, 3.0)
+    assert trials.roles == ["habit", "actor"]
+    assert (trials.noisy_gain(0), trials.noisy_gain(1)) == (0.0, 1.0)
+    trials.generation += 1
+    assert trials.noisy_gain(1) == 0.0
+
+
+@pytest.mark.parametrize("trust_radius", [0.0, 0.25])
+def test_a_radius_follows_the_learners_episodes_once_the_critic_presses(trust_radius, monkeypatch):
+    """Episodes of ten steps: the learner's are paid 10, the habit's 20. Before the 31st update nobody presses."""
+    ten = partial(CountingEnv, lengths=(10,), returns=(10.0, 20.0), cut=(True,))
+    model = imitating(ten, critic_warmup=30, policy_kwargs={"trust_radius": trust_radius}, **ONE_CLONE)
+    gains = []
+    if trust_radius:
+        monkeypatch.setattr(model.policy.trust_region, "follow", lambda gain: gains.append((model.num_timesteps, gain)))
+    model.learn(70)
+    assert gains == ([(40, 0.0), (50, -0.5), (60, 0.0), (70, -0.5)] if trust_radius else [])
+
+
 def test_a_reset_of_the_environments_forgets_running_episodes_and_nothing_else():
     trials = Trials(2)
     play_quiet(trials, 100.0)

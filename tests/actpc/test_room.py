@@ -143,13 +143,13 @@ def test_clones_that_imitate_between_demonstrations_have_smaller_synapses(apart,
         (0.08, (1.0, 1.0), None),
         (0.08, (1.0, 2.0), None),
         (0.12, (1.0, 1.0), HELD_UNIT),
-        (0.12, (1.0, 2.0), 1.0),
+        (0.12, (1.0, 2.0), HELD_UNIT),
         (0.12, (0.0, 0.0), 1.0),
-        (0.12, (-1.0, -1.0), 1.0),
+        (0.12, (0.0, -1.0), HELD_UNIT),
     ],
 )
 def test_the_trust_region_counts_by_the_demonstrations_spread_unless_the_clone_guesses_between_them(apart, paid, unit, noise):
-    """Where all that is paid is paid the same the habit holds the learner."""
+    """Then the habit holds the learner, unless nothing was paid."""
     keywords = {"observation_normalization": "none", "refresh_kwargs": {"noise": noise}}
     model = imitating(demonstrations=parallel_lines(apart, paid=paid), **keywords)
     region, spread = model.policy.trust_region, model.policy.spread
@@ -165,8 +165,9 @@ def test_the_trust_region_counts_by_the_demonstrations_spread_unless_the_clone_g
     [
         (0.12, {}, True),
         (0.08, {}, False),
-        (0.12, {"demonstrations": parallel_lines(0.12, paid=(1.0, 2.0))}, False),
-        (0.12, {"demonstrations": parallel_lines(0.12, paid=(2.0, 0.0)), "refresh_kwargs": {"weighting": "uniform"}}, True),
+        (0.12, {"demonstrations": parallel_lines(0.12, paid=(1.0, 2.0))}, True),
+        (0.12, {"demonstrations": parallel_lines(0.12, paid=(0.0, 0.0))}, False),
+        (0.12, {"demonstrations": parallel_lines(0.12, paid=(-2.0, 0.0)), "refresh_kwargs": {"weighting": "uniform"}}, True),
         (0.12, {"refresh_kwargs": {"habit": False}}, False),
         (0.08, {"refresh_kwargs": {"habit": True}}, True),
         (0.12, {"actor_pressure": 0.0}, False),
@@ -179,9 +180,7 @@ def test_the_trust_region_counts_by_the_demonstrations_spread_unless_the_clone_g
         (0.12, {"policy_kwargs": {"memory_history": 2}}, True),
     ],
 )
-def test_where_clones_guess_and_all_is_paid_the_same_the_habit_teaches_what_it_does_in_the_batchs_states(
-    apart, keywords, teaches
-):
+def test_where_clones_guess_the_habit_teaches_what_it_does_in_the_batchs_states(apart, keywords, teaches):
     model = imitating(**{"demonstrations": parallel_lines(apart), "observation_normalization": "none", **keywords})
     before = model.describe()
     model.learn(40)
@@ -213,12 +212,12 @@ def test_what_the_habit_teaches_is_learned(compiled, monkeypatch):
 
 @pytest.mark.parametrize("taught", [True, False])
 def test_whether_the_habit_teaches_is_decided_once_with_the_region(taught, tmp_path):
-    """Whatever is asked for later, and whatever the next demonstrations are paid."""
-    line = parallel_lines(0.12, paid=(1.0, 1.0 if taught else 2.0))
+    """Whatever is asked for later, and whatever the next demonstrations leave between them."""
+    line = parallel_lines(0.12 if taught else 0.08)
     model = imitating(demonstrations=line, observation_normalization="none")
     model.learn(40)
     model.save(tmp_path / "agent")
-    others = {"demonstrations": parallel_lines(0.12, paid=(1.0, 2.0 if taught else 1.0))}
+    others = {"demonstrations": parallel_lines(0.08 if taught else 0.12)}
     for changes in ({"refresh_kwargs": {"habit": not taught}}, others):
         loaded = ActPC.load(tmp_path / "agent", env=model.env, **changes)
         loaded.learn(20)

@@ -8,6 +8,7 @@ import torch as th
 from sb3_actpc.actpc.trust_region import (
     DEVIATION_RATE,
     FALL,
+    FOLLOWING_RATE,
     HELD_UNIT,
     LARGEST_UNHELD,
     MULTIPLIERS,
@@ -107,14 +108,15 @@ def test_a_wider_radius_is_reached_by_an_actor_that_follows_the_pressure():
     ],
 )
 def test_multiplier_and_radius_stay_within_bounds(make, largest):
-    """Where the unit is unknown the region is too wide to hold the actor: the multiplier has a bound of its own."""
-    for verdict, actions, multiplier in (("tied", ZEROS, largest), ("rejected", ZEROS + 1e6, MULTIPLIERS[0])):
+    """Where the unit is unknown the region is too wide to hold the actor: the multiplier has a bound of its own. Where the
+    habit holds it the radius never falls below the first."""
+    for verdict, gain, actions, multiplier in (("tied", 1, ZEROS, largest), ("rejected", -1, ZEROS + 1e6, MULTIPLIERS[0])):
         region = make()
-        smallest = 1.0 if region.holds else RADII[0]
         for _ in range(3000):
             region.regulate(actions, ZEROS, WORTH)
             region.resize(verdict)
-        assert float(region.radius) == pytest.approx(RADII[1] if verdict == "tied" else smallest)
+            region.follow(gain)
+        assert float(region.radius) == pytest.approx(RADII[1] if gain > 0 else 1.0 if region.holds else RADII[0])
         assert float(region.multiplier) == pytest.approx(multiplier)
 
 
@@ -125,18 +127,17 @@ def test_holding_its_own_widens_the_radius_and_losing_shrinks_it():
         assert (float(region.radius) > 1.0) == grows
 
 
-def test_a_learner_that_the_habit_holds_keeps_its_first_radius_and_what_it_has_won_can_be_lost():
-    """Elsewhere a learner that loses twice has half of it; a learner that is not held any more can lose it too."""
-    region, free = (measured_by([0.1, 0.1], guesses=True, holds=holds, radius=0.5) for holds in (True, False))
-    after = []
-    for verdict in ("rejected", "tied", "rejected", "rejected"):
-        region.resize(verdict)
-        free.resize(verdict)
-        after.append((float(region.radius), float(free.radius)))
-    assert after == [pytest.approx(both) for both in [(0.5, 0.35), (1.0, 0.7), (0.7, 0.49), (0.5, 0.343)]]
-    region.measure_by(th.tensor([0.1, 0.1]), guesses=False, holds=False)
-    region.resize("rejected")
-    assert float(region.radius) == pytest.approx(0.35)
+def test_where_the_habit_holds_the_learner_the_radius_follows_its_episodes_and_no_verdict():
+    """As many wins as losses of the same size leave it where it was, but for the first radius, below which it never falls."""
+    region, free = (measured_by([0.1, 0.1], guesses=True, holds=holds) for holds in (True, False))
+    radii = []
+    for gain in (0.5, 0.5, -0.5, -1.0, 1.0):
+        region.resize("tied")
+        region.follow(gain)
+        free.follow(gain)
+        radii.append(math.log(float(region.radius)) / FOLLOWING_RATE)
+    assert radii == pytest.approx([0.5, 1.0, 0.5, 0.0, 1.0], abs=1e-4)
+    assert float(free.radius) == 1.0
 
 
 def test_what_is_returned_does_not_change_with_the_next_update():
