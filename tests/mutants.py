@@ -662,8 +662,8 @@ MUTANTS = [
     Mutant(
         "a clone's verdict moves the radius",
         AGENT,
-        "and is_paid and not self.trials.is_clone",
-        "and is_paid",
+        "and trials.habit_return != 0.0 and not trials.is_clone",
+        "and trials.habit_return != 0.0",
         f"{HABIT} -k begins",
     ),
     Mutant(
@@ -690,7 +690,7 @@ MUTANTS = [
     Mutant(
         "a late clone is a candidate at once",
         AGENT,
-        "max(self.critic_warmup, self.trials.begun_at)",
+        "max(self.critic_warmup, trials.begun_at)",
         "self.critic_warmup",
         f"{HABIT} -k long_enough",
     ),
@@ -1177,7 +1177,13 @@ MUTANTS = [
         f"{ROOMS} -k teaches",
     ),
     Mutant("ties change nothing", REGION, '"tied": 2.0', '"tied": 1.0', REGIONS),
-    Mutant("unpaid ties widen", AGENT, "verdict is not None and is_paid", "verdict is not None", f"{HABIT} -k resized"),
+    Mutant(
+        "unpaid ties widen",
+        AGENT,
+        "verdict is not None and trials.habit_return != 0.0",
+        "verdict is not None",
+        f"{HABIT} -k resized",
+    ),
     Mutant(
         "old candidates count",
         TRIALS,
