@@ -686,8 +686,10 @@ class ActPC(OffPolicyAlgorithm):
         if self.actor_warm_start:
             self.actor.circuit.optimizer.state.clear()  # its moments are those of other learning rates
             self.policy.spread.copy_(spread_of(self._imitation_residuals()))
-            if self.policy.trust_region is not None:
-                self.policy.trust_region.measure_by(self.policy.spread, self.imitation.guesses, self.imitation.is_held)
+            region = self.policy.trust_region
+            if region is not None:  # a further clone changes nothing of what the first one has decided
+                is_held = bool(region.holds) if self.pretrained else self.imitation.is_held
+                region.measure_by(self.policy.spread, self.imitation.guesses, is_held)
 
     def _update_prior(self, batch_size: int) -> None:
         assert self.expert is not None
@@ -793,7 +795,7 @@ class ActPC(OffPolicyAlgorithm):
         if trials.n_clones:
             trials.imitated_return = self.imitation.mean_return()
         region, pressed_since = self.policy.trust_region, max(self.critic_warmup, trials.begun_at)
-        if region is not None and self._n_updates > pressed_since:
+        if region is not None and self._n_updates > self.critic_warmup:
             region.follow(trials.noisy_gain(env))
         verdict = trials.end(env, has_learned=self._n_updates > pressed_since + CANDIDATE_AGE)
         # nothing is proven where nothing is paid, and a clone proves nothing about the pressure

@@ -130,13 +130,16 @@ class Trials:
 
     def noisy_gain(self, env: int) -> float:
         """
-        Of the episode of ``env``, which has had its last step, over the habit: within the bounds -1 and 1 a share of the
-        habit's absolute mean return, or of nothing the sign. 0 where it is not the learning actor's, or another one began it.
+        Of the episode of ``env``, which has had its last step, over the habit's mean return, as a share of that or of the
+        most that an episode is paid beyond it, whichever is larger: so what is paid all or nothing gains in the mean where it
+        is paid more often. From -1 to 1; 0 where it is not the learning actor's, where a verdict fell while it ran, or where
+        the habit has no return yet.
         """
         if self.roles[env] != "actor" or self.generations[env] != self.generation or not self.habit_returns:
             return 0.0
-        gain, unit = self.returns[env] - self.habit_return, abs(self.habit_return)
-        return max(-1.0, min(1.0, gain / unit)) if unit else float((gain > 0.0) - (gain < 0.0))
+        gain = self.returns[env] - self.habit_return
+        unit = max(abs(self.habit_return), max(self.habit_returns) - self.habit_return, gain)
+        return max(-1.0, gain / unit) if unit else -float(gain < 0.0)
 
     def is_ahead(self) -> bool:
         """Whether the learning actor is paid more than the habit, even with noise."""

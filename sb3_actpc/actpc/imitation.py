@@ -104,7 +104,7 @@ class Imitation:
     def is_held(self) -> bool:
         """Whether the habit teaches the learning actor what to do in the states that are replayed: as asked for, or by default
         where clones guess: refresh alone moves it freely there, and that a grip was lost is seen hundreds of steps later, if
-        at all. Where no demonstration is paid its habit is nothing to be held to. Decided once, with the trust region's
+        at all. Where all demonstrations return 0 the habit is nothing to be held to. Decided once, with the trust region's
         unit."""
         agent, region, asked_for = self.agent, self.agent.policy.trust_region, self.agent.refresh.habit
         # a habit that is no clone has nothing to teach

@@ -21,8 +21,9 @@ RADII = 0.1, 1000.0  # below a third of a standard deviation nothing is learned
 # what a verdict about a candidate (:mod:`sb3_actpc.actpc.habit`) does to the radius
 RADIUS_FACTORS = {"accepted": 1.25, "tied": 2.0, "undecided": 1.0, "rejected": 0.7}
 # of the radius's logarithm, where the habit holds the learning actor: for an episode of that one which is paid twice what the
-# habit is, or nothing. A few hundred episodes of a gain of a fifth are a radius ten times as wide
+# habit is, or nothing. Some 250 episodes of a gain of a fifth are a radius ten times as wide
 FOLLOWING_RATE = 0.05
+LARGEST_HELD = HELD_UNIT**-2  # the radius there: half of the actions' range, beyond which nothing is held
 
 
 def spread_of(residuals: th.Tensor) -> th.Tensor:
@@ -48,10 +49,10 @@ class TrustRegion(nn.Module):
 
     Where the habit holds the learning actor the radius begins small, and follows every episode of that one in the place of
     verdicts, which are few where clones guess: it widens with what they are paid more than the habit, and shrinks with what
-    they are paid less, to the first radius and no further. A critic that has seen a few dozen of an arm's episodes takes its
-    actor to losses in a region of any size, and learns nothing in one of none.
+    they are paid less, to the first radius and no further. A critic that has seen a few dozen of an arm's episodes loses
+    with its actor however small the region is, and has to go on in one that it can learn in.
 
-    :param radius: at first, a mean squared distance in that unit
+    :param radius: at first, and where the habit holds the learning actor the smallest, a mean squared distance in that unit
     :param n_actions: A
     :raises ValueError: for a radius outside ``RADII``, within which outcomes move it
     """
@@ -78,9 +79,11 @@ class TrustRegion(nn.Module):
         self.begin()
 
     def begin(self) -> None:
-        """With an actor that does what its habit does."""
+        """With an actor that does what its habit does. What another one has won by its episodes says nothing of this one."""
         self.deviation.zero_()
         self.multiplier.fill_(FIRST_MULTIPLIER)
+        if self.holds:
+            self.radius.fill_(self.first_radius)
 
     def measure_by(self, spread: th.Tensor, guesses: bool, holds: bool) -> None:
         """
@@ -126,4 +129,4 @@ class TrustRegion(nn.Module):
         :param gain: of an episode of the learning actor over the habit's mean return, as a share of that: from -1 to 1
         """
         if self.holds:
-            self.radius.mul_(math.exp(FOLLOWING_RATE * gain)).clamp_(self.first_radius, RADII[1])
+            self.radius.mul_(math.exp(FOLLOWING_RATE * gain)).clamp_(self.first_radius, max(self.first_radius, LARGEST_HELD))
