@@ -33,7 +33,7 @@ from sb3_actpc.actpc.habit import (
 )
 from sb3_actpc.actpc.imitation import Imitation
 from sb3_actpc.actpc.self_imitation import imitated_return
-from sb3_actpc.actpc.trust_region import FIRST_MULTIPLIER, RADIUS_FACTORS, spread_of
+from sb3_actpc.actpc.trust_region import FIRST_MULTIPLIER, FOLLOWING_RATE, RADIUS_FACTORS, spread_of
 from tests.actpc.agents import QUICK, differ, imitating, make, weights_of
 from tests.actpc.envs import CountingEnv, demonstrations
 from tests.checkpoints.runs import assert_same, learn_in_two, learn_straight
@@ -446,17 +446,32 @@ def test_noisy_episodes_count_after_a_second_beginning_too():
         ([8.0, 12.0], -5.0, -1.0),
         ([-40.0], -30.0, 0.25),
         ([-40.0], -50.0, -0.25),
+        ([0.0, 0.0, 0.0, 40.0], 25.0, 0.5),  # of the 30 that its best episode is beyond its mean
+        ([0.0, 0.0, 0.0, 40.0], 0.0, -1 / 3),
         ([0.0], 3.0, 1.0),
         ([0.0], 0.0, 0.0),
         ([0.0], -3.0, -1.0),
         ([], 3.0, 0.0),
     ],
 )
-def test_what_a_noisy_episode_gains_is_a_share_of_what_the_habit_is_paid(habit, paid, gain):
+def test_what_a_noisy_episode_gains_is_a_share_of_what_the_habit_is_paid_or_can_be(habit, paid, gain):
     trials = Trials(1, habit_returns=habit)
     trials.step(0, paid - 1.0)
     trials.step(0, 1.0)
     assert trials.noisy_gain(0) == pytest.approx(gain)
+
+
+@pytest.mark.parametrize("n_successes", [1, 2, 5, 9])
+def test_paid_all_or_nothing_a_learner_gains_in_the_mean_where_it_succeeds_more_often(n_successes):
+    """Of ten episodes of the habit so many: whatever that is, the same share of them gains nothing."""
+    trials = Trials(1, habit_returns=[1.0] * n_successes + [0.0] * (10 - n_successes))
+    gains = []
+    for paid in (0.0, 1.0):
+        trials.returns = [paid]
+        gains.append(trials.noisy_gain(0))
+    for share in (0.1, 0.5, 0.9):
+        mean = share * gains[1] + (1.0 - share) * gains[0]
+        assert np.sign(round(mean, 9)) == np.sign(round(share - n_successes / 10, 9))
 
 
 def test_quiet_episodes_and_those_of_a_learner_of_before_gain_nothing():
@@ -470,16 +485,35 @@ def test_quiet_episodes_and_those_of_a_learner_of_before_gain_nothing():
     assert trials.noisy_gain(1) == 0.0
 
 
-@pytest.mark.parametrize("trust_radius", [0.0, 0.25])
-def test_a_radius_follows_the_learners_episodes_once_the_critic_presses(trust_radius, monkeypatch):
-    """Episodes of ten steps: the learner's are paid 10, the habit's 20. Before the 31st update nobody presses."""
-    ten = partial(CountingEnv, lengths=(10,), returns=(10.0, 20.0), cut=(True,))
-    model = imitating(ten, critic_warmup=30, policy_kwargs={"trust_radius": trust_radius}, **ONE_CLONE)
-    gains = []
-    if trust_radius:
-        monkeypatch.setattr(model.policy.trust_region, "follow", lambda gain: gains.append((model.num_timesteps, gain)))
-    model.learn(70)
-    assert gains == ([(40, 0.0), (50, -0.5), (60, 0.0), (70, -0.5)] if trust_radius else [])
+@pytest.mark.parametrize(
+    ("keywords", "n_gains"),
+    [({}, 2), ({"refresh_kwargs": {"n_clones": 1, "habit": False}}, 0), ({"policy_kwargs": {"trust_radius": 0.0}}, None)],
+)
+def test_a_radius_follows_the_learners_episodes_once_the_critic_presses(keywords, n_gains):
+    """Episodes of ten steps: the learner's are paid 30, the habit's 20. Before the 31st update nobody presses."""
+    ten = partial(CountingEnv, lengths=(10,), returns=(30.0, 20.0), cut=(True,))
+    model = imitating(ten, **{"critic_warmup": 30, "refresh_kwargs": {"n_clones": 1, "habit": True}, **keywords})
+    region = model.policy.trust_region
+    assert (region is None) == (n_gains is None)
+    for n_steps, n_followed in ((40, 0), (10, 1), (10, 1), (10, 2)):
+        model.learn(n_steps, reset_num_timesteps=not model.num_timesteps)
+        if region is not None:
+            expected = 0.25 * np.exp(FOLLOWING_RATE * 0.5 * min(n_followed, n_gains))
+            assert float(region.radius) == pytest.approx(expected)
+
+
+def test_an_accepted_clone_begins_with_the_first_radius_and_is_held_whatever_is_pressed_meanwhile():
+    """Elsewhere outcomes have made the radius, and it stays."""
+    for held in (True, False):
+        model = imitating(refresh_kwargs={"habit": held})
+        model.learn(20)
+        region = model.policy.trust_region
+        region.radius.fill_(3.0)
+        model.actor_pressure = 0.0
+        model.trials.is_clone = True
+        model._accept_candidate()
+        assert float(region.radius) == (0.25 if held else 3.0)
+        assert bool(region.holds) == held
 
 
 def test_a_reset_of_the_environments_forgets_running_episodes_and_nothing_else():

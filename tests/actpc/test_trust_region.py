@@ -10,6 +10,7 @@ from sb3_actpc.actpc.trust_region import (
     FALL,
     FOLLOWING_RATE,
     HELD_UNIT,
+    LARGEST_HELD,
     LARGEST_UNHELD,
     MULTIPLIERS,
     RADII,
@@ -109,14 +110,15 @@ def test_a_wider_radius_is_reached_by_an_actor_that_follows_the_pressure():
 )
 def test_multiplier_and_radius_stay_within_bounds(make, largest):
     """Where the unit is unknown the region is too wide to hold the actor: the multiplier has a bound of its own. Where the
-    habit holds it the radius never falls below the first."""
+    habit holds it the radius never falls below the first, and comes to half of the actions' range at most."""
     for verdict, gain, actions, multiplier in (("tied", 1, ZEROS, largest), ("rejected", -1, ZEROS + 1e6, MULTIPLIERS[0])):
         region = make()
         for _ in range(3000):
             region.regulate(actions, ZEROS, WORTH)
             region.resize(verdict)
             region.follow(gain)
-        assert float(region.radius) == pytest.approx(RADII[1] if gain > 0 else 1.0 if region.holds else RADII[0])
+        smallest, largest_radius = (1.0, LARGEST_HELD) if region.holds else RADII
+        assert float(region.radius) == pytest.approx(largest_radius if gain > 0 else smallest)
         assert float(region.multiplier) == pytest.approx(multiplier)
 
 
@@ -138,6 +140,13 @@ def test_where_the_habit_holds_the_learner_the_radius_follows_its_episodes_and_n
         radii.append(math.log(float(region.radius)) / FOLLOWING_RATE)
     assert radii == pytest.approx([0.5, 1.0, 0.5, 0.0, 1.0], abs=1e-4)
     assert float(free.radius) == 1.0
+
+
+def test_a_first_radius_beyond_all_that_can_be_held_stays():
+    region = measured_by([0.1, 0.1], guesses=True, holds=True, radius=100)
+    for gain in (1.0, -1.0):
+        region.follow(gain)
+        assert float(region.radius) == 100.0
 
 
 def test_what_is_returned_does_not_change_with_the_next_update():

@@ -3,6 +3,7 @@
 import os
 import signal
 from copy import deepcopy
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -81,6 +82,20 @@ def test_actpc(tmp_path: Path, n_envs: int, normalize: bool, stop_at: int) -> No
 )
 def test_actpc_with(tmp_path: Path, keywords: dict[str, Any]) -> None:
     check(lambda: make_actpc(CountingEnv, demonstrations=demonstrations(), **keywords), tmp_path, 90, 41)
+
+
+@pytest.mark.parametrize("n_envs", [1, 2])
+def test_a_radius_that_has_followed_episodes_goes_on(tmp_path: Path, n_envs: int) -> None:
+    ten_steps = partial(CountingEnv, lengths=(10,), returns=(30.0, 20.0, 10.0), cut=(True,))
+    keywords = {"demonstrations": demonstrations(), "alpha_ext": 1.0, "refresh_kwargs": {"habit": True}, "critic_warmup": 10}
+    made = []
+
+    def make() -> ActPC:
+        made.append(make_actpc(ten_steps, n_envs, **keywords))
+        return made[-1]
+
+    check(make, tmp_path, 150, 65)
+    assert all(float(model.policy.trust_region.radius) > 0.25 for model in (made[0], made[-1]))
 
 
 def test_actpc_with_dictionaries_of_observations(tmp_path: Path) -> None:
