@@ -1165,8 +1165,8 @@ MUTANTS = [
     Mutant(
         "a clone in a phase of imitation is not held",
         AGENT,
-        "bool(region.holds) if self.pretrained else ",
-        "",
+        "self.imitation.guesses, self.imitation.is_held",
+        "self.imitation.guesses, self.imitation.is_taught",
         f"{HABIT} -k first_radius",
     ),
     Mutant("whether it holds is forgotten", REGION, "self.holds.fill_(float(holds))", "pass", f"{ROOMS} -k decided_once"),
@@ -1178,11 +1178,24 @@ MUTANTS = [
         "self.guesses",
         f"{ROOMS} -k teaches",
     ),
-    Mutant("whether it holds is decided anew", IMITATION, "if agent.pretrained:", "if False:", f"{ROOMS} -k decided_once"),
+    Mutant(
+        "whether it holds is decided anew",
+        IMITATION,
+        "region is None or agent.pretrained",
+        "region is None",
+        f"{ROOMS} -k decided_once",
+    ),
+    Mutant(
+        "an actor that only imitates is taught",
+        IMITATION,
+        "return self.is_held and self._has_teacher",
+        "return self.is_held",
+        f"{ROOMS} -k decided_once",
+    ),
     Mutant(
         "the habit holds imitation alone", IMITATION, "agent.actor_pressure and agent.ref", "agent.ref", f"{ROOMS} -k teaches"
     ),
-    Mutant("a habit of nothing teaches", IMITATION, " and agent.actor_warm_start and", " and", f"{ROOMS} -k teaches"),
+    Mutant("a habit of nothing teaches", IMITATION, " and agent.actor_warm_start\n", "\n", f"{ROOMS} -k teaches"),
     Mutant(
         "nobody is taught",
         AGENT,

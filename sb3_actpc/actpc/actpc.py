@@ -302,7 +302,7 @@ class ActPC(OffPolicyAlgorithm):
         self.cloning: Cloning | None = None  # while the actor becomes a clone
         self.trials: Trials | None = None
         self._has_bar = False  # whether learning shows its progress
-        self._is_held = False  # whether the habit teaches the learning actor
+        self._is_taught = False  # whether the habit teaches the learning actor
         if _init_setup_model:
             self._setup_model()
             self._check_learning_rates()
@@ -547,7 +547,7 @@ class ActPC(OffPolicyAlgorithm):
             print(self.describe())
         self._has_bar = _shows_progress(result[1])
         self.pretrain(between_updates(result[1]), self._has_bar)
-        self._is_held = self.imitation.is_held
+        self._is_taught = self.imitation.is_taught
         self.start_time = time.time_ns()  # of the frames per second: pre-training has none
         self._compiled = self._compiled or compiled_update(self, self._total_timesteps)  # resumed, as straight
         return result
@@ -686,10 +686,8 @@ class ActPC(OffPolicyAlgorithm):
         if self.actor_warm_start:
             self.actor.circuit.optimizer.state.clear()  # its moments are those of other learning rates
             self.policy.spread.copy_(spread_of(self._imitation_residuals()))
-            region = self.policy.trust_region
-            if region is not None:  # a further clone changes nothing of what the first one has decided
-                is_held = bool(region.holds) if self.pretrained else self.imitation.is_held
-                region.measure_by(self.policy.spread, self.imitation.guesses, is_held)
+            if self.policy.trust_region is not None:
+                self.policy.trust_region.measure_by(self.policy.spread, self.imitation.guesses, self.imitation.is_held)
 
     def _update_prior(self, batch_size: int) -> None:
         assert self.expert is not None
@@ -960,7 +958,7 @@ class ActPC(OffPolicyAlgorithm):
         refresh alone does where nothing was shown, so that no pressure is left.
         """
         imitated = self.imitation.sample(len(batch.features))
-        if not self._is_held:
+        if not self._is_taught:
             return imitated
         assert self.actor.habit is not None
         features, actions, memory = imitated

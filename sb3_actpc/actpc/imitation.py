@@ -102,18 +102,27 @@ class Imitation:
 
     @property
     def is_held(self) -> bool:
-        """Whether the habit teaches the learning actor what to do in the states that are replayed: as asked for, or by default
-        where clones guess: refresh alone moves it freely there, and that a grip was lost is seen hundreds of steps later, if
-        at all. Where all demonstrations return 0 the habit is nothing to be held to. Decided once, with the trust region's
-        unit."""
+        """Whether the habit holds the learning actor: as asked for, or by default where clones guess: refresh alone moves it
+        freely there, and that a grip was lost is seen hundreds of steps later, if at all. Where all demonstrations return 0
+        the habit is nothing to be held to. Decided once, with the trust region's unit."""
         agent, region, asked_for = self.agent, self.agent.policy.trust_region, self.agent.refresh.habit
-        # a habit that is no clone has nothing to teach
-        has_roles = agent.actor_pressure and agent.refresh_weight and agent.actor_warm_start and agent.expert is not None
-        if region is None or not has_roles:
+        if region is None or agent.pretrained:
+            return region is not None and bool(region.holds)
+        if not self._has_teacher:
             return False
-        if agent.pretrained:
-            return bool(region.holds)
         return self.guesses and bool(agent.expert.episodes.returns.any()) if asked_for is None else asked_for
+
+    @property
+    def is_taught(self) -> bool:
+        """Whether it then teaches it, too, what to do in the states that are replayed."""
+        return self.is_held and self._has_teacher
+
+    @property
+    def _has_teacher(self) -> bool:
+        """A habit that is no clone has nothing to teach, and an actor that only imitates needs nobody to hold it."""
+        agent = self.agent
+        has_roles = agent.actor_pressure and agent.refresh_weight and agent.actor_warm_start
+        return bool(has_roles) and agent.expert is not None
 
     @property
     def noise(self) -> float:
@@ -184,7 +193,7 @@ class Imitation:
             f"noise on what the first clone imitates: {self.noise:g} of a step's length"
             f"{', and steps between the episodes' if self.noise else ''}"
             f"{'; every other further clone the other way' if self.noise_of(1) != self.noise else ''}"
-            f"{HELD if self.is_held else ''}"
+            f"{HELD if self.is_taught else ''}"
         )
 
     def _describe_parts(self) -> str:

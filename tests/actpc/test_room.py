@@ -221,10 +221,10 @@ def test_whether_the_habit_teaches_is_decided_once_with_the_region(taught, tmp_p
     for changes in ({"refresh_kwargs": {"habit": not taught}}, others):
         loaded = ActPC.load(tmp_path / "agent", env=model.env, **changes)
         loaded.learn(20)
-        assert loaded._is_held == taught
+        assert loaded._is_taught == taught
         assert (float(loaded.policy.trust_region.unit[0]) == pytest.approx(HELD_UNIT)) == taught
     loaded.actor_pressure = 0.0  # imitation alone is taught by nobody
-    assert not loaded.learn(20)._is_held
+    assert not loaded.learn(20)._is_taught
 
 
 @pytest.mark.parametrize("lengths", [(40,), (1, 1, 1)])
