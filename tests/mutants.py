@@ -457,8 +457,8 @@ MUTANTS = [
     Mutant(
         "a candidate plays on for ever",
         TRIALS,
-        "has_time = self.candidate_steps < MOST_PROOF_STEPS * (2 if is_doubtful else 1)",
-        "has_time = True",
+        "has_time = is_early or",
+        "has_time = True or",
         f"{HABIT} -k plays_on",
     ),
     Mutant(
@@ -965,7 +965,7 @@ MUTANTS = [
         f"{HABIT} -k spread",
     ),
     Mutant(
-        "a few successes prove a learner", TRIALS, "is_early = is_coin and has_time", "is_early = False", f"{HABIT} -k nothing"
+        "a few successes prove a learner", TRIALS, "is_few = is_coin and is_early", "is_few = False", f"{HABIT} -k nothing"
     ),
     Mutant(
         "a likely success is enough in the end",
@@ -978,9 +978,47 @@ MUTANTS = [
         "successes with noise hasten a learner", TRIALS, "is_doubtful = is_coin or", "is_doubtful =", f"{HABIT} -k nothing"
     ),
     Mutant(
-        "clones are learners of all or nothing", TRIALS, "is_coin = not self.is_clone and", "is_coin =", f"{HABIT} -k nothing"
+        "clones are learners of all or nothing",
+        TRIALS,
+        "return not self.is_clone and self.habit_return",
+        "return self.habit_return",
+        f"{HABIT} -k nothing",
     ),
-    Mutant("nothing is all", TRIALS, "return self.habit_return > 0.0 and", "return", f"{HABIT} -k nothing"),
+    Mutant("nothing is all", TRIALS, "self.habit_return > 0.0 and len(paid)", "len(paid)", f"{HABIT} -k nothing"),
+    Mutant("no race", TRIALS, "has_time = is_early or (is_coin", "has_time = is_early or (False", f"{HABIT} -k race"),
+    Mutant("a race for ever", TRIALS, "< MOST_PROOF_STEPS * RACING", "< MOST_PROOF_STEPS * 2 * RACING", f"{HABIT} -k race"),
+    Mutant("who gains no more races on", TRIALS, "(is_coin and gain > 0.0 and", "(is_coin and", f"{HABIT} -k race"),
+    Mutant(
+        "the candidate races alone", TRIALS, "is_habits_turn = self.habit_is_due", "is_habits_turn = False", f"{HABIT} -k race"
+    ),
+    Mutant(
+        "the habit races alone",
+        TRIALS,
+        "self.habit_proofs + 1, self.habit_steps + length, False",
+        "self.habit_proofs + 1, self.habit_steps + length, True",
+        f"{HABIT} -k race",
+    ),
+    Mutant(
+        "all race",
+        TRIALS,
+        "MOST_PROOF_STEPS * DOUBTFUL and self._is_coin()",
+        "MOST_PROOF_STEPS * DOUBTFUL",
+        f"{HABIT} -k race",
+    ),
+    Mutant(
+        "a race from the first episode on",
+        TRIALS,
+        "self.on_trial and self.candidate_steps >= MOST_PROOF_STEPS * DOUBTFUL",
+        "self.on_trial",
+        f"{HABIT} -k race",
+    ),
+    Mutant(
+        "twenty episodes are asked in a race too",
+        TRIALS,
+        "is_few = is_coin and is_early",
+        "is_few = is_coin and has_time",
+        f"{HABIT} -k nothing",
+    ),
     Mutant("too few successes are a tie", TRIALS, '"undecided" if is_coin else "tied"', '"tied"', f"{HABIT} -k nothing"),
     Mutant(
         "given synapses have no rivals",
@@ -1324,8 +1362,8 @@ MUTANTS = [
     Mutant(
         "unseen falls count for nothing",
         TRIALS,
-        "gain >= self._unseen_risk() * unit and not is_early",
-        "not is_early",
+        "gain >= self._unseen_risk() * unit and not is_few",
+        "not is_few",
         f"{HABIT} -k occasion",
     ),
     Mutant(

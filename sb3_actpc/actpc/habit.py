@@ -17,6 +17,8 @@ N_PROOFS = 2  # episodes of a candidate at least, before it is judged by less th
 # environment steps, or episodes however short: of a candidate before it is judged, and of the habit after one not accepted
 PROOF_STEPS, ENOUGH_PROOFS = 500, 10
 MOST_PROOF_STEPS = 2000  # that a candidate has for a proof
+# times as many: of a learner that is not surely better, and of one that gains where episodes are paid all or nothing
+DOUBTFUL, RACING = 2, 4
 MANY_PROOFS = 20  # episodes of a learner that are paid all or nothing, before it is accepted
 # of the habit, which is frozen: with random goals the last twenty alone may all be unlucky; and of the learning actor
 KEPT_RETURNS, KEPT_NOISY_RETURNS = 100, 2
@@ -63,8 +65,9 @@ class Trials:
 
     Where an episode is paid all or nothing, as a lifted cube is, a few say little, and whoever looks after each of them finds
     a gain in the end. Beside a habit that is paid at all a learner then has twice the steps in any case, plays
-    ``MANY_PROOFS`` episodes in them if it can, and must gain ``SURE`` of its standard errors to the end; what is then neither
-    is undecided, and no reason to go farther. Of episodes of 500 steps and more hardly any gain is so sure.
+    ``MANY_PROOFS`` episodes in them if it can, and must gain ``SURE`` of its standard errors to the end. While it gains,
+    it has twice as many again, a *race* in which it takes turns with the habit, whose own return was partly luck; what is
+    then neither is undecided, and no reason to go farther.
 
     Clones of the same demonstrations can do very differently, by their first synapses alone. So while the habit is paid less
     than what it imitates, further clones are candidates: before anything is learned, where ``GREAT_SHORTFALL`` of it is
@@ -89,6 +92,7 @@ class Trials:
     candidate_steps: int = 0
     habit_proofs: int = 0  # episodes since the last verdict, and their steps
     habit_steps: int = 0
+    habit_is_due: bool = False  # in a race: the candidate has played the last quiet episode
     imitated_return: float = 0.0  # what the imitated episodes were paid
     n_clones: int = 0  # that may still be tried
     n_tried: int = 0  # that were
@@ -199,12 +203,13 @@ class Trials:
         if role == "candidate":
             self.candidate_returns.append(episode_return)
             self.candidate_steps += length
+            self.habit_is_due = True
             verdict = self._judge()
             if verdict is not None:
                 self._conclude(verdict)
             return verdict
         self.habit_returns = [*self.habit_returns, episode_return][-KEPT_RETURNS:]
-        self.habit_proofs, self.habit_steps = self.habit_proofs + 1, self.habit_steps + length
+        self.habit_proofs, self.habit_steps, self.habit_is_due = self.habit_proofs + 1, self.habit_steps + length, False
         self.tests_habit = len(self.habit_returns) < N_PROOFS or not _is_tried(self.habit_proofs, self.habit_steps)
         return None
 
@@ -216,7 +221,8 @@ class Trials:
             learning actor's average
         """
         has_candidate = self.on_trial or (not self.tests_habit and (self.has_learned or self.needs_clone()))
-        quiet: Role = "candidate" if has_candidate else "habit"
+        is_habits_turn = self.habit_is_due and self._is_race()
+        quiet: Role = "candidate" if has_candidate and not is_habits_turn else "habit"
         begins = self.on_trial and len(self.candidate_returns) < N_PROOFS  # its first episodes follow each other
         is_quiet = begins or self.roles[env] == "actor" or self.quiet_due[env] > 0
         self.roles[env] = quiet if is_quiet else "actor"
@@ -237,9 +243,10 @@ class Trials:
         great_loss = gain + SURE * error < -GREAT_LOSS * unit
         if not _is_tried(n, self.candidate_steps) and not (n >= N_PROOFS and great_loss):
             return None
-        is_coin = not self.is_clone and self._is_all_or_nothing()
+        is_coin = self._is_coin()
         is_doubtful = is_coin or not (self.is_clone or self.is_ahead())
-        has_time = self.candidate_steps < MOST_PROOF_STEPS * (2 if is_doubtful else 1)
+        is_early = self.candidate_steps < MOST_PROOF_STEPS * (DOUBTFUL if is_doubtful else 1)
+        has_time = is_early or (is_coin and gain > 0.0 and self.candidate_steps < MOST_PROOF_STEPS * RACING)
         if great_loss:
             return "rejected"
         if n < N_PROOFS:
@@ -247,14 +254,19 @@ class Trials:
         if gain < -max(smallest, LIKELY * error if has_time else 0.0):
             return "rejected"
         if gain > 0.0 and gain >= max(smallest, (SURE if has_time or is_coin else LIKELY) * error):
-            is_early = is_coin and has_time and n < MANY_PROOFS
-            return "accepted" if gain >= self._unseen_risk() * unit and not is_early else None
+            is_few = is_coin and is_early and n < MANY_PROOFS
+            return "accepted" if gain >= self._unseen_risk() * unit and not is_few else None
         is_open = abs(gain) + SURE * error > smallest
         return "tied" if not is_open else None if has_time else "undecided" if is_coin else "tied"
 
-    def _is_all_or_nothing(self) -> bool:
-        """Whether all paid episodes of habit and candidate are paid the same, and the habit has one."""
-        return self.habit_return > 0.0 and len({*self.habit_returns, *self.candidate_returns} - {0.0}) == 1
+    def _is_coin(self) -> bool:
+        """Whether a learner is judged, and all paid episodes of it and the habit are paid the same, and the habit has one."""
+        paid = {*self.habit_returns, *self.candidate_returns} - {0.0}
+        return not self.is_clone and self.habit_return > 0.0 and len(paid) == 1
+
+    def _is_race(self) -> bool:
+        """Whether candidate and habit take turns."""
+        return self.on_trial and self.candidate_steps >= MOST_PROOF_STEPS * DOUBTFUL and self._is_coin()
 
     def _unseen_risk(self) -> float:
         """By how much more likely the candidate's next episode is a first fall than the habit's, by the rule of succession:

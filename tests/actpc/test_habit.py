@@ -269,7 +269,7 @@ def test_a_loss_that_may_be_chance_is_not_held_against_a_candidate_while_it_has_
 def test_of_short_episodes_a_candidate_may_play_as_many_as_it_takes():
     """Successes of 0 or 1, two fifths against one: 35 episodes tell the two apart by the errors asked for, ten do not."""
     length = MOST_PROOF_STEPS // 40
-    for n_needed, paid in ((35, [0.0, 0.0, 1.0, 0.0, 1.0] * 7), (80, [0.0, 1.0, 0.0, 0.0] * 20)):
+    for n_needed, paid in ((35, [0.0, 0.0, 1.0, 0.0, 1.0] * 7), (80, [0.0, 1.0, 0.0, 0.0, 0.0] * 16)):
         trials = Trials(1, habit_returns=[0.0, 0.0, 1.0, 0.0, 0.0] * 4, tests_habit=False)
         verdicts = [play_quiet(trials, one, length)[1] for one in paid[:n_needed]]
         assert verdicts == [None] * (n_needed - 1) + ["accepted" if n_needed == 35 else "undecided"]
@@ -282,7 +282,8 @@ def test_of_short_episodes_a_candidate_may_play_as_many_as_it_takes():
         (False, [1.0, 0.0], 100, [1.0], MANY_PROOFS, "accepted"),  # in 2000 of 4000 steps
         (True, [1.0, 0.0], 100, [1.0], 5, "accepted"),  # a gain of 0.5 by errors of 0.23, after 500 steps
         (False, [1.0, 0.0], 250, [1.0], 16, "accepted"),  # it had its steps
-        (False, [1.0, 0.0], 250, [1.0, 0.0, 1.0, 1.0, 0.0], 16, "undecided"),  # 0.125, and errors of 0.17
+        (False, [1.0, 0.0], 250, [1.0, 0.0], 16, "undecided"),  # no gain
+        (False, [1.0, 0.0], 250, [1.0, 0.0, 1.0, 1.0, 0.0], 32, "undecided"),  # 0.09, and errors of 0.14
         (True, [1.0, 0.0], 250, [1.0, 0.0, 1.0, 1.0, 0.0], 8, "accepted"),  # 0.125, and half of 0.21
         (False, [0.0, 0.0], 100, [1.0], 5, "accepted"),  # nothing to lose
         (False, [-1.0, 0.0], 100, [0.0], 5, "accepted"),  # a cost is not nothing
@@ -301,6 +302,57 @@ def test_of_a_learner_that_is_paid_all_or_nothing_many_episodes_or_all_of_its_st
         cast(trials, "candidate")
         verdicts.append(play(trials, paid, length)[1])
     assert verdicts == [None] * (n_needed - 1) + [verdict]
+
+
+def race(trials, candidate, habit=(), length=400):
+    """A learner's trial from its 4,000 steps on: who played each quiet episode, and the verdict."""
+    trials.on_trial, trials.candidate_steps, trials.habit_is_due = True, MOST_PROOF_STEPS * 2, True
+    trials.begin(0)
+    paid, roles, verdict = {"candidate": list(candidate), "habit": list(habit)}, [], None
+    while verdict is None and paid["candidate"]:
+        role = trials.roles[0]
+        verdict = play(trials, 0.0 if role == "actor" else paid[role].pop(0), length)[1]
+        roles += [role] * (role != "actor")
+    return roles, verdict
+
+
+def test_a_learner_of_all_or_nothing_that_gains_by_chance_perhaps_races_against_the_habit():
+    """0.95 of twenty against 1.00: 0.05, and 1.5 errors of 0.05. Its own next ten, and ten of the habit, two of which fail,
+    make it 0.1, and 1.5 errors of 0.07."""
+    trials = Trials(1, habit_returns=[0.0] + [1.0] * 19, candidate_returns=[1.0] * 20)
+    roles, verdict = race(trials, [1.0] * 10, [1.0, 0.0] * 2 + [1.0] * 6)
+    assert roles == ["habit", "candidate"] * 4
+    assert verdict == "accepted"
+    assert trials.habit_returns == [1.0] * 24  # the candidate's: what the habit had is gone
+
+
+@pytest.mark.parametrize(
+    ("n_habit", "candidate", "n_turns", "verdict"),
+    [
+        (20, [1.0] * 10, 10, "undecided"),  # it has had its 8,000 steps
+        (20, [1.0, 0.0], 2, "undecided"),  # it gains no more
+        (40, [0.0], 1, "rejected"),  # a loss, by then of any size
+    ],
+)
+def test_a_race_ends_where_the_learner_gains_no_more_or_has_had_its_time(n_habit, candidate, n_turns, verdict):
+    trials = Trials(1, habit_returns=[0.0] + [1.0] * (n_habit - 1), candidate_returns=[1.0] * 20)
+    roles, ended = race(trials, candidate, [1.0] * 10)
+    assert (ended, roles) == (verdict, ["habit", "candidate"] * n_turns)
+    assert trials.tests_habit and not trials.on_trial
+
+
+@pytest.mark.parametrize(("is_clone", "habit"), [(True, [0.0] + [1.0] * 19), (False, [0.5] + [1.0] * 19), (False, [0.0] * 20)])
+def test_clones_and_graded_returns_do_not_race(is_clone, habit):
+    trials = Trials(1, is_clone=is_clone, habit_returns=habit, candidate_returns=[1.0] * 20)
+    assert race(trials, [1.0] * 10)[0] == ["candidate"]
+
+
+@pytest.mark.parametrize(("missing", "first"), [(0, "habit"), (1, "candidate")])
+def test_a_race_begins_where_a_trial_would_end(missing, first):
+    trials = Trials(1, habit_returns=[0.0] + [1.0] * 19, candidate_returns=[1.0] * 20, on_trial=True, habit_is_due=True)
+    trials.candidate_steps = MOST_PROOF_STEPS * 2 - missing
+    trials.begin(0)
+    assert trials.roles == [first]
 
 
 def test_an_unlucky_row_of_the_habits_episodes_is_no_candidates_chance():
