@@ -129,8 +129,9 @@ class ActPC(OffPolicyAlgorithm):
         predictive-coding literature) or "iterative" (settle, then change; the paper's K steps
         of eq. 1 with ``circuit_kwargs=dict(dynamics="state")``)
     :param exploration_noise: standard deviation of the Gaussian noise on the actions in [-1, 1]; with demonstrations at most
-        their spread around the warm-started actor (0.02 at least), dimension by dimension. With a habit a noisy episode is
-        followed by as many steps without. 0 for none (the paper)
+        their spread around the warm-started actor (0.02 at least), dimension by dimension, or, where the habit holds the
+        learning actor, the trust region's unit. With a habit a noisy episode is followed by as many steps without. 0 for none
+        (the paper)
     :param policy_delay: updates of the critic for each of the actor, as in TD3; the paper's is 1
     :param demonstrations: a path, a Minari id, or a :class:`~sb3_actpc.demonstrations.dataset.Demonstrations`. A path is saved
         as it was given; others can be set later (``agent.demonstrations = ...``), which a trained prior outlasts
@@ -733,8 +734,14 @@ class ActPC(OffPolicyAlgorithm):
         return self.policy.unscale_action(scaled), scaled
 
     def _exploration(self, shape: tuple[int, ...]) -> np.ndarray:
-        """Gaussian noise, no wider in any dimension than the demonstrations spread around the warm-started actor."""
-        scale = self.policy.spread.clamp_max(float(self.exploration_noise)).cpu().numpy().reshape(shape[1:])
+        """
+        Gaussian noise, in any dimension no wider than the demonstrations spread around the warm-started actor. Where the
+        habit holds the learning actor that says nothing of where it may go: than the trust region's unit, as the critic must
+        have seen there what actions do.
+        """
+        region = self.policy.trust_region
+        widest = region.unit if region is not None and self._is_taught else self.policy.spread
+        scale = widest.clamp_max(float(self.exploration_noise)).cpu().numpy().reshape(shape[1:])
         return np.random.normal(size=shape).astype(np.float32) * scale
 
     def _imitation_residuals(self) -> th.Tensor:

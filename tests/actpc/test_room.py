@@ -197,6 +197,23 @@ def test_where_clones_guess_the_habit_teaches_what_it_does_in_the_batchs_states(
         assert not th.allclose(actions[16:], model.actor.circuit.project(batch.features, batch.memory))
 
 
+@pytest.mark.parametrize(
+    ("asked_for", "keywords", "expected"),
+    [
+        (0.1, {}, 0.1),
+        (0.3, {}, HELD_UNIT),
+        (0.1, {"refresh_kwargs": {"habit": False}}, 0.02),
+        (0.1, {"actor_pressure": 0.0}, 0.02),
+    ],
+)
+def test_where_the_habit_teaches_the_noise_is_as_wide_as_the_region(asked_for, keywords, expected):
+    """The clone of these demonstrations errs by less than a fiftieth, which says nothing of where the learning actor may go."""
+    model = imitating(demonstrations=parallel_lines(0.12), exploration_noise=asked_for, **keywords)
+    model.learn(1)
+    model.policy.spread.fill_(0.02)
+    assert model._exploration((20_000, 2)).std(0) == pytest.approx([expected] * 2, rel=0.05)
+
+
 @pytest.mark.parametrize("compiled", [False, True])
 def test_what_the_habit_teaches_is_learned(compiled, monkeypatch):
     """Whatever is taught next: an update of the actor settles the steps that are imitated and as many states of the batch."""
