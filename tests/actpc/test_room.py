@@ -207,7 +207,7 @@ def test_where_clones_guess_the_habit_teaches_what_it_does_in_the_batchs_states(
     ],
 )
 def test_where_the_habit_teaches_the_noise_is_as_wide_as_the_region(asked_for, keywords, expected):
-    """The clone of these demonstrations errs by less than a fiftieth, which says nothing of where the learning actor may go."""
+    """The clone errs by less than a fiftieth here, which says nothing of where the learning actor may go."""
     model = imitating(demonstrations=parallel_lines(0.12), exploration_noise=asked_for, **keywords)
     model.learn(1)
     model.policy.spread.fill_(0.02)
