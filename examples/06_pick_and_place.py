@@ -1,6 +1,6 @@
 """A goal task that is never paid: each step costs 1 until a cube is at its goal. A scripted arm shows FetchPickAndPlace.
 
-Needs pip install -e ".[fetch]". A quarter of an hour on one core; two numbers, of episodes and of the seed, can be given.
+Needs pip install -e ".[fetch]". Half an hour on one core; two numbers, of episodes and of the seed, can be given.
 What it prints is in docs/tasks.md.
 """
 
@@ -45,9 +45,10 @@ def success(model: ActPC) -> float:
 
 shown = Demonstrations.record(pick_and_place, ENV_ID, n_episodes=N_EPISODES, seed=1000)
 print(shown)
-model = ActPC("MultiInputPolicy", ENV_ID, demonstrations=shown, gamma=0.95, seed=SEED)
+hindsight = {"replay_buffer_class": "HerReplayBuffer"}
+model = ActPC("MultiInputPolicy", ENV_ID, demonstrations=shown, gamma=0.95, seed=SEED, **hindsight)
 model.learn(1)
 print(f"success of the first clone: {success(model):.2f}")
-for _ in range(4):
+for _ in range(6):
     model.learn(5_000, reset_num_timesteps=False)
     print(f"after {model.num_timesteps} steps: {success(model):.2f}, clones left to try: {model.trials.n_clones}", flush=True)
