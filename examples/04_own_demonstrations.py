@@ -1,6 +1,6 @@
 """A goal task with own demonstrations: a scripted arm shows FetchReach, ActPC imitates it and learns with hindsight.
 
-Needs pip install -e ".[fetch]". Some minutes.
+Needs pip install -e ".[fetch]". Ten minutes.
 """
 
 import gymnasium as gym
@@ -26,7 +26,7 @@ demonstrations.save("fetch_reach.npz")  # sb3-actpc train --env FetchReach-v4 --
 print(demonstrations)
 
 model = ActPC(env=ENV_ID, **{**preset(ENV_ID), "demonstrations": demonstrations}, seed=0)
-for steps in (1, 4_000):
+for steps in (1, 10_000):
     model.learn(steps, progress_bar=True)  # one step: imitation alone
     mean, _ = evaluate_policy(model, model.get_env(), n_eval_episodes=20)
     print(f"after {model.num_timesteps} steps: mean return {mean:.2f}")

@@ -1001,15 +1001,22 @@ MUTANTS = [
     Mutant(
         "all race",
         TRIALS,
-        "MOST_PROOF_STEPS * DOUBTFUL and self._is_coin()",
-        "MOST_PROOF_STEPS * DOUBTFUL",
+        "return self.on_trial and has_played and self._is_coin()",
+        "return self.on_trial and has_played",
         f"{HABIT} -k race",
     ),
     Mutant(
         "a race from the first episode on",
         TRIALS,
-        "self.on_trial and self.candidate_steps >= MOST_PROOF_STEPS * DOUBTFUL",
-        "self.on_trial",
+        "self.on_trial and has_played and",
+        "self.on_trial and",
+        f"{HABIT} -k race",
+    ),
+    Mutant(
+        "a race after one long episode",
+        TRIALS,
+        "len(self.candidate_returns) >= N_PROOFS and self.candidate_steps",
+        "self.candidate_steps",
         f"{HABIT} -k race",
     ),
     Mutant(

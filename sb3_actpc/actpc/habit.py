@@ -66,8 +66,8 @@ class Trials:
     Where an episode is paid all or nothing, as a lifted cube is, a few say little, and whoever looks after each of them finds
     a gain in the end. Beside a habit that is paid at all a learner then has twice the steps in any case, plays
     ``MANY_PROOFS`` episodes in them if it can, and must gain ``SURE`` of its standard errors to the end. While it gains,
-    it has twice as many again, a *race* in which it takes turns with the habit, whose own return was partly luck; what is
-    then neither is undecided, and no reason to go farther.
+    it has as many again, a *race* in which it takes turns with the habit, whose own return was partly luck; what is then
+    neither is undecided, and no reason to go farther. With the habit's and the noisy episodes that is three times as long.
 
     Clones of the same demonstrations can do very differently, by their first synapses alone. So while the habit is paid less
     than what it imitates, further clones are candidates: before anything is learned, where ``GREAT_SHORTFALL`` of it is
@@ -266,7 +266,8 @@ class Trials:
 
     def _is_race(self) -> bool:
         """Whether candidate and habit take turns."""
-        return self.on_trial and self.candidate_steps >= MOST_PROOF_STEPS * DOUBTFUL and self._is_coin()
+        has_played = len(self.candidate_returns) >= N_PROOFS and self.candidate_steps >= MOST_PROOF_STEPS * DOUBTFUL
+        return self.on_trial and has_played and self._is_coin()
 
     def _unseen_risk(self) -> float:
         """By how much more likely the candidate's next episode is a first fall than the habit's, by the rule of succession:

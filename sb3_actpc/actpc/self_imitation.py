@@ -50,7 +50,7 @@ class Refresh:
         others
     :param habit: whether the habit, where it began as a clone, teaches the learning actor too, in the batch's states (half of
         what refresh imitates), if a critic presses; decided at the warm start. None for where clones guess between the
-        demonstrations, unless all of these return 0. False for the paper
+        demonstrations, unless all of these return 0; noise is then as wide as the trust region's unit. False for the paper
     :raises ValueError: for another value
     """
 

@@ -317,8 +317,8 @@ def race(trials, candidate, habit=(), length=400):
 
 
 def test_a_learner_of_all_or_nothing_that_gains_by_chance_perhaps_races_against_the_habit():
-    """0.95 of twenty against 1.00: 0.05, and 1.5 errors of 0.05. Its own next ten, and ten of the habit, two of which fail,
-    make it 0.1, and 1.5 errors of 0.07."""
+    """0.95 of twenty against 1.00: 0.05, and 1.5 errors of 0.05. Four more of the habit, of which two fail, and four of the
+    learner's make it 0.125, and 1.5 errors of 0.07."""
     trials = Trials(1, habit_returns=[0.0] + [1.0] * 19, candidate_returns=[1.0] * 20)
     roles, verdict = race(trials, [1.0] * 10, [1.0, 0.0] * 2 + [1.0] * 6)
     assert roles == ["habit", "candidate"] * 4
@@ -347,9 +347,10 @@ def test_clones_and_graded_returns_do_not_race(is_clone, habit):
     assert race(trials, [1.0] * 10)[0] == ["candidate"]
 
 
-@pytest.mark.parametrize(("missing", "first"), [(0, "habit"), (1, "candidate")])
-def test_a_race_begins_where_a_trial_would_end(missing, first):
-    trials = Trials(1, habit_returns=[0.0] + [1.0] * 19, candidate_returns=[1.0] * 20, on_trial=True, habit_is_due=True)
+@pytest.mark.parametrize(("missing", "n", "first"), [(0, 20, "habit"), (1, 20, "candidate"), (0, 1, "candidate")])
+def test_a_race_begins_where_a_trial_would_end(missing, n, first):
+    """Which is after two episodes at least."""
+    trials = Trials(1, habit_returns=[0.0] + [1.0] * 19, candidate_returns=[1.0] * n, on_trial=True, habit_is_due=True)
     trials.candidate_steps = MOST_PROOF_STEPS * 2 - missing
     trials.begin(0)
     assert trials.roles == [first]

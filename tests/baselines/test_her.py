@@ -264,7 +264,7 @@ def test_actpc_and_her_run_on_fetch(tmp_path) -> None:
 
 @pytest.mark.slow
 def test_actpc_does_not_fall_below_what_a_slow_arm_shows_of_fetch_reach() -> None:
-    """A critic that has seen the arm's actions alone presses away from the goal."""
+    """A critic that has seen the arm's actions alone presses away from the goal: -31 after 6,000 steps."""
     pytest.importorskip("gymnasium_robotics")
     env = make_env("FetchReach-v4", {})
 
@@ -273,11 +273,11 @@ def test_actpc_does_not_fall_below_what_a_slow_arm_shows_of_fetch_reach() -> Non
 
     shown = Demonstrations.record(slowly, env, n_episodes=40, only_successes=True)
     settings = {**preset("FetchReach-v4"), "demonstrations": shown, "actor_warm_start": 2000}
-    model = ActPC(env=env, **settings, seed=0, device="cpu").learn(4000)
+    model = ActPC(env=env, **settings, seed=0, device="cpu").learn(8000)
     habit, _ = evaluate_policy(model, model.get_env(), 20)
     model.actor.habit.load_state_dict(model.actor.circuit.state_dict())
     learning, _ = evaluate_policy(model, model.get_env(), 20)
-    assert min(habit, learning) > shown.episode_returns.mean() - 1.5
+    assert habit > shown.episode_returns.mean() - 1.5 and learning > shown.episode_returns.mean() - 0.5
 
 
 @pytest.mark.slow
