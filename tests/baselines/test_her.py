@@ -273,7 +273,7 @@ def test_actpc_does_not_fall_below_what_a_slow_arm_shows_of_fetch_reach() -> Non
 
     shown = Demonstrations.record(slowly, env, n_episodes=40, only_successes=True)
     settings = {**preset("FetchReach-v4"), "demonstrations": shown, "actor_warm_start": 2000}
-    model = ActPC(env=env, **settings, seed=0, device="cpu").learn(8000)
+    model = ActPC(env=env, **settings, seed=0, device="cpu").learn(10_000)
     habit, _ = evaluate_policy(model, model.get_env(), 20)
     model.actor.habit.load_state_dict(model.actor.circuit.state_dict())
     learning, _ = evaluate_policy(model, model.get_env(), 20)
