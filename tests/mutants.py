@@ -994,8 +994,8 @@ MUTANTS = [
     Mutant(
         "the habit races alone",
         TRIALS,
-        "self.habit_proofs + 1, self.habit_steps + length, False",
-        "self.habit_proofs + 1, self.habit_steps + length, True",
+        'self.habit_is_due = role == "candidate"',
+        "self.habit_is_due = True",
         f"{HABIT} -k race",
     ),
     Mutant(

@@ -129,7 +129,7 @@ class ActPC(OffPolicyAlgorithm):
         predictive-coding literature) or "iterative" (settle, then change; the paper's K steps
         of eq. 1 with ``circuit_kwargs=dict(dynamics="state")``)
     :param exploration_noise: standard deviation of the Gaussian noise on the actions in [-1, 1]; with demonstrations at most
-        their spread around the warm-started actor (0.02 at least), dimension by dimension, or, where the habit holds the
+        their spread around the warm-started actor (0.02 at least), dimension by dimension, or, where the habit teaches the
         learning actor, the trust region's unit. With a habit a noisy episode is followed by as many steps without. 0 for none
         (the paper)
     :param policy_delay: updates of the critic for each of the actor, as in TD3; the paper's is 1
@@ -735,9 +735,9 @@ class ActPC(OffPolicyAlgorithm):
 
     def _exploration(self, shape: tuple[int, ...]) -> np.ndarray:
         """
-        Gaussian noise, in any dimension no wider than the demonstrations spread around the warm-started actor. Where the
-        habit holds the learning actor that says nothing of where it may go: than the trust region's unit, as the critic must
-        have seen there what actions do.
+        Gaussian noise, in any dimension no wider than the demonstrations spread around the warm-started actor or, where the
+        habit teaches the learning actor, than the trust region's unit: where that may go the critic must have seen what
+        actions do.
         """
         region = self.policy.trust_region
         widest = region.unit if region is not None and self._is_taught else self.policy.spread

@@ -200,16 +200,16 @@ class Trials:
 
     def _count(self, role: Role, episode_return: float, length: int) -> Verdict | None:
         """A quiet episode, once those that began before it have ended: of several environments the first to end are short."""
+        self.habit_is_due = role == "candidate"
         if role == "candidate":
             self.candidate_returns.append(episode_return)
             self.candidate_steps += length
-            self.habit_is_due = True
             verdict = self._judge()
             if verdict is not None:
                 self._conclude(verdict)
             return verdict
         self.habit_returns = [*self.habit_returns, episode_return][-KEPT_RETURNS:]
-        self.habit_proofs, self.habit_steps, self.habit_is_due = self.habit_proofs + 1, self.habit_steps + length, False
+        self.habit_proofs, self.habit_steps = self.habit_proofs + 1, self.habit_steps + length
         self.tests_habit = len(self.habit_returns) < N_PROOFS or not _is_tried(self.habit_proofs, self.habit_steps)
         return None
 
