@@ -1,6 +1,6 @@
 """A goal task with own demonstrations: a scripted arm shows FetchReach, ActPC imitates it and learns with hindsight.
 
-Needs pip install -e ".[fetch]". Ten minutes.
+Needs pip install -e ".[fetch]". Some minutes.
 """
 
 import gymnasium as gym
