@@ -165,7 +165,8 @@ class ActPC(OffPolicyAlgorithm):
         then tell better what is done, but for what never changes within one: :mod:`sb3_actpc.actpc.within_episodes`) or
         "bounds" (those of the observation space, which must be finite, become -1 and 1)
     :param compile: run the updates of circuits that sweep, or settle by eq. 1, as one graph of ``torch.compile`` (see
-        :mod:`~sb3_actpc.actpc.compiled`): True, False or "auto", where the run is long enough to earn it
+        :mod:`~sb3_actpc.actpc.compiled`): True, False or "auto", where the run is long enough to earn it. On a GPU True and
+        "auto" also record the whole update as a CUDA graph (:mod:`~sb3_actpc.actpc.captured`), which takes no time
     :param policy_kwargs: keywords of :class:`~sb3_actpc.actpc.policies.ActPCPolicy`: ``net_arch``, ``n_critics``, ``habit``,
         ``trust_radius``, ``nudge``, ``memory_history`` (the working memory), ``circuit_kwargs`` (of every
         :class:`~sb3_actpc.ngc.NGCCircuit`: ``n_settling_steps``, ``feedback``, ``dynamics``, ``matmul_precision``,
@@ -906,10 +907,7 @@ class ActPC(OffPolicyAlgorithm):
                     self._update_actor(parts[0])  # lines 19 and 26
                 self._update_critic(parts[1])  # lines 21 and 22
                 self._update_generator(parts[2])  # line 24
-            if self.target_update_interval == 1:
-                self._update_targets(self.tau)
-            if self.policy.actor_average is not None:
-                _follow([self.policy.actor_average], [self.actor.circuit], AVERAGING_RATE)
+                self._follow_circuits()
         self._log_training()
 
     def _batch_sizes(self, batch_size: int) -> tuple[int, int, int]:
@@ -952,18 +950,20 @@ class ActPC(OffPolicyAlgorithm):
 
     def _update_actor(self, batch: Batch) -> None:
         """Motor-action circuit: pressure of the critic (line 19) plus refresh (line 26), in one step of the optimiser."""
-        imitated = self._imitated(batch) if self.refresh_weight and self.imitation.parts() else None
+        imitated = self._imitated(batch)
         pressure = self.actor_pressure if self._n_updates > self.critic_warmup else 0.0
         changes = self._actor_changes(batch, imitated, self.refresh_weight, pressure or None)
         if changes is not None:
             self.actor.circuit.apply_changes(changes)
 
-    def _imitated(self, batch: Batch) -> Imitated:
+    def _imitated(self, batch: Batch) -> Imitated | None:
         """
-        What refresh imitates: as many steps as the batch has that are worth it and, where the habit holds the learning actor,
-        what that does in the batch's states. A region that is small enough for an arm's grip is otherwise soon used up by what
-        refresh alone does where nothing was shown, so that no pressure is left.
+        What refresh imitates, if anything: as many steps as the batch has that are worth it and, where the habit holds the
+        learning actor, what that does in the batch's states. A region that is small enough for an arm's grip is otherwise soon
+        used up by what refresh alone does where nothing was shown, so that no pressure is left.
         """
+        if not self.refresh_weight or not self.imitation.parts():
+            return None
         imitated = self.imitation.sample(len(batch.features))
         if not self._is_taught:
             return imitated
@@ -1059,6 +1059,13 @@ class ActPC(OffPolicyAlgorithm):
     def _update_targets(self, tau: float) -> None:
         """Move the target circuits by ``tau`` (1 copies)."""
         _follow([self.actor_target, *self.critic_target], [self.actor.circuit, *self.critic], tau)
+
+    def _follow_circuits(self) -> None:
+        """After an update: the targets, where they move with every one, and the actor's average."""
+        if self.target_update_interval == 1:
+            self._update_targets(self.tau)
+        if self.policy.actor_average is not None:
+            _follow([self.policy.actor_average], [self.actor.circuit], AVERAGING_RATE)
 
     def _on_step(self) -> None:
         """Moves the targets where that goes by environment steps."""

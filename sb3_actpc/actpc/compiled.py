@@ -1,16 +1,18 @@
-"""One update as one compiled graph: all changes from the synapses as they stand, then applied as ever."""
+"""One update as one graph: all changes from the synapses as they stand, compiled, and on a GPU recorded with their steps."""
 
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import torch as th
 from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 
+from sb3_actpc.actpc.captured import CapturedUpdate
 from sb3_actpc.actpc.cloning import Imitated
 from sb3_actpc.actpc.features import Batch
-from sb3_actpc.ngc import HebbianChanges
+from sb3_actpc.ngc import HebbianChanges, NGCCircuit
 
 # compiling takes one to three minutes on a CPU, and saves a quarter of an update's products and calls
 ENOUGH_UPDATES = 200_000
@@ -21,39 +23,53 @@ MOST_GRAPHS = 64  # of all agents in a process together, each with two; torch gi
 class _Given(NamedTuple):
     """What an update starts from beside the synapses: tensors alone, so that other values need no other graph."""
 
-    weights: tuple[th.Tensor, th.Tensor]  # of refresh and pressure, 0-d
+    weights: tuple[th.Tensor, th.Tensor | None]  # of refresh and pressure, 0-d; None where there is no pressure yet
     actor: Batch | None  # None where the actor waits
-    critic: Batch
+    critic: Batch | None  # None where nobody asks the critics
     generator: Batch
     imitated: Imitated | None
     target_noise: th.Tensor | None  # (B, A)
 
 
+_Changes = list[tuple[list[th.Tensor], list[th.Tensor], list[th.Tensor]]]  # of every circuit: weights, biases, memory
+
+
 class CompiledUpdate:
     """
     The update of an agent whose circuits all sweep (``settling="scheduled"``) or settle by eq. 1 (``dynamics="state"``),
-    compiled by ``torch.compile``; on a GPU captured as a CUDA graph.
+    compiled by ``torch.compile``; of circuits that sweep on a GPU, compiled or not, captured as a CUDA graph.
 
-    No circuit reads in an update what another has just changed, so that all changes come from one graph; the optimisers'
-    steps, decay, bounds and the targets' move stay as they are. Equal to the eager update but for rounding.
+    No circuit reads in an update what another has just changed, so that all changes come from one graph. The optimisers'
+    steps, decay, bounds and the targets' move are as ever; a CUDA graph holds them too. Equal to the eager update but for
+    rounding.
 
     :param agent: whose circuits are updated
+    :param compiles: by ``torch.compile``
+    :param captures: as a CUDA graph
     """
 
-    def __init__(self, agent: Any) -> None:
-        from torch._dynamo import config  # takes a second
+    def __init__(self, agent: Any, compiles: bool = True, captures: bool = False) -> None:
+        self.agent, self.compiles = agent, compiles
+        self._changes: Callable[[_Given], _Changes] = self._all_changes
+        if compiles:
+            from torch._dynamo import config  # takes a second
 
-        self.agent = agent
-        config.recompile_limit = max(config.recompile_limit, MOST_GRAPHS)
-        # on a GPU the kernels are captured as one CUDA graph, which is replayed
-        mode = "reduce-overhead" if agent.device.type == "cuda" else "default"
-        self._changes = th.compile(self._all_changes, fullgraph=True, dynamic=False, mode=mode)
+            config.recompile_limit = max(config.recompile_limit, MOST_GRAPHS)
+            # eq. 1's rates wait for the GPU in an update: there its products alone are a CUDA graph
+            mode = "reduce-overhead" if agent.device.type == "cuda" and not captures else "default"
+            self._changes = th.compile(self._all_changes, fullgraph=True, dynamic=False, mode=mode)
+        self._update: Callable[[_Given], None] = self._change_all
+        if captures:
+            optimizers = [circuit.optimizer for _, circuit in agent.policy.named_circuits()]
+            self._update = CapturedUpdate(self._change_all, optimizers)
         self._has_warned = False
 
     def ready(self) -> bool:
-        """Whether the update has all its parts: something is imitated, the pressure has begun, nothing is measured. Warns once
-        where compiling was asked for (True) and a part is missing."""
+        """Whether nothing is measured and, as each other update would be compiled anew, this one has all its parts: something
+        is imitated, and the pressure has begun. Warns once where compiling was asked for (True) and a part is missing."""
         agent = self.agent
+        if not self.compiles:
+            return not agent.diagnostics.active
         if agent._n_updates <= agent.critic_warmup:
             return False
         missing = self._missing_part()
@@ -86,13 +102,13 @@ class CompiledUpdate:
         # drawn in the order of the eager update
         imitated = None if actor is None else agent._imitated(actor)
         refresh, pressure = (th.tensor(float(w), device=agent.device) for w in (agent.refresh_weight, agent.actor_pressure))
-        given = _Given((refresh, pressure), actor, critic, generator, imitated, agent._target_noise(critic))
-        circuits = [*agent.critic, *([agent.generator] if agent.alpha_ep else [])]
-        if actor is not None:
-            circuits.insert(0, agent.actor.circuit)
-        th.compiler.cudagraph_mark_step_begin()  # the last update's changes, which a graph writes over, are applied
+        is_pressed = agent.actor_pressure and agent._n_updates > agent.critic_warmup
+        asked = critic if agent.actor_pressure else None
+        noise = None if asked is None else agent._target_noise(asked)
+        given = _Given((refresh, pressure if is_pressed else None), actor, asked, generator, imitated, noise)
+        th.compiler.cudagraph_mark_step_begin()  # the last update's changes, which such a graph writes over, are applied
         try:
-            found = self._changes(given)
+            self._update(given)
         except Exception as error:
             if agent.compile is True:
                 raise
@@ -103,39 +119,56 @@ class CompiledUpdate:
                 stacklevel=2,
             )
             return False
-        for circuit, changes in zip(circuits, found, strict=True):
-            circuit.apply_changes(HebbianChanges(*changes))
         return True
 
-    def _all_changes(self, given: _Given) -> list[tuple[list[th.Tensor], list[th.Tensor], list[th.Tensor]]]:
+    def _change_all(self, given: _Given) -> None:
+        for circuit, changes in zip(self._changing(given), self._changes(given), strict=True):
+            circuit.apply_changes(HebbianChanges(*changes))
+        self.agent._follow_circuits()
+
+    def _changing(self, given: _Given) -> list[NGCCircuit]:
+        """Those that :meth:`_all_changes` is about, in its order."""
+        agent = self.agent
+        is_acting = given.actor is not None and (given.imitated is not None or given.weights[1] is not None)
+        actor = [agent.actor.circuit] if is_acting else []
+        critics = [] if given.critic is None else [*agent.critic]
+        return [*actor, *critics, *([agent.generator] if agent.alpha_ep else [])]
+
+    def _all_changes(self, given: _Given) -> _Changes:
         agent = self.agent
         changes = [] if given.actor is None else [agent._actor_changes(given.actor, given.imitated, *given.weights)]
-        changes += agent._critic_changes(given.critic, given.target_noise)
+        changes += [] if given.critic is None else agent._critic_changes(given.critic, given.target_noise)
         changes += [agent._generator_changes(given.generator)] if agent.alpha_ep else []
-        return [(change.weights, change.biases, change.memory) for change in changes]
+        return [(change.weights, change.biases, change.memory) for change in changes if change is not None]
 
 
 def compiled_update(agent: Any, total_timesteps: int) -> CompiledUpdate | None:
     """
-    The compiled update that ``agent.compile`` asks for, or None where the eager one is meant or is all there is.
+    The compiled or captured update that ``agent.compile`` asks for, or None where the eager one is meant or is all there is.
 
     :param agent: set up
-    :param total_timesteps: of the run: "auto" compiles from ``ENOUGH_UPDATES`` updates on
+    :param total_timesteps: of the run: "auto" compiles from ``ENOUGH_UPDATES`` updates on, and captures always
     :raises ValueError: when it is asked for (True) of circuits that do not sweep
     """
-    is_fixed = all(circuit.has_fixed_steps for _, circuit in agent.policy.named_circuits())
+    circuits = [circuit for _, circuit in agent.policy.named_circuits()]
+    is_fixed = all(circuit.has_fixed_steps for circuit in circuits)
     if agent.compile is True and not is_fixed:
         raise ValueError(
             "compile=True needs settling='scheduled', or circuit_kwargs=dict(dynamics='state'): steps that stop at a "
             "tolerance are no fixed graph"
         )
     earned = agent.compile == "auto" and total_timesteps * updates_per_step(agent) >= ENOUGH_UPDATES
-    if not is_fixed or not (earned or agent.compile is True):
-        return None
-    if agent.device.type == "cpu" and not _has_compiler():
+    compiles = is_fixed and (earned or agent.compile is True)
+    if compiles and agent.device.type == "cpu" and not _has_compiler():
         agent.logger.info("compile: no C++ compiler here, updates run eagerly")
         return None
-    return CompiledUpdate(agent)
+    captures = agent.compile is not False and agent.device.type == "cuda" and all(map(_can_be_captured, circuits))
+    return CompiledUpdate(agent, compiles, captures) if compiles or captures else None
+
+
+def _can_be_captured(circuit: NGCCircuit) -> bool:
+    """Whether an update neither waits for the GPU (rates of eq. 1 do) nor steps an optimiser that might."""
+    return circuit.settling == "scheduled" and bool(circuit.optimizer.defaults.get("fused"))
 
 
 def updates_per_step(agent: Any) -> float:

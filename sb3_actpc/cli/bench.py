@@ -12,6 +12,7 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument("--rounds", type=int, default=40, help="interleaved measurements of every entry")
     parser.add_argument("--threads", type=int, default=None, help="torch threads (default: torch's own choice)")
     parser.add_argument("--device", default="cpu", help="torch device")
+    parser.add_argument("--batch-size", type=int, default=256, help="of the updates and the settling alone")
     parser.add_argument("--compiled", action="store_true", help="also the compiled update (compiling takes minutes)")
     parser.add_argument("--training", action="store_true", help="also steps of training, and acting (SBX's with sbx-rl)")
     parser.add_argument("--growth", action="store_true", help="also growth with K, width, batch and number of environments")
@@ -27,8 +28,10 @@ def run(args: argparse.Namespace) -> int:
     from sb3_actpc.experiments import timing
     from sb3_actpc.utils.checks import check_device
 
-    if args.rounds < 1 or (args.threads is not None and args.threads < 1):
-        raise ValueError(f"--rounds {args.rounds} and --threads {args.threads} must be at least 1")
+    if min(args.rounds, args.batch_size) < 1 or (args.threads is not None and args.threads < 1):
+        raise ValueError(
+            f"--rounds {args.rounds}, --batch-size {args.batch_size} and --threads {args.threads} must be at least 1"
+        )
     if args.table:
         print(timing.table(args.table))
         return 0
@@ -40,18 +43,20 @@ def run(args: argparse.Namespace) -> int:
         for line in timing.robosuite(args.rounds):
             print(line)
         return 0
-    groups = [timing.updates(args.device, args.compiled), timing.settling(args.device)]
+    groups = [timing.updates(args.device, args.compiled, args.batch_size), timing.settling(args.device, args.batch_size)]
     if args.training:
         groups += [*timing.training(args.device, args.compiled), timing.acting()]
     if args.growth:
         groups += timing.growth()
     ratios = timing.measure(groups, args.rounds, args.device)
-    sizes = f"batch {timing.BATCH_SIZE}, hidden [{timing.WIDTH}, {timing.WIDTH}]"
+    sizes = f"batch {args.batch_size}, hidden [{timing.WIDTH}, {timing.WIDTH}]"
     print(f"{sizes}, {args.device}, {th.get_num_threads()} threads; medians of rounds")
     for name, (ratio, unit) in ratios.items():
         print(f"{name:56s} {ratio:6.2f} x {unit}")
     if args.output:
-        about = {"device": args.device, "threads": th.get_num_threads(), "rounds": args.rounds, "torch": th.__version__}
+        device = args.device if args.device == "cpu" else th.cuda.get_device_name(args.device)
+        about = {"device": device, "threads": th.get_num_threads(), "batch_size": args.batch_size, "rounds": args.rounds}
+        about["torch"] = th.__version__
         args.output.write_text(json.dumps({**about, "ratios": ratios}, indent=1) + "\n")
     print(f"replay memory over SB3's, per HalfCheetah transition: {timing.memory_ratio():.2f}")
     return 0

@@ -38,6 +38,7 @@ SWEEP = {"feedback": "learned", "feedback_start": "mirrored"}
 BFLOAT16 = {"policy_kwargs.circuit_kwargs.matmul_precision": "bfloat16"}
 QUICK = {"prior_updates": 1, "actor_warm_start": 0, "critic_warmup": 0}
 TD3_SIZES: dict[str, Any] = {"policy_kwargs": {"net_arch": [WIDTH, WIDTH]}, "batch_size": BATCH_SIZE}
+EAGER = ", every kernel by itself"  # on a GPU, where an update is a CUDA graph otherwise
 
 Entries = dict[str, Callable[[], object]]
 # what is timed in turns, and which of it the others (that follow) are divided by -> what their ratio is called then
@@ -85,16 +86,17 @@ def table(files: list[Path]) -> str:
         try:
             about = json.loads(file.read_text())
             columns.append({f"{name} / {unit}": f"{ratio:.2f}" for name, (ratio, unit) in about["ratios"].items()})
-            heads.append(f"{about['device']}, {about['threads']} threads")
+            size = about.get("batch_size", BATCH_SIZE)
+            heads.append(f"{about['device']}, {about['threads']} threads{'' if size == BATCH_SIZE else f', batch {size}'}")
         except (ValueError, LookupError, TypeError, AttributeError) as error:
             raise ValueError(f"{file}: not what `sb3-actpc bench --output` writes ({error!r})") from error
     rows = [[name, *(column.get(name, "") for column in columns)] for name in columns[0]]
     return markdown(pd.DataFrame(rows, columns=heads))
 
 
-def updates(device: str, compiled: bool) -> Group:
+def updates(device: str, compiled: bool, batch_size: int = BATCH_SIZE) -> Group:
     """TD3's; the bare agent's and the shipped one's with every kind of settling, the paper's preset, and all three with
-    products in bfloat16 where the processor has them."""
+    products in bfloat16 where the processor has them; on a GPU also without a CUDA graph."""
     kinds: dict[str, tuple[str, dict[str, Any]]] = {
         "tied sweep": ("scheduled", {"feedback": "tied"}),
         "learned sweep": ("scheduled", SWEEP),
@@ -109,13 +111,15 @@ def updates(device: str, compiled: bool) -> Group:
     settings[paper] = preset(TASK, "actpc_paper")
     if has_bfloat16():
         settings |= {f"{name}, bfloat16": with_changes(settings[name], BFLOAT16) for name in (bare, shipped, paper)}
+    if device != "cpu":
+        settings |= {name + EAGER: {**settings[name], "compile": False} for name in (bare, shipped)}
     if compiled:
         presets = [name for name in settings if name.startswith((shipped, paper))]
         settings |= {f"{name}, compiled": {**settings[name], "compile": True} for name in presets}
     shared: dict[str, Any] = {"learning_starts": 10 * N_FILLED, "buffer_size": 10 * N_FILLED, "device": device, "seed": 0}
-    entries = {"SB3 TD3 train()": _updater(TD3("MlpPolicy", TASK, **TD3_SIZES, **shared))}
+    entries = {"SB3 TD3 train()": _updater(TD3("MlpPolicy", TASK, **{**TD3_SIZES, "batch_size": batch_size}, **shared))}
     for name, keywords in settings.items():
-        own: dict[str, Any] = {"policy": "MlpPolicy", **keywords, **QUICK, "batch_size": BATCH_SIZE, **shared}
+        own: dict[str, Any] = {"policy": "MlpPolicy", **keywords, **QUICK, "batch_size": batch_size, **shared}
         entries[name] = _updater(ActPC(env=TASK, **own))
     return entries, {"SB3 TD3 train()": "TD3"}
 
@@ -124,15 +128,15 @@ def _updater(model: OffPolicyAlgorithm) -> Callable[[], object]:
     """Fill the buffer with random actions; one call is then two updates (TD3 moves its actor every other time)."""
     model.set_logger(configure(None, []))
     model.learn(N_FILLED)
-    return lambda: model.train(gradient_steps=2, batch_size=BATCH_SIZE)
+    return lambda: model.train(gradient_steps=2, batch_size=model.batch_size)
 
 
-def settling(device: str) -> Group:
+def settling(device: str, batch_size: int = BATCH_SIZE) -> Group:
     """One K = 10 settling of a tied circuit, and its matrix products alone."""
     circuit = NGCCircuit(23, 17, (WIDTH, WIDTH), feedback="tied", dynamics="state").to(device)
-    x, target = th.randn(BATCH_SIZE, 23, device=device), th.randn(BATCH_SIZE, 17, device=device)
+    x, target = th.randn(batch_size, 23, device=device), th.randn(batch_size, 17, device=device)
     alone = "matrix products of one settling"
-    entries = {alone: _products(circuit, BATCH_SIZE), "one settling, K = 10": lambda: circuit.settle(x, target)}
+    entries = {alone: _products(circuit, batch_size), "one settling, K = 10": lambda: circuit.settle(x, target)}
     return entries, {alone: "the products"}
 
 

@@ -382,7 +382,8 @@ class NGCCircuit(nn.Module):
         for group in self.optimizer.param_groups if weight_decay else ():
             matrices = [parameter for parameter in group["params"] if parameter.dim() > 1]
             if matrices:
-                th._foreach_mul_(matrices, max(0.0, 1.0 - group["lr"] * weight_decay))
+                kept = 1.0 - group["lr"] * weight_decay  # a tensor where a CUDA graph reads the rate
+                th._foreach_mul_(matrices, kept.clamp_min(0.0) if isinstance(kept, th.Tensor) else max(0.0, kept))
 
     def _scaled_synapses(self) -> list[th.Tensor]:
         return [*self.synapses.weights, *self.synapses.feedback]

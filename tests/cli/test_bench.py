@@ -25,9 +25,10 @@ def test_the_table_has_a_column_for_each_file(tmp_path):
     for threads, ratio in ((1, 0.9), (2, 0.75)):
         files.append(tmp_path / f"{threads}.json")
         ratios = {"bare": [ratio, "TD3"], **({"compiled": [0.5, "TD3"]} if threads == 1 else {})}
-        files[-1].write_text(json.dumps({"device": "cpu", "threads": threads, "ratios": ratios}))
+        size = {"batch_size": 4096} if threads == 2 else {}
+        files[-1].write_text(json.dumps({"device": "cpu", "threads": threads, **size, "ratios": ratios}))
     assert table(files).splitlines() == [
-        "| update, over its unit | cpu, 1 threads | cpu, 2 threads |",
+        "| update, over its unit | cpu, 1 threads | cpu, 2 threads, batch 4096 |",
         "| --- | --- | --- |",
         "| bare / TD3 | 0.90 | 0.75 |",
         "| compiled / TD3 | 0.50 |  |",
