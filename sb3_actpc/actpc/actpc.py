@@ -165,8 +165,8 @@ class ActPC(OffPolicyAlgorithm):
         then tell better what is done, but for what never changes within one: :mod:`sb3_actpc.actpc.within_episodes`) or
         "bounds" (those of the observation space, which must be finite, become -1 and 1)
     :param compile: run the updates of circuits that sweep, or settle by eq. 1, as one graph of ``torch.compile`` (see
-        :mod:`~sb3_actpc.actpc.compiled`): True, False or "auto", where the run is long enough to earn it. On a GPU True and
-        "auto" also record the whole update as a CUDA graph (:mod:`~sb3_actpc.actpc.captured`), which takes no time
+        :mod:`~sb3_actpc.actpc.compiled`): True, False or "auto", where the run is long enough to earn it. On a GPU, sweeps
+        are a CUDA graph in its place (:mod:`~sb3_actpc.actpc.captured`), which takes no time to make: True and "auto" alike
     :param policy_kwargs: keywords of :class:`~sb3_actpc.actpc.policies.ActPCPolicy`: ``net_arch``, ``n_critics``, ``habit``,
         ``trust_radius``, ``nudge``, ``memory_history`` (the working memory), ``circuit_kwargs`` (of every
         :class:`~sb3_actpc.ngc.NGCCircuit`: ``n_settling_steps``, ``feedback``, ``dynamics``, ``matmul_precision``,
@@ -955,6 +955,11 @@ class ActPC(OffPolicyAlgorithm):
         changes = self._actor_changes(batch, imitated, self.refresh_weight, pressure or None)
         if changes is not None:
             self.actor.circuit.apply_changes(changes)
+        region = self.policy.trust_region
+        if self.trials is not None:
+            self.diagnostics.follow(pressure=lambda: self.pressure)
+        if self.trials is not None and region is not None:
+            self.diagnostics.follow(trust_radius=lambda: float(region.radius))
 
     def _imitated(self, batch: Batch) -> Imitated | None:
         """
@@ -1085,9 +1090,6 @@ class ActPC(OffPolicyAlgorithm):
             self.logger.record("train/self_imitation_size", len(memory))
             self.logger.record("train/self_imitation_best_return", memory.best_return)
         if self.trials is not None:
-            self.logger.record("train/pressure", self.pressure)
-            if self.policy.trust_region is not None:
-                self.logger.record("train/trust_radius", float(self.policy.trust_region.radius))
             if self.trials.habit_returns:  # it has played
                 self.logger.record("train/habit_return", self.trials.habit_return)
             self.logger.record("train/habit_generation", self.trials.generation)

@@ -14,6 +14,7 @@ from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 from sb3_actpc.actpc.arguments import Between, Share, Size, checked
 from sb3_actpc.actpc.reward_signals import STORED, Normalize
 from sb3_actpc.actpc.self_imitation import Observations, SelfImitationMemory, TensorObservations, map_observations
+from sb3_actpc.actpc.transfer import to_device
 from sb3_actpc.utils.checks import LARGEST_SIZE
 
 OWN_TRANSITIONS = 100_000  # that the self-imitation memory keeps, of a buffer that keeps more
@@ -242,34 +243,31 @@ class SignalReplay(ReplayBuffer):
             epistemic = self._summed(self.epistemic, window, envs, mask, rewards_of[0])
             instrumental = self._summed(self.instrumental, window, envs, mask, rewards_of[1])
         one_step_on = mask is not None and rewards_of is not None
-        return SignalReplaySamples(
+        samples: Any = SignalReplaySamples  # of arrays
+        arrays = samples(
             observations=self._observations_at(rows, envs, env),
-            actions=self.to_torch(self.actions[rows, envs]),
+            actions=self.actions[rows, envs],
             next_observations=self._next_observations_at(last, envs, env),
-            dones=self.to_torch((self.dones[last, envs] * (1 - self.timeouts[last, envs])).reshape(-1, 1)),
-            rewards=self.to_torch(
-                self._summed(self.rewards, window, envs, mask, lambda rewards: self._normalize_reward(rewards, env))
-            ),
-            discounts=None if mask is None else self.to_torch(self.gamma ** mask.sum(1, keepdims=True)),
-            epistemic=self.to_torch(epistemic),
-            instrumental=self.to_torch(instrumental),
+            dones=(self.dones[last, envs] * (1 - self.timeouts[last, envs])).reshape(-1, 1),
+            rewards=self._summed(self.rewards, window, envs, mask, lambda rewards: self._normalize_reward(rewards, env)),
+            discounts=None if mask is None else self.gamma ** mask.sum(1, keepdims=True),
+            epistemic=epistemic,
+            instrumental=instrumental,
             history=history,
             history_mask=history_mask,
             following_observations=self._next_observations_at(rows, envs, env) if one_step_on else None,
             next_history=next_history[0],
             next_history_mask=next_history[1],
         )
+        return to_device(arrays, th.device(self.device))
 
-    def _observations_at(self, rows: np.ndarray, envs: np.ndarray, env: VecNormalize | None) -> TensorObservations:
-        return self._to_tensors(map_observations(lambda array: array[rows, envs], self.observations), env)
+    def _observations_at(self, rows: np.ndarray, envs: np.ndarray, env: VecNormalize | None) -> Observations:
+        return self._normalize_obs(map_observations(lambda array: array[rows, envs], self.observations), env)
 
-    def _next_observations_at(self, rows: np.ndarray, envs: np.ndarray, env: VecNormalize | None) -> TensorObservations:
+    def _next_observations_at(self, rows: np.ndarray, envs: np.ndarray, env: VecNormalize | None) -> Observations:
         if self.optimize_memory_usage:
             return self._observations_at((rows + 1) % self.buffer_size, envs, env)
-        return self._to_tensors(map_observations(lambda array: array[rows, envs], self.next_observations), env)
-
-    def _to_tensors(self, observations: Observations, env: VecNormalize | None) -> TensorObservations:
-        return map_observations(self.to_torch, self._normalize_obs(observations, env))
+        return self._normalize_obs(map_observations(lambda array: array[rows, envs], self.next_observations), env)
 
     def _past_at(
         self, rows: np.ndarray, envs: np.ndarray, including: bool = False
@@ -292,14 +290,13 @@ class SignalReplay(ReplayBuffer):
 
     def _history_at(
         self, rows: np.ndarray, envs: np.ndarray, env: VecNormalize | None, including: bool = False
-    ) -> tuple[TensorObservations | None, th.Tensor | None]:
-        """:meth:`_past_at` as normalised tensors."""
+    ) -> tuple[Observations | None, np.ndarray | None]:
+        """:meth:`_past_at`, normalised."""
         past, mask = self._past_at(rows, envs, including)
         if past is None or mask is None:
             return None, None
         flat = map_observations(lambda array: array.reshape(-1, *array.shape[2:]), past)
-        tensors = map_observations(lambda t: t.reshape(*mask.shape, *t.shape[1:]), self._to_tensors(flat, env))
-        return tensors, self.to_torch(mask)
+        return map_observations(lambda one: one.reshape(*mask.shape, *one.shape[1:]), self._normalize_obs(flat, env)), mask
 
     def _n_step_window(self, rows: np.ndarray, envs: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The rows of each n-step window, the last that counts, and which do, (B, n_steps), (B,) and (B, n_steps)."""

@@ -1,9 +1,10 @@
-"""One update as one graph: all changes from the synapses as they stand, compiled, and on a GPU recorded with their steps."""
+"""One update as one graph: all changes from the synapses as they stand, compiled, or on a GPU captured with their steps."""
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import torch as th
@@ -37,38 +38,39 @@ _Changes = list[tuple[list[th.Tensor], list[th.Tensor], list[th.Tensor]]]  # of 
 class CompiledUpdate:
     """
     The update of an agent whose circuits all sweep (``settling="scheduled"``) or settle by eq. 1 (``dynamics="state"``),
-    compiled by ``torch.compile``; of circuits that sweep on a GPU, compiled or not, captured as a CUDA graph.
+    compiled by ``torch.compile``; of circuits that sweep on a GPU, captured as a CUDA graph in its place, which takes no time.
 
     No circuit reads in an update what another has just changed, so that all changes come from one graph. The optimisers'
     steps, decay, bounds and the targets' move are as ever; a CUDA graph holds them too. Equal to the eager update but for
     rounding.
 
     :param agent: whose circuits are updated
-    :param compiles: by ``torch.compile``
     :param captures: as a CUDA graph
     """
 
-    def __init__(self, agent: Any, compiles: bool = True, captures: bool = False) -> None:
-        self.agent, self.compiles = agent, compiles
+    def __init__(self, agent: Any, captures: bool = False) -> None:
+        self.agent, self.captures = agent, captures
+        self._update: Callable[[_Given], None] = self._change_all
         self._changes: Callable[[_Given], _Changes] = self._all_changes
-        if compiles:
+        if captures:
+            optimizers = [circuit.optimizer for _, circuit in agent.policy.named_circuits()]
+            self._update = CapturedUpdate(self._change_all, optimizers)
+        else:
             from torch._dynamo import config  # takes a second
 
             config.recompile_limit = max(config.recompile_limit, MOST_GRAPHS)
             # eq. 1's rates wait for the GPU in an update: there its products alone are a CUDA graph
-            mode = "reduce-overhead" if agent.device.type == "cuda" and not captures else "default"
+            mode = "reduce-overhead" if agent.device.type == "cuda" else "default"
             self._changes = th.compile(self._all_changes, fullgraph=True, dynamic=False, mode=mode)
-        self._update: Callable[[_Given], None] = self._change_all
-        if captures:
-            optimizers = [circuit.optimizer for _, circuit in agent.policy.named_circuits()]
-            self._update = CapturedUpdate(self._change_all, optimizers)
         self._has_warned = False
+        # to a GPU numbers go slowly; a tensor for each name, as one that comes twice asks for another graph
+        self._weight = lru_cache(8)(lambda name, weight: th.tensor(float(weight), device=agent.device))
 
     def ready(self) -> bool:
         """Whether nothing is measured and, as each other update would be compiled anew, this one has all its parts: something
         is imitated, and the pressure has begun. Warns once where compiling was asked for (True) and a part is missing."""
         agent = self.agent
-        if not self.compiles:
+        if self.captures:
             return not agent.diagnostics.active
         if agent._n_updates <= agent.critic_warmup:
             return False
@@ -101,7 +103,7 @@ class CompiledUpdate:
         agent = self.agent
         # drawn in the order of the eager update
         imitated = None if actor is None else agent._imitated(actor)
-        refresh, pressure = (th.tensor(float(w), device=agent.device) for w in (agent.refresh_weight, agent.actor_pressure))
+        refresh, pressure = (self._weight(name, getattr(agent, name)) for name in ("refresh_weight", "actor_pressure"))
         is_pressed = agent.actor_pressure and agent._n_updates > agent.critic_warmup
         asked = critic if agent.actor_pressure else None
         noise = None if asked is None else agent._target_noise(asked)
@@ -158,12 +160,14 @@ def compiled_update(agent: Any, total_timesteps: int) -> CompiledUpdate | None:
             "tolerance are no fixed graph"
         )
     earned = agent.compile == "auto" and total_timesteps * updates_per_step(agent) >= ENOUGH_UPDATES
-    compiles = is_fixed and (earned or agent.compile is True)
-    if compiles and agent.device.type == "cpu" and not _has_compiler():
+    if agent.compile is not False and agent.device.type == "cuda" and all(map(_can_be_captured, circuits)):
+        return CompiledUpdate(agent, captures=True)
+    if not is_fixed or not (earned or agent.compile is True):
+        return None
+    if agent.device.type == "cpu" and not _has_compiler():
         agent.logger.info("compile: no C++ compiler here, updates run eagerly")
         return None
-    captures = agent.compile is not False and agent.device.type == "cuda" and all(map(_can_be_captured, circuits))
-    return CompiledUpdate(agent, compiles, captures) if compiles or captures else None
+    return CompiledUpdate(agent)
 
 
 def _can_be_captured(circuit: NGCCircuit) -> bool:

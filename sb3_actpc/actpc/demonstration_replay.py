@@ -10,7 +10,8 @@ from gymnasium import spaces
 
 from sb3_actpc.actpc.features import Batch, CircuitInputs
 from sb3_actpc.actpc.reward_signals import STORED, Normalize
-from sb3_actpc.actpc.self_imitation import Episodes
+from sb3_actpc.actpc.self_imitation import Episodes, Observations
+from sb3_actpc.actpc.transfer import to_device
 from sb3_actpc.demonstrations.dataset import Demonstrations
 from sb3_actpc.demonstrations.rows import split_observations
 
@@ -71,32 +72,35 @@ class DemonstrationReplay:
         :return: the transitions as the circuits see them
         """
         samples = self.episodes.take(rows, self.history)
-        features = inputs.features(inputs.observations(samples.observations))
         steps = np.arange(n_steps)
         window = rows[:, None] + steps
         counts = window < self.ends[rows][:, None]
         last = rows + counts.sum(1) - 1
         rewards = self._rewards(window.clip(max=len(self) - 1), inputs, weights, signals or STORED) * counts * gamma**steps
-        next_features = bootstrap_features = self._next_features(last, inputs)
+        following = self._next(rows, inputs) if n_steps > 1 and weights[1] else None
+        dones, discounts = self.demonstrations.terminations[last][:, None], gamma ** counts.sum(1, keepdims=True)
+        numbers = map(_single, (samples.actions, rewards.sum(1)[:, None], dones, discounts))
+        arrays = inputs.normalized(samples.observations), self._next(last, inputs), following, *numbers
+        observed, bootstrap, following, actions, paid, dones, discounts = to_device(arrays, inputs.device)
+        features, bootstrap_features = inputs.features(observed), inputs.features(bootstrap)
         next_past: tuple[Any, Any] = (None, None)
         if n_steps > 1:
-            next_features = self._next_features(rows, inputs) if weights[1] else bootstrap_features
             next_past = inputs.past(*self.episodes.past(last, self.history, including=True))
         memory, next_memory = inputs.memories(*inputs.past(samples.history, samples.history_mask), features, *next_past)
         return Batch(
             features=features,
-            actions=inputs.tensor(samples.actions),
-            next_features=next_features,
+            actions=actions,
+            next_features=bootstrap_features if following is None else inputs.features(following),
             bootstrap_features=bootstrap_features,
             memory=memory,
             next_memory=next_memory,
-            rewards=inputs.tensor(rewards.sum(1))[:, None],
-            dones=inputs.tensor(self.demonstrations.terminations[last])[:, None],
-            discounts=inputs.tensor(gamma ** counts.sum(1, keepdims=True)),
+            rewards=paid,
+            dones=dones,
+            discounts=discounts,
         )
 
-    def _next_features(self, rows: np.ndarray, inputs: CircuitInputs) -> th.Tensor:
-        return inputs.features(inputs.observations(self.next_observations.take(rows).observations))
+    def _next(self, rows: np.ndarray, inputs: CircuitInputs) -> Observations:
+        return inputs.normalized(self.next_observations.take(rows).observations)
 
     def _rewards(
         self,
@@ -150,3 +154,7 @@ class DemonstrationReplay:
             self.epistemic[rows] = epistemic(raw_ep)
             self.instrumental[rows] = instrumental(raw_in)
         self.has_signals = True
+
+
+def _single(array: np.ndarray) -> np.ndarray:
+    return array.astype(np.float32, copy=False)

@@ -9,6 +9,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from sb3_actpc.actpc.buffers import SignalReplaySamples
 from sb3_actpc.actpc.policies import ActPCActor
 from sb3_actpc.actpc.self_imitation import Observations, TensorObservations, map_observations
+from sb3_actpc.actpc.transfer import to_device
 
 
 class Batch(NamedTuple):
@@ -68,21 +69,30 @@ class CircuitInputs:
         """Whether VecNormalize does; at first it knows nothing of what it will make of the demonstrations."""
         return self.vec_normalize is not None and bool(self.vec_normalize.norm_obs)
 
+    @property
+    def device(self) -> th.device:
+        """The agent's."""
+        return self.actor.normalizer.mean.device
+
     def tensor(self, array: np.ndarray) -> th.Tensor:
         """The array as float32 on the agent's device."""
-        return th.as_tensor(array, dtype=th.float32, device=self.actor.normalizer.mean.device)
+        return th.as_tensor(array, dtype=th.float32, device=self.device)
+
+    def normalized(self, observations: Any, batch_dims: int = 1) -> Observations:
+        """:param observations: numpy, as the environment gave them, with ``batch_dims`` leading dimensions; or a dict of such
+        :return: numpy, normalised as the replay buffer's are
+        """
+        if self.vec_normalize is None:
+            return observations
+        shape = next(iter(observations.values())).shape if isinstance(observations, dict) else observations.shape
+        lead = shape[:batch_dims]
+        flat = map_observations(lambda array: array.reshape(-1, *array.shape[batch_dims:]), observations)
+        normalized = self.vec_normalize.normalize_obs(flat)
+        return map_observations(lambda array: array.reshape(*lead, *array.shape[1:]), normalized)
 
     def observations(self, observations: Any, batch_dims: int = 1) -> TensorObservations:
-        """:param observations: numpy, as the environment gave them, with ``batch_dims`` leading dimensions; or a dict of such
-        :return: tensors, normalised as the replay buffer's are
-        """
-        if self.vec_normalize is not None:
-            shape = next(iter(observations.values())).shape if isinstance(observations, dict) else observations.shape
-            lead = shape[:batch_dims]
-            flat = map_observations(lambda array: array.reshape(-1, *array.shape[batch_dims:]), observations)
-            normalized = self.vec_normalize.normalize_obs(flat)
-            observations = map_observations(lambda array: array.reshape(*lead, *array.shape[1:]), normalized)
-        return map_observations(lambda array: th.as_tensor(array, device=self.actor.normalizer.mean.device), observations)
+        """:meth:`normalized`, as tensors."""
+        return to_device(self.normalized(observations, batch_dims), self.device)
 
     def past(
         self, history: Observations | None, mask: np.ndarray | None

@@ -11,6 +11,7 @@ from sb3_actpc.actpc.cloning import Cloning, Imitated
 from sb3_actpc.actpc.held_out import N_ASKED, N_UPDATES, random_numbers_of_its_own, split, typical_error
 from sb3_actpc.actpc.room import Room
 from sb3_actpc.actpc.self_imitation import Episodes, imitated_return, is_by_return, sample_union
+from sb3_actpc.actpc.transfer import to_device
 from sb3_actpc.ngc import NGCCircuit
 
 ROOM_DECAY = 1.0  # of clones' synapses where the demonstrations leave room, which small synapses guess better
@@ -50,7 +51,9 @@ class Imitation:
             for part in parts:
                 room.measure(part)
         samples = sample_union(parts, n, agent.memory_history, agent.refresh.weighting)
-        features, actions = inputs.features(inputs.observations(samples.observations)), inputs.tensor(samples.actions)
+        arrays = inputs.normalized(samples.observations), samples.actions.astype(np.float32, copy=False)
+        observed, actions = to_device(arrays, inputs.device)
+        features = inputs.features(observed)
         if room is not None and samples.neighbours is not None:
             features, actions = room.between(features, actions, samples.neighbours, noise)
         return features, actions, inputs.memory(*inputs.past(samples.history, samples.history_mask))

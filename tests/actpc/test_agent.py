@@ -22,6 +22,7 @@ from sb3_actpc import ActPC, Demonstrations, MlpPolicy
 from sb3_actpc.actpc import actpc as actpc_module
 from sb3_actpc.actpc import demonstration_replay
 from sb3_actpc.actpc.diagnostics import Diagnostics
+from sb3_actpc.actpc.transfer import to_device
 from sb3_actpc.ngc import NGCCircuit, settle_coupled
 from tests.actpc.agents import QUICK, differ, imitating, make, plain, weights_of
 from tests.actpc.envs import CountingEnv, demonstrations
@@ -791,10 +792,12 @@ def test_rebuilt_memory_equals_the_one_at_collection_across_episode_ends_and_rin
     for age in range(30 - 4):  # the oldest rows have lost their predecessors and are never sampled
         row = (buffer.newest - age) % 30
         rows, envs = np.full(n_envs, row), np.arange(n_envs)
-        past = model.inputs.past_features(*buffer._history_at(rows, envs, None))
+        past = model.inputs.past_features(*to_device(buffer._history_at(rows, envs, None), model.device))
         assert np.allclose(past.numpy(), seen[steps - 1 - age], atol=1e-6)
         if age:  # the next step's, where the episode went on
-            after = model.inputs.past_features(*buffer._history_at(rows, envs, None, including=True)).numpy()
+            after = model.inputs.past_features(
+                *to_device(buffer._history_at(rows, envs, None, including=True), model.device)
+            ).numpy()
             goes_on = buffer.dones[row] == 0
             assert np.allclose(after[goes_on], seen[steps - age][goes_on], atol=1e-6)
     drawn = {int(r) for _ in range(50) for r in buffer._draw(16)[0]}

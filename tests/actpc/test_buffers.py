@@ -336,7 +336,7 @@ def test_the_past_of_the_bootstrapped_observation_is_what_came_before_it_in_its_
     batch = buffer._gather(rows, envs, None)
     if n_steps == 1:
         assert batch.next_history is None  # it is the past, and the present observation
-        next_past, next_mask = (part.numpy() for part in buffer._history_at(rows, envs, None, including=True))
+        next_past, next_mask = buffer._history_at(rows, envs, None, including=True)
     else:
         next_past, next_mask = batch.next_history.numpy(), batch.next_history_mask.numpy()
     for row, env in enumerate(envs):

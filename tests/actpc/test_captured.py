@@ -37,7 +37,7 @@ def recorded(monkeypatch):
     if DEVICE == "cpu":
         monkeypatch.setattr(CapturedUpdate, "_record", record)
         monkeypatch.setattr(
-            actpc_module, "compiled_update", lambda agent, _: CompiledUpdate(agent, False, True) if agent.compile else None
+            actpc_module, "compiled_update", lambda agent, _: CompiledUpdate(agent, captures=True) if agent.compile else None
         )
     return found
 
@@ -130,7 +130,7 @@ def test_on_a_cpu_nothing_is_captured_and_on_a_gpu_what_neither_waits_nor_is_tol
         return compiled_update(model, 1)
 
     found = captured(agent(compile="auto"))
-    assert isinstance(found._update, CapturedUpdate) and not found.compiles
+    assert isinstance(found._update, CapturedUpdate) and found.captures
     assert captured(agent(compile=False)) is None
     assert captured(agent("iterative", EQUATION_1, 1.0, compile="auto")) is None
     assert captured(make(policy_kwargs={"optimizer_class": th.optim.SGD}, compile="auto", **PARTS)) is None

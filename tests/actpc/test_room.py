@@ -188,7 +188,11 @@ def test_where_clones_guess_the_habit_teaches_what_it_does_in_the_batchs_states(
     habit, batch = model.actor.habit, model._sample_batch(16)
     for weights in [] if habit is None else habit.synapses[0]:
         weights.data.mul_(0.5)  # that it is another one
-    features, actions, memory = model._imitated(batch)
+    imitated = model._imitated(batch)
+    assert (imitated is None) == (not model.refresh_weight)
+    if imitated is None:
+        return
+    features, actions, memory = imitated
     assert len(features) == len(actions) == (32 if teaches else 16)
     assert (memory is None) == (not model.memory_history) and (memory is None or len(memory) == len(features))
     if teaches:
