@@ -38,7 +38,7 @@ _Changes = list[tuple[list[th.Tensor], list[th.Tensor], list[th.Tensor]]]  # of 
 class CompiledUpdate:
     """
     The update of an agent whose circuits all sweep (``settling="scheduled"``) or settle by eq. 1 (``dynamics="state"``),
-    compiled by ``torch.compile``; of circuits that sweep on a GPU, captured as a CUDA graph in its place, which takes no time.
+    compiled by ``torch.compile``; on a GPU, where all sweep, captured as a CUDA graph, which takes no time.
 
     No circuit reads in an update what another has just changed, so that all changes come from one graph. The optimisers'
     steps, decay, bounds and the targets' move are as ever; a CUDA graph holds them too. Equal to the eager update but for
@@ -59,9 +59,7 @@ class CompiledUpdate:
             from torch._dynamo import config  # takes a second
 
             config.recompile_limit = max(config.recompile_limit, MOST_GRAPHS)
-            # eq. 1's rates wait for the GPU in an update: there its products alone are a CUDA graph
-            mode = "reduce-overhead" if agent.device.type == "cuda" else "default"
-            self._changes = th.compile(self._all_changes, fullgraph=True, dynamic=False, mode=mode)
+            self._changes = th.compile(self._all_changes, fullgraph=True, dynamic=False)
         self._has_warned = False
         # to a GPU numbers go slowly; a tensor for each name, as one that comes twice asks for another graph
         self._weight = lru_cache(8)(lambda name, weight: th.tensor(float(weight), device=agent.device))
@@ -108,7 +106,6 @@ class CompiledUpdate:
         asked = critic if agent.actor_pressure else None
         noise = None if asked is None else agent._target_noise(asked)
         given = _Given((refresh, pressure if is_pressed else None), actor, asked, generator, imitated, noise)
-        th.compiler.cudagraph_mark_step_begin()  # the last update's changes, which such a graph writes over, are applied
         try:
             self._update(given)
         except Exception as error:
@@ -153,6 +150,14 @@ def compiled_update(agent: Any, total_timesteps: int) -> CompiledUpdate | None:
     :raises ValueError: when it is asked for (True) of circuits that do not sweep
     """
     circuits = [circuit for _, circuit in agent.policy.named_circuits()]
+    if agent.device.type == "cuda":
+        captures = all(map(_can_be_captured, circuits))
+        if agent.compile is True and not captures:
+            raise ValueError(
+                "compile=True on a GPU needs settling='scheduled', as eq. 1's rates wait for it, and Adam; on a CPU "
+                "(device='cpu') eq. 1 is compiled too"
+            )
+        return CompiledUpdate(agent, captures=True) if captures and agent.compile is not False else None
     is_fixed = all(circuit.has_fixed_steps for circuit in circuits)
     if agent.compile is True and not is_fixed:
         raise ValueError(
@@ -160,11 +165,9 @@ def compiled_update(agent: Any, total_timesteps: int) -> CompiledUpdate | None:
             "tolerance are no fixed graph"
         )
     earned = agent.compile == "auto" and total_timesteps * updates_per_step(agent) >= ENOUGH_UPDATES
-    if agent.compile is not False and agent.device.type == "cuda" and all(map(_can_be_captured, circuits)):
-        return CompiledUpdate(agent, captures=True)
     if not is_fixed or not (earned or agent.compile is True):
         return None
-    if agent.device.type == "cpu" and not _has_compiler():
+    if not _has_compiler():
         agent.logger.info("compile: no C++ compiler here, updates run eagerly")
         return None
     return CompiledUpdate(agent)

@@ -1,6 +1,7 @@
 """The update as a CUDA graph: what it reads, when it is recorded anew; on a GPU the numbers themselves."""
 
 import copy
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -132,5 +133,10 @@ def test_on_a_cpu_nothing_is_captured_and_on_a_gpu_what_neither_waits_nor_is_tol
     found = captured(agent(compile="auto"))
     assert isinstance(found._update, CapturedUpdate) and found.captures
     assert captured(agent(compile=False)) is None
-    assert captured(agent("iterative", EQUATION_1, 1.0, compile="auto")) is None
-    assert captured(make(policy_kwargs={"optimizer_class": th.optim.SGD}, compile="auto", **PARTS)) is None
+    for others in (
+        partial(agent, "iterative", EQUATION_1, 1.0),
+        partial(make, policy_kwargs={"optimizer_class": th.optim.SGD}, **PARTS),
+    ):
+        assert captured(others(compile="auto")) is None
+        with pytest.raises(ValueError, match="compile=True on a GPU needs settling='scheduled'"):
+            captured(others(compile=True))
