@@ -73,3 +73,21 @@ def weights_of(circuit) -> list[th.Tensor]:
 
 def differ(one, other) -> bool:
     return any(not th.equal(a, b) for a, b in zip(one, other, strict=True))
+
+
+PARTS = {
+    "demonstrations": demonstrations(),
+    "demonstration_fraction": 0.5,
+    "target_policy_noise": 0.2,
+    "refresh_kwargs": {"noise": 0.1},
+    "scale_pressure": True,
+    "actor_warm_start": 5,
+}
+EQUATION_1 = {"dynamics": "state", "n_settling_steps": 3}
+LEARNED = {"feedback": "learned", "feedback_start": "mirrored", "weight_decay": 0.1}
+
+
+def with_all_parts(settling="scheduled", circuits=None, nudge=None, **keywords):
+    """An agent whose updates have all their parts."""
+    policy = {"net_arch": [16, 16], "n_critics": 2, "memory_history": 2, "nudge": nudge, "circuit_kwargs": circuits or LEARNED}
+    return make(settling=settling, policy_kwargs=policy, refresh_weight=0.3, **PARTS, **keywords)

@@ -12,8 +12,7 @@ from sb3_actpc.actpc import actpc as actpc_module
 from sb3_actpc.actpc import captured as captured_module
 from sb3_actpc.actpc.captured import N_WARM_UP, CapturedUpdate
 from sb3_actpc.actpc.compiled import CompiledUpdate, compiled_update
-from tests.actpc.agents import make
-from tests.actpc.test_compiled import EQUATION_1, PARTS, agent
+from tests.actpc.agents import EQUATION_1, PARTS, make, with_all_parts
 
 DEVICE = "cuda" if th.cuda.is_available() else "cpu"
 
@@ -54,7 +53,7 @@ def trained(model, n=8):
 def made(**keywords):
     th.manual_seed(0)
     np.random.seed(0)
-    model = agent(device=DEVICE, **keywords)
+    model = with_all_parts(device=DEVICE, **keywords)
     model.learn(60)
     return model
 
@@ -124,17 +123,17 @@ def test_an_update_is_recorded_after_its_warm_up_and_for_every_kind(recorded):
 
 
 def test_on_a_cpu_nothing_is_captured_and_on_a_gpu_what_neither_waits_nor_is_told_not_to():
-    assert compiled_update(agent(compile="auto"), 1) is None
+    assert compiled_update(with_all_parts(compile="auto"), 1) is None
 
     def captured(model):
         object.__setattr__(model, "device", th.device("cuda"))
         return compiled_update(model, 1)
 
-    found = captured(agent(compile="auto"))
+    found = captured(with_all_parts(compile="auto"))
     assert isinstance(found._update, CapturedUpdate) and found.captures
-    assert captured(agent(compile=False)) is None
+    assert captured(with_all_parts(compile=False)) is None
     for others in (
-        partial(agent, "iterative", EQUATION_1, 1.0),
+        partial(with_all_parts, "iterative", EQUATION_1, 1.0),
         partial(make, policy_kwargs={"optimizer_class": th.optim.SGD}, **PARTS),
     ):
         assert captured(others(compile="auto")) is None

@@ -11,25 +11,10 @@ from stable_baselines3.common.logger import configure
 from sb3_actpc.actpc import actpc as actpc_module
 from sb3_actpc.actpc import compiled as compiled_module
 from sb3_actpc.actpc.compiled import ENOUGH_UPDATES, CompiledUpdate, compiled_update
-from tests.actpc.agents import make
+from tests.actpc.agents import EQUATION_1, LEARNED, make, with_all_parts
 from tests.actpc.envs import demonstrations
 
-PARTS = {
-    "demonstrations": demonstrations(),
-    "demonstration_fraction": 0.5,
-    "target_policy_noise": 0.2,
-    "refresh_kwargs": {"noise": 0.1},
-    "scale_pressure": True,
-    "actor_warm_start": 5,
-}
 LENGTH = len(demonstrations().rewards) / demonstrations().n_episodes
-EQUATION_1 = {"dynamics": "state", "n_settling_steps": 3}
-LEARNED = {"feedback": "learned", "feedback_start": "mirrored", "weight_decay": 0.1}
-
-
-def agent(settling="scheduled", circuits=None, nudge=None, **keywords):
-    policy = {"net_arch": [16, 16], "n_critics": 2, "memory_history": 2, "nudge": nudge, "circuit_kwargs": circuits or LEARNED}
-    return make(settling=settling, policy_kwargs=policy, refresh_weight=0.3, **PARTS, **keywords)
 
 
 @pytest.mark.parametrize("device", [None, pytest.param("cpu", marks=pytest.mark.slow)])
@@ -45,7 +30,7 @@ def test_compiled_updates_equal_eager_ones(settling, circuits, nudge, device, mo
     for compiled in (False, True):
         th.manual_seed(0)
         np.random.seed(0)
-        model = agent(settling, circuits, nudge, compile=compiled, device="cpu")
+        model = with_all_parts(settling, circuits, nudge, compile=compiled, device="cpu")
         model.learn(60)
         start = {name: value.clone() for name, value in model.policy.state_dict().items()}
         assert (model._compiled is not None) == compiled
@@ -60,7 +45,7 @@ def test_compiled_updates_equal_eager_ones(settling, circuits, nudge, device, mo
 
 @pytest.mark.parametrize(("settling", "circuits"), [("scheduled", LEARNED), ("iterative", EQUATION_1)])
 def test_auto_compiles_from_enough_updates_on(settling, circuits):
-    model = agent(settling, circuits, compile="auto")
+    model = with_all_parts(settling, circuits, compile="auto")
     assert compiled_update(model, ENOUGH_UPDATES - 1) is None
     assert compiled_update(model, ENOUGH_UPDATES) is not None
     model.compile = False
@@ -71,7 +56,7 @@ def test_a_resumed_run_compiles_as_the_whole_run_would(monkeypatch):
     """Else the two would differ by rounding."""
     asked = []
     monkeypatch.setattr(actpc_module, "compiled_update", lambda agent, steps: asked.append(steps))
-    model = agent()
+    model = with_all_parts()
     model.learn(60)
     model.learn(40, reset_num_timesteps=False)
     assert asked == [60, 100]
@@ -89,7 +74,7 @@ def test_a_resumed_run_compiles_as_the_whole_run_would(monkeypatch):
     ],
 )
 def test_auto_counts_the_updates_that_a_run_will_make(keywords, per_step):
-    model = agent(compile="auto", **keywords)
+    model = with_all_parts(compile="auto", **keywords)
     enough = math.ceil(ENOUGH_UPDATES / per_step)
     assert compiled_update(model, enough - 1) is None and compiled_update(model, enough) is not None
 
@@ -124,7 +109,7 @@ def test_weights_that_are_annealed_ask_for_no_other_graph(monkeypatch):
     monkeypatch.setattr(
         compiled_module.th, "compile", lambda function, **keywords: real(function, backend=counted, **keywords)
     )
-    model = agent(compile=True)
+    model = with_all_parts(compile=True)
     model.learn(60)
     n_graphs = len(graphs)
     assert n_graphs > 0
@@ -137,13 +122,13 @@ def test_weights_that_are_annealed_ask_for_no_other_graph(monkeypatch):
 def test_agents_of_many_sizes_have_their_graphs_in_one_process():
     from torch._dynamo import config
 
-    CompiledUpdate(agent())
+    CompiledUpdate(with_all_parts())
     assert config.recompile_limit >= 64
 
 
 def test_without_a_compiler_updates_stay_eager(monkeypatch):
     monkeypatch.setattr("sb3_actpc.actpc.compiled._has_compiler", lambda: False)
-    model, said = agent(compile=True), []
+    model, said = with_all_parts(compile=True), []
     model.set_logger(configure(None, []))
     monkeypatch.setattr(model.logger, "info", said.append)
     assert compiled_update(model, 1) is None and len(said) == 1 and "no C++ compiler" in said[0]
@@ -157,19 +142,19 @@ def test_where_compiling_fails_auto_goes_on_eagerly_and_an_order_raises(monkeypa
     monkeypatch.setattr(compiled_module.th, "compile", lambda function, **_: function)
     monkeypatch.setattr(compiled_module, "ENOUGH_UPDATES", 1)
     with pytest.raises(RuntimeError, match=r"Python\.h"):
-        agent(compile=True).learn(60)
-    model = agent(compile="auto")
+        with_all_parts(compile=True).learn(60)
+    model = with_all_parts(compile="auto")
     with pytest.warns(UserWarning, match=r"compiling them failed \(RuntimeError\)") as said:
         model.learn(60)
     assert len([one for one in said if "compiling" in str(one.message)]) == 1
-    eager = agent(compile=False)
+    eager = with_all_parts(compile=False)
     eager.learn(60)
     assert model._compiled is None and model._n_updates == eager._n_updates
 
 
 def test_in_a_graph_rates_are_tensors_that_move_with_the_synapses(monkeypatch):
     """As numbers they would be constants of the graph."""
-    circuit = agent("iterative", EQUATION_1).critic[0]
+    circuit = with_all_parts("iterative", EQUATION_1).critic[0]
     numbers = circuit.layer_rates()
     monkeypatch.setattr(th.compiler, "is_compiling", lambda: True)
     tensors = circuit.layer_rates()
