@@ -45,6 +45,7 @@ from sb3_actpc.actpc.arguments import (
     checked,
 )
 from sb3_actpc.actpc.buffers import CombinedHerReplayBuffer, SignalReplay, combined_buffer_class, relabels
+from sb3_actpc.actpc.calibration import Calibration
 from sb3_actpc.actpc.cloning import Cloning, Imitated
 from sb3_actpc.actpc.compiled import CompiledUpdate, compiled_update, updates_per_step
 from sb3_actpc.actpc.demonstration_replay import DemonstrationReplay
@@ -303,6 +304,8 @@ class ActPC(OffPolicyAlgorithm):
         self.n_cloning_updates = 0
         self.cloning: Cloning | None = None  # while the actor becomes a clone
         self.trials: Trials | None = None
+        self.calibration: Calibration | None = None  # of the critic, where a trust region regulates its pressure
+        self._meant: np.ndarray | None = None  # what the last actions were before their noise
         self._has_bar = False  # whether learning shows its progress
         self._is_taught = False  # whether the habit teaches the learning actor
         if _init_setup_model:
@@ -336,6 +339,8 @@ class ActPC(OffPolicyAlgorithm):
             goes_on = self.trials is not None and self._last_obs is not None
             self.trials = (self.trials or Trials(1, n_clones=clones)).forgotten(self.n_envs, goes_on)
             self.trials.n_clones = min(self.trials.n_clones, clones)
+        if self.policy.habit and self.policy.trust_region is not None:
+            self.calibration = (self.calibration or Calibration(1)).forgotten(self.n_envs)
         self._setup_demonstrations()
         self._fit_to_bounds()
         self.diagnostics = Diagnostics(self.policy)
@@ -489,6 +494,8 @@ class ActPC(OffPolicyAlgorithm):
         super().set_env(env, force_reset)
         if self.trials is not None:  # another environment may pay for other steps
             self.trials = self.trials.forgotten(self.n_envs, goes_on=not force_reset)
+        if self.calibration is not None:
+            self.calibration = self.calibration.forgotten(self.n_envs)
         if self.replay_buffer is not None:
             self.replay_buffer.forget_own_episodes()
         if isinstance(self.replay_buffer, HerReplayBuffer):  # SB3 goes on paying by the old one
@@ -532,6 +539,8 @@ class ActPC(OffPolicyAlgorithm):
                 self.replay_buffer.cut_running_episodes()
             if self.trials is not None:
                 self.trials.begin_all()
+            if self.calibration is not None:
+                self.calibration.begin_all()
         result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
         self._check_observations(self._last_obs)
         self._follow_demonstrations()
@@ -550,6 +559,7 @@ class ActPC(OffPolicyAlgorithm):
         self._has_bar = _shows_progress(result[1])
         self.pretrain(between_updates(result[1]), self._has_bar)
         self._is_taught = self.imitation.is_taught
+        self._follow_calibration()
         self.start_time = time.time_ns()  # of the frames per second: pre-training has none
         self._compiled = self._compiled or compiled_update(self, self._total_timesteps)  # resumed, as straight
         return result
@@ -728,6 +738,7 @@ class ActPC(OffPolicyAlgorithm):
         if warming_up:
             scaled = self.policy.scale_action(np.array([self.action_space.sample() for _ in range(n_envs)]))
         check_finite("actor", "actions", scaled, self.num_timesteps)
+        self._meant = None if warming_up else scaled
         if action_noise is not None or self.exploration_noise:
             noise = self._exploration(scaled.shape) if action_noise is None else action_noise()
             noisy = np.array([role == "actor" for role in roles]).reshape(-1, *[1] * (scaled.ndim - 1))
@@ -768,6 +779,7 @@ class ActPC(OffPolicyAlgorithm):
         check_finite("environment", "rewards", reward, self.num_timesteps)
         score = self._score if any(self.reward_weights[1:]) else None
         assert isinstance(replay_buffer, SignalReplay)
+        self._calibrate(buffer_action, reward, dones, infos)
         scored: Any = SimpleNamespace(add=partial(replay_buffer.add, score=score))  # SB3 calls ``add`` and nothing else
         super()._store_transition(scored, buffer_action, new_obs, reward, dones, infos)
         self._rollout_starts = np.array(dones, dtype=bool)
@@ -776,6 +788,28 @@ class ActPC(OffPolicyAlgorithm):
         if self.expert is not None and np.any(dones):
             self.expert.check_scale(replay_buffer.rewards[: replay_buffer.size()])
         self._prove(paid, dones)
+
+    def _calibrate(self, actions: np.ndarray, rewards: np.ndarray, dones: np.ndarray, infos: list[dict[str, Any]]) -> None:
+        """Whether the critic knows what the learning actor's noise gains: see :mod:`sb3_actpc.actpc.calibration`."""
+        if self.calibration is None or self.trials is None or self._meant is None:
+            return
+        noisy = [env for env, role in enumerate(self.trials.roles) if role == "actor" and env not in self.trials.skipped]
+        if not noisy or np.array_equal(actions[noisy], self._meant[noisy]):  # there is no noise
+            return
+        with th.no_grad():
+            features = self.actor.features(self.actor.obs_to_tensor(self._last_obs)[0]).repeat(2, 1)  # type: ignore[arg-type]
+            both = self.inputs.tensor(np.concatenate([actions, self._meant]).reshape(len(features), -1))
+            done, meant = self.critic.first().project(th.cat([features, both], dim=1)).mean(1).view(2, -1).tolist()
+        for env in noisy:
+            self.calibration.step(env, done[env] - meant[env], meant[env], self.alpha_ext * float(rewards[env]))
+            if dones[env]:
+                self.calibration.end(env, self.gamma, terminated=not infos[env].get("TimeLimit.truncated", False))
+                self._follow_calibration()
+
+    def _follow_calibration(self) -> None:
+        region = self.policy.trust_region
+        if region is not None and self.calibration is not None and self.calibration.n:
+            region.trust.fill_(self.calibration.trust)
 
     def _prove(self, rewards: np.ndarray, dones: np.ndarray) -> None:
         """The habit follows from what whole episodes were paid: see :mod:`sb3_actpc.actpc.habit`."""
@@ -959,7 +993,7 @@ class ActPC(OffPolicyAlgorithm):
         if self.trials is not None:
             self.diagnostics.follow(pressure=lambda: self.pressure)
         if self.trials is not None and region is not None:
-            self.diagnostics.follow(trust_radius=lambda: float(region.radius))
+            self.diagnostics.follow(trust_radius=lambda: float(region.radius), critic_trust=lambda: float(region.trust))
 
     def _imitated(self, batch: Batch) -> Imitated | None:
         """
@@ -1160,6 +1194,7 @@ class ActPC(OffPolicyAlgorithm):
             "expert_signals": None if expert is None else [expert.epistemic, expert.instrumental, expert.has_signals],
             "diagnostics": dict(self.diagnostics.values),
             "trials": None if self.trials is None else self.trials.checkpoint_state(),
+            "calibration": None if self.calibration is None else self.calibration.checkpoint_state(),
             "imitation": self.imitation.checkpoint_state(),
         }
 
@@ -1186,6 +1221,9 @@ class ActPC(OffPolicyAlgorithm):
         self.signals.restore_checkpoint_state(state["signals"])
         self.diagnostics.values = dict(state["diagnostics"])
         self.trials = None if state["trials"] is None else Trials(**state["trials"])
+        if state.get("calibration") is not None:  # none in a checkpoint of before
+            self.calibration = Calibration(**state["calibration"])
+            self._follow_calibration()
         self.imitation.restore_checkpoint_state(state.get("imitation"))  # none in a checkpoint of before
 
     @classmethod

@@ -63,6 +63,7 @@ class TrustRegion(nn.Module):
     deviation: th.Tensor
     multiplier: th.Tensor
     holds: th.Tensor
+    trust: th.Tensor
 
     def __init__(self, radius: float, n_actions: int) -> None:
         smallest, largest = RADII
@@ -75,6 +76,7 @@ class TrustRegion(nn.Module):
         self.register_buffer("radius", th.tensor(float(radius)))
         self.register_buffer("deviation", th.tensor(0.0))
         self.register_buffer("multiplier", th.tensor(0.0))
+        self.register_buffer("trust", th.tensor(1.0), persistent=False)  # the share of the radius that the critic has proven
         self.register_buffer("holds", th.tensor(0.0))  # 1 where the habit teaches the learning actor, which goes with the unit
         self.begin()
 
@@ -108,7 +110,8 @@ class TrustRegion(nn.Module):
         weights = values - values.min() + SMALLEST_VALUE  # the same for all where all are worth the same
         squares = ((actions - habit_actions) / self.unit).square().mean(1)
         self.deviation.lerp_((squares * weights).mean() / weights.mean(), DEVIATION_RATE)
-        unused = (1.0 - self.deviation / self.radius).clamp_min(-1.0)
+        allowed = self.radius * self.trust
+        unused = (1.0 - self.deviation / allowed.clamp_min(SMALLEST_VALUE)).clamp_min(-1.0)
         self.multiplier.mul_((RISE * unused.clamp_min(0.0) + FALL * unused.clamp_max(0.0)).exp())
         self.multiplier.clamp_min_(MULTIPLIERS[0]).clamp_max_(self.largest)
         return self.multiplier.clone()
