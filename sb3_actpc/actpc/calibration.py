@@ -100,8 +100,9 @@ class Calibration:
 
     @property
     def trust(self) -> float:
-        """The share of its word that is proven: the slope less its error, from 0 to 1."""
-        return min(max(self.slope - self.error, 0.0), 1.0)
+        """The share of its word that is not disproven: the slope and its error, from 0 to 1. Where nothing is to be gained any
+        more nothing can be proven, and where nothing is known nothing is disproven."""
+        return min(max(self.slope + self.error, 0.0), 1.0) if self.said_squared else 1.0
 
     def checkpoint_state(self) -> dict[str, Any]:
         """Everything, as plain values."""
