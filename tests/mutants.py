@@ -156,16 +156,23 @@ MUTANTS = [
     Mutant(
         "a CUDA graph steps a loaded optimiser's old averages",
         "actpc/captured.py",
-        "*_same(tensors), *self._addresses())",
-        "*_same(tensors))",
+        "*_same(tensors), *self._addresses(), *self.settings())",
+        "*_same(tensors), *self.settings())",
         "tests/actpc/test_captured.py -k loaded",
     ),
     Mutant(
         "a CUDA graph takes two batches for one",
         "actpc/captured.py",
-        "*_same(tensors), *self._addresses())",
-        "*self._addresses())",
+        "*_same(tensors), *self._addresses(), *self.settings())",
+        "*self._addresses(), *self.settings())",
         "tests/actpc/test_captured.py -k every_kind",
+    ),
+    Mutant(
+        "a CUDA graph keeps the settings that it was recorded with",
+        "actpc/captured.py",
+        "*self._addresses(), *self.settings())",
+        "*self._addresses())",
+        "tests/actpc/test_captured.py -k setting_that",
     ),
     Mutant(
         "a CUDA graph keeps its learning rate",

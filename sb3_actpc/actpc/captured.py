@@ -17,15 +17,19 @@ class CapturedUpdate:
     An update that changes synapses in place, recorded once for every kind of batch and replayed.
 
     Launching some hundred small kernels one by one takes longer than running them. The graph reads copies of what it is given
-    and the synapses where they lie; where these, or an optimiser's averages, have moved, it is recorded anew.
+    and the synapses where they lie; where these, or an optimiser's averages, have moved, or a setting has changed, it is
+    recorded anew.
 
     :param update: of a nested tuple of tensors and Nones; it must not wait for the GPU
-    :param optimizers: those that it steps
+    :param optimizers: those that it steps; the graph follows their learning rates
+    :param settings: the numbers that the update reads beside tensors, which are constants of a graph
     :raises RuntimeError: when called, for an update that cannot be recorded
     """
 
-    def __init__(self, update: Callable[[Any], None], optimizers: list[th.optim.Optimizer]) -> None:
-        self.update, self.optimizers = update, optimizers
+    def __init__(
+        self, update: Callable[[Any], None], optimizers: list[th.optim.Optimizer], settings: Callable[[], tuple[Any, ...]]
+    ) -> None:
+        self.update, self.optimizers, self.settings = update, optimizers, settings
         self._rates: list[th.Tensor] = []  # learning rates, which a schedule moves, as the graphs read them
         self._set: list[float] = []
         self._n_seen: dict[Any, int] = {}
@@ -33,7 +37,8 @@ class CapturedUpdate:
 
     def __call__(self, given: Any) -> None:
         tensors = list(_tensors(given))
-        kind = (*(_shape(part) for part in _parts(given)), *_same(tensors), *self._addresses())
+        shapes = [_shape(part) for part in _parts(given)]
+        kind = (*shapes, *_same(tensors), *self._addresses(), *self.settings())
         if kind not in self._recorded:
             self._n_seen[kind] = self._n_seen.get(kind, 0) + 1
             if self._n_seen[kind] <= N_WARM_UP:

@@ -54,7 +54,7 @@ class CompiledUpdate:
         self._changes: Callable[[_Given], _Changes] = self._all_changes
         if captures:
             optimizers = [circuit.optimizer for _, circuit in agent.policy.named_circuits()]
-            self._update = CapturedUpdate(self._change_all, optimizers)
+            self._update = CapturedUpdate(self._change_all, optimizers, self._settings)
         else:
             from torch._dynamo import config  # takes a second
 
@@ -63,6 +63,13 @@ class CompiledUpdate:
         self._has_warned = False
         # to a GPU numbers go slowly; a tensor for each name, as one that comes twice asks for another graph
         self._weight = lru_cache(8)(lambda name, weight: th.tensor(float(weight), device=agent.device))
+
+    def _settings(self) -> tuple[Any, ...]:
+        """Of the agent, which a user may change, beside what comes with every batch."""
+        agent = self.agent
+        decays = [circuit.weight_decay for _, circuit in agent.policy.named_circuits()]
+        own = agent.tau, agent.target_update_interval, agent.scale_pressure, agent.bootstrap, agent.alpha_ep
+        return *own, agent.policy.nudge, *decays
 
     def ready(self) -> bool:
         """Whether nothing is measured and, as each other update would be compiled anew, this one has all its parts: something

@@ -45,7 +45,9 @@ class TrustRegion(nn.Module):
     lost nothing is imitated, and refresh alone lets the actor drift there. The multiplier grows slowly while the deviation is
     below the radius, and falls quickly while it is above. So a set of demonstrations that holds one action for a state allows
     little, one that holds many allows much; and the radius follows outcomes: it widens with candidates that hold their own,
-    and shrinks with those that do not. Where the unit is unknown the multiplier has a bound of its own (``LARGEST_UNHELD``).
+    and shrinks with those that do not. Of the radius the critic has what its calibration leaves it (``trust``,
+    :mod:`sb3_actpc.actpc.calibration`): none where its word is disproven. Where the unit is unknown the multiplier has a
+    bound of its own (``LARGEST_UNHELD``).
 
     Where the habit holds the learning actor the radius begins small, and follows every episode of that one in the place of
     verdicts, which are few where clones guess: it widens with what they are paid more than the habit, and shrinks with what

@@ -87,7 +87,7 @@ def test_a_rate_that_changes_reaches_the_graph(recorded):
     before = {name: value.clone() for name, value in model.policy.state_dict().items() if "weights" in name}
     model.lr_schedule = lambda left: 0.0
     assert model._compiled._update._recorded
-    model.tau, moved = 0.0, trained(model, 2)
+    moved = trained(model, 2)
     for name, value in before.items():
         if name.startswith(("actor.circuit", "critic.0")):
             assert th.equal(value.cpu(), moved[name]), name
@@ -105,9 +105,24 @@ def test_a_loaded_optimiser_is_recorded_anew(recorded):
     assert all(th.allclose(value, ours[name], atol=1e-6) for name, value in theirs.items())
 
 
+@pytest.mark.parametrize(
+    ("name", "value"), [("tau", 0.5), ("scale_pressure", False), ("target_update_interval", 100), ("refresh_weight", 0.9)]
+)
+def test_a_setting_that_changes_is_followed(name, value, recorded):
+    """By another graph, or, as the weights are, by what the graph reads."""
+    model, eager = made(compile="auto"), made(compile=False)
+    for each in (model, eager):
+        trained(each)
+        setattr(each, name, value)
+    n = len(model._compiled._update._recorded)
+    ours, theirs = trained(model), trained(eager)
+    assert len(model._compiled._update._recorded) == n + (name != "refresh_weight")
+    assert all(th.allclose(value, ours[name], atol=1e-6) for name, value in theirs.items())
+
+
 def test_an_update_is_recorded_after_its_warm_up_and_for_every_kind(recorded):
     said, parameter = [], th.nn.Parameter(th.zeros(1), requires_grad=False)
-    update = CapturedUpdate(lambda given: said.append(given), [th.optim.Adam([parameter], fused=True)])
+    update = CapturedUpdate(lambda given: said.append(given), [th.optim.Adam([parameter], fused=True)], tuple)
     if DEVICE == "cpu":
         x, y = th.ones(3), th.zeros(2)
         for n in range(1, N_WARM_UP + 3):
