@@ -119,11 +119,11 @@ MUTANTS = [
         "tests/actpc/test_calibration.py -k time_limit",
     ),
     Mutant(
-        "a critic is distrusted until it has proven all",
+        "a critic is distrusted unless it has proven itself",
         "actpc/calibration.py",
-        "self.slope + self.error, 0.0)",
-        "self.slope - self.error, 0.0)",
-        "tests/actpc/test_calibration.py -k regression",
+        "if self.slope >= 0.0:",
+        "if self.slope >= 1.0:",
+        "tests/actpc/test_calibration.py -k p_value",
     ),
     Mutant(
         "an episode of long ago tells as much of the critic",

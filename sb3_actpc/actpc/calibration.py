@@ -1,7 +1,7 @@
 """How far the critic's word can be taken: whether actions gain what it says that they gain."""
 
 from dataclasses import asdict, dataclass, field, replace
-from math import exp
+from math import erfc, exp
 from typing import Any
 
 import numpy as np
@@ -100,9 +100,11 @@ class Calibration:
 
     @property
     def trust(self) -> float:
-        """The share of its word that is not disproven: the slope and its error, from 0 to 1. Where nothing is to be gained any
-        more nothing can be proven, and where nothing is known nothing is disproven."""
-        return min(max(self.slope + self.error, 0.0), 1.0) if self.said_squared else 1.0
+        """How likely so negative a slope is of a critic that knows nothing (p-value, two-sided); 1 for a positive one. What
+        its word is worth, if not less than nothing, the radius leaves to outcomes."""
+        if self.slope >= 0.0:
+            return 1.0
+        return erfc(-self.slope / self.error / 2**0.5) if self.error else 0.0
 
     def checkpoint_state(self) -> dict[str, Any]:
         """Everything, as plain values."""

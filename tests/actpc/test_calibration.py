@@ -6,7 +6,7 @@ from math import exp
 import numpy as np
 import pytest
 import torch as th
-from scipy.stats import linregress
+from scipy.stats import linregress, norm
 
 from sb3_actpc.actpc.calibration import FEWEST, WINDOW, Calibration
 from sb3_actpc.actpc.trust_region import FALL, FIRST_MULTIPLIER, RISE, TrustRegion
@@ -37,11 +37,18 @@ def test_it_is_the_regression_of_what_is_gained_on_what_was_said():
     said, gained = drawn()
     found, line = played(said, gained), linregress(said, gained)
     assert found.slope == pytest.approx(line.slope) and found.error == pytest.approx(line.stderr)
-    assert found.trust == pytest.approx(line.slope + line.stderr) and 0.3 < found.trust < 0.8
 
 
-@pytest.mark.parametrize(("slope", "trust"), [(1.0, 1.0), (3.0, 1.0), (-1.0, 0.0), (0.0, 0.0)])
-def test_trust_is_a_share(slope, trust):
+@pytest.mark.parametrize("seed", range(4))
+def test_trust_is_the_p_value_of_a_negative_slope(seed):
+    said, gained = drawn(slope=-0.05, seed=seed)
+    found, line = played(said, gained), linregress(said, gained)
+    assert found.trust == pytest.approx(2 * norm.cdf(line.slope / line.stderr) if line.slope < 0.0 else 1.0)
+    assert 0.0 < found.trust
+
+
+@pytest.mark.parametrize(("slope", "trust"), [(1.0, 1.0), (3.0, 1.0), (-1.0, 0.0), (0.01, 1.0)])
+def test_a_critic_that_is_surely_wrong_is_not_trusted(slope, trust):
     said, gained = drawn(slope=slope, noise=0.0)
     assert played(said, gained).trust == pytest.approx(trust, abs=1e-6)
 
