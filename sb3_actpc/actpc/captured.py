@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import torch as th
 
 # updates that run as ever before one of their kind is recorded: optimisers and libraries set up what they need
 N_WARM_UP = 2
+MOST_KINDS = 8  # of updates, each of which has a graph; then all are recorded anew
 
 
 class CapturedUpdate:
@@ -21,77 +24,112 @@ class CapturedUpdate:
     recorded anew.
 
     :param update: of a nested tuple of tensors and Nones; it must not wait for the GPU
-    :param optimizers: those that it steps; the graph follows their learning rates
+    :param stepped: the optimisers that it steps, which go with what it is given; the graph follows their learning rates
     :param settings: the numbers that the update reads beside tensors, which are constants of a graph
-    :raises RuntimeError: when called, for an update that cannot be recorded
     """
 
     def __init__(
-        self, update: Callable[[Any], None], optimizers: list[th.optim.Optimizer], settings: Callable[[], tuple[Any, ...]]
+        self,
+        update: Callable[[Any], None],
+        stepped: Callable[[Any], list[th.optim.Optimizer]],
+        settings: Callable[[], tuple[Any, ...]],
     ) -> None:
-        self.update, self.optimizers, self.settings = update, optimizers, settings
-        self._rates: list[th.Tensor] = []  # learning rates, which a schedule moves, as the graphs read them
-        self._set: list[float] = []
+        self.update, self.stepped, self.settings = update, stepped, settings
         self._n_seen: dict[Any, int] = {}
-        self._recorded: dict[Any, tuple[Any, list[th.Tensor]]] = {}  # graph, and what it reads
+        self._recorded: dict[Any, _Recorded] = {}
 
-    def __call__(self, given: Any) -> None:
+    def prepared(self, given: Any) -> Callable[[], None]:
+        """
+        :param given: what the update is of
+        :return: what makes it; until then nothing has changed
+        :raises RuntimeError: for an update that cannot be recorded
+        """
+        optimizers = self.stepped(given)
+        state = [value for optimizer in optimizers for value in _state_of(optimizer)]
+        # an optimiser that has just begun would be recorded as it begins
+        has_begun = all(optimizer.state for optimizer in optimizers)
+        if not has_begun:
+            return partial(self.update, given)
         tensors = list(_tensors(given))
         shapes = [_shape(part) for part in _parts(given)]
-        kind = (*shapes, *_same(tensors), *self._addresses(), *self.settings())
+        kind = (*shapes, *_same(tensors), *[one.data_ptr() for one in state], *_numbers(optimizers), *self.settings())
         if kind not in self._recorded:
+            self._forget_others()
             self._n_seen[kind] = self._n_seen.get(kind, 0) + 1
             if self._n_seen[kind] <= N_WARM_UP:
-                self.update(given)
-                return
-            self._recorded[kind] = self._record(given)
-        graph, copies = self._recorded[kind]
-        self._follow_rates()
-        th._foreach_copy_(copies, list({id(tensor): tensor for tensor in tensors}.values()))
-        graph.replay()
+                return partial(self.update, given)
+            self._recorded[kind] = self._record(given, optimizers, state)
+        return partial(self._recorded[kind].replay, list({id(tensor): tensor for tensor in tensors}.values()))
 
-    @property
-    def _groups(self) -> list[dict[str, Any]]:
-        """Of parameters; a loaded file's are others."""
-        return [group for optimizer in self.optimizers for group in optimizer.param_groups]
+    def _forget_others(self) -> None:
+        if max(len(self._recorded), len(self._n_seen)) >= MOST_KINDS:
+            self._recorded, self._n_seen = {}, {}
 
-    def _record(self, given: Any) -> tuple[Any, list[th.Tensor]]:
+    def _record(self, given: Any, optimizers: list[th.optim.Optimizer], state: list[th.Tensor]) -> _Recorded:
         copies = {id(tensor): th.empty_like(tensor) for tensor in _tensors(given)}
+        device = state[0].device
+        groups = [group for optimizer in optimizers for group in optimizer.param_groups]
+        rates = [th.zeros((), device=device) for _ in groups]
         graph = new_graph()
-        with self._rates_as_tensors(), capture(graph):
+        with _with_rates(groups, rates), capture(graph, device):
             self.update(_replaced(given, copies))
-        return graph, list(copies.values())
+        return _Recorded(graph, list(copies.values()), groups, rates, state)
 
-    @contextmanager
-    def _rates_as_tensors(self) -> Iterator[None]:
-        """A number would be a constant of the graph."""
-        groups = self._groups
-        if not self._rates:
-            self._rates = [th.zeros((), device=group["params"][0].device) for group in groups]
-            self._set = [0.0] * len(groups)
-        before = [(group["lr"], group["capturable"]) for group in groups]
-        try:
-            for group, rate in zip(groups, self._rates, strict=True):
-                group["lr"], group["capturable"] = rate, True
-            yield
-        finally:
-            for group, (rate, capturable) in zip(groups, before, strict=True):
-                group["lr"], group["capturable"] = rate, capturable
 
-    def _follow_rates(self) -> None:
-        for index, (group, rate) in enumerate(zip(self._groups, self._rates, strict=True)):
-            if group["lr"] != self._set[index]:
-                self._set[index] = group["lr"]
-                rate.fill_(group["lr"])
+@dataclass
+class _Recorded:
+    """
+    A graph and what it reads.
 
-    def _addresses(self) -> Iterator[int]:
-        """Where every optimiser's first synapses lie, and their averages; a loaded file's lie elsewhere."""
-        for optimizer in self.optimizers:
-            first = optimizer.param_groups[0]["params"][0]
-            yield first.data_ptr()
-            for value in optimizer.state.get(first, {}).values():
-                if isinstance(value, th.Tensor):
-                    yield value.data_ptr()
+    :param copies: of what the update is given
+    :param groups: of parameters, whose learning rates a schedule moves
+    :param rates: these as the graph reads them
+    :param state: synapses and optimisers' averages, whose memory is nobody else's while there is a graph
+    """
+
+    graph: Any
+    copies: list[th.Tensor]
+    groups: list[dict[str, Any]]
+    rates: list[th.Tensor]
+    state: list[th.Tensor]
+    numbers: list[float] = field(default_factory=list)  # the rates as they were set last
+
+    def replay(self, tensors: list[th.Tensor]) -> None:
+        numbers = [group["lr"] for group in self.groups]
+        if numbers != self.numbers:
+            self.numbers = numbers
+            for rate, number in zip(self.rates, numbers, strict=True):
+                rate.fill_(number)
+        th._foreach_copy_(self.copies, tensors)
+        self.graph.replay()
+
+
+@contextmanager
+def _with_rates(groups: list[dict[str, Any]], rates: list[th.Tensor]) -> Iterator[None]:
+    """Learning rates as tensors: a number would be a constant of the graph."""
+    before = [(group["lr"], group["capturable"]) for group in groups]
+    try:
+        for group, rate in zip(groups, rates, strict=True):
+            group["lr"], group["capturable"] = rate, True
+        yield
+    finally:
+        for group, (rate, capturable) in zip(groups, before, strict=True):
+            group["lr"], group["capturable"] = rate, capturable
+
+
+def _state_of(optimizer: th.optim.Optimizer) -> Iterator[th.Tensor]:
+    """Its parameters and what it keeps of each."""
+    for group in optimizer.param_groups:
+        for parameter in group["params"]:
+            yield parameter
+            yield from (value for value in optimizer.state.get(parameter, {}).values() if isinstance(value, th.Tensor))
+
+
+def _numbers(optimizers: list[th.optim.Optimizer]) -> Iterator[Any]:
+    """The optimisers' settings but their learning rates."""
+    for optimizer in optimizers:
+        for group in optimizer.param_groups:
+            yield from (value for name, value in group.items() if name not in ("params", "lr", "lr_scale", "capturable"))
 
 
 def new_graph() -> Any:
@@ -99,9 +137,9 @@ def new_graph() -> Any:
     return th.cuda.CUDAGraph()
 
 
-def capture(graph: Any) -> Any:
-    """While this context lasts, kernels are recorded into the graph and do not run."""
-    return th.cuda.graph(graph)
+def capture(graph: Any, device: th.device) -> Any:
+    """While this context lasts, kernels of the device are recorded into the graph and do not run."""
+    return th.cuda.graph(graph, stream=th.cuda.Stream(device))
 
 
 def _parts(given: Any) -> Iterator[Any]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import torch as th
@@ -50,16 +50,13 @@ class CompiledUpdate:
 
     def __init__(self, agent: Any, captures: bool = False) -> None:
         self.agent, self.captures = agent, captures
-        self._update: Callable[[_Given], None] = self._change_all
-        self._changes: Callable[[_Given], _Changes] = self._all_changes
         if captures:
-            optimizers = [circuit.optimizer for _, circuit in agent.policy.named_circuits()]
-            self._update = CapturedUpdate(self._change_all, optimizers, self._settings)
+            self._captured = CapturedUpdate(self._change_all, self._stepped, self._settings)
         else:
             from torch._dynamo import config  # takes a second
 
             config.recompile_limit = max(config.recompile_limit, MOST_GRAPHS)
-            self._changes = th.compile(self._all_changes, fullgraph=True, dynamic=False)
+            self._compiled = th.compile(self._all_changes, fullgraph=True, dynamic=False)
         self._has_warned = False
         # to a GPU numbers go slowly; a tensor for each name, as one that comes twice asks for another graph
         self._weight = lru_cache(8)(lambda name, weight: th.tensor(float(weight), device=agent.device))
@@ -67,9 +64,14 @@ class CompiledUpdate:
     def _settings(self) -> tuple[Any, ...]:
         """Of the agent, which a user may change, beside what comes with every batch."""
         agent = self.agent
-        decays = [circuit.weight_decay for _, circuit in agent.policy.named_circuits()]
+        of_circuits = [
+            (circuit.weight_decay, circuit.weight_bound, circuit.memory_weight) for _, circuit in agent.policy.named_circuits()
+        ]
         own = agent.tau, agent.target_update_interval, agent.scale_pressure, agent.bootstrap, agent.alpha_ep
-        return *own, agent.policy.nudge, *decays
+        return *own, agent.policy.nudge, *of_circuits
+
+    def _stepped(self, given: _Given) -> list[th.optim.Optimizer]:
+        return [circuit.optimizer for circuit in self._changing(given)]
 
     def ready(self) -> bool:
         """Whether nothing is measured and, as each other update would be compiled anew, this one has all its parts: something
@@ -114,21 +116,30 @@ class CompiledUpdate:
         noise = None if asked is None else agent._target_noise(asked)
         given = _Given((refresh, pressure if is_pressed else None), actor, asked, generator, imitated, noise)
         try:
-            self._update(given)
+            update = self._prepared(given)
         except Exception as error:
             if agent.compile is True:
                 raise
             agent._compiled = None
+            done = "recording" if self.captures else "compiling"
             warnings.warn(
-                f"updates run eagerly, as compiling them failed ({type(error).__name__}); compile=False does not try, and "
+                f"updates run eagerly, as {done} them failed ({type(error).__name__}); compile=False does not try, and "
                 "compile=True shows the error",
                 stacklevel=2,
             )
             return False
+        update()
         return True
 
+    def _prepared(self, given: _Given) -> Callable[[], None]:
+        """What makes the update; until then nothing has changed."""
+        return self._captured.prepared(given) if self.captures else partial(self._apply, given, self._compiled(given))
+
     def _change_all(self, given: _Given) -> None:
-        for circuit, changes in zip(self._changing(given), self._changes(given), strict=True):
+        self._apply(given, self._all_changes(given))
+
+    def _apply(self, given: _Given, found: _Changes) -> None:
+        for circuit, changes in zip(self._changing(given), found, strict=True):
             circuit.apply_changes(HebbianChanges(*changes))
         self.agent._follow_circuits()
 
@@ -182,7 +193,8 @@ def compiled_update(agent: Any, total_timesteps: int) -> CompiledUpdate | None:
 
 def _can_be_captured(circuit: NGCCircuit) -> bool:
     """Whether an update neither waits for the GPU (rates of eq. 1 do) nor steps an optimiser that might."""
-    return circuit.settling == "scheduled" and bool(circuit.optimizer.defaults.get("fused"))
+    defaults = circuit.optimizer.defaults
+    return circuit.settling == "scheduled" and bool(defaults.get("fused")) and "capturable" in defaults
 
 
 def updates_per_step(agent: Any) -> float:

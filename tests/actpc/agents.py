@@ -87,7 +87,8 @@ EQUATION_1 = {"dynamics": "state", "n_settling_steps": 3}
 LEARNED = {"feedback": "learned", "feedback_start": "mirrored", "weight_decay": 0.1}
 
 
-def with_all_parts(settling="scheduled", circuits=None, nudge=None, **keywords):
-    """An agent whose updates have all their parts."""
+def with_all_parts(settling="scheduled", circuits=None, nudge=None, habit=False, **keywords):
+    """An agent whose updates have all their parts; a habit and its trust region by choice."""
     policy = {"net_arch": [16, 16], "n_critics": 2, "memory_history": 2, "nudge": nudge, "circuit_kwargs": circuits or LEARNED}
-    return make(settling=settling, policy_kwargs=policy, refresh_weight=0.3, **PARTS, **keywords)
+    keywords = {**PARTS, "refresh_weight": 0.3, **keywords}
+    return make(settling=settling, policy_kwargs={**policy, "habit": habit}, **keywords)
