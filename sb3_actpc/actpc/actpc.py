@@ -790,26 +790,29 @@ class ActPC(OffPolicyAlgorithm):
         self._prove(paid, dones)
 
     def _calibrate(self, actions: np.ndarray, rewards: np.ndarray, dones: np.ndarray, infos: list[dict[str, Any]]) -> None:
-        """Whether the critic knows what the learning actor's noise gains: see :mod:`sb3_actpc.actpc.calibration`."""
-        if self.calibration is None or self.trials is None or self._meant is None:
+        """Whether the critic knows what the learning actor's noise gains: see :mod:`sb3_actpc.actpc.calibration`. Not where it
+        is paid by internal signals too, which are not those that a step had when it is learned."""
+        is_noisy = self.action_noise is not None or self.exploration_noise
+        is_asked = is_noisy and self.actor_pressure and not any(self.reward_weights[1:])
+        if self.calibration is None or self.trials is None or self._meant is None or not is_asked:
             return
         noisy = [env for env, role in enumerate(self.trials.roles) if role == "actor" and env not in self.trials.skipped]
-        if not noisy or np.array_equal(actions[noisy], self._meant[noisy]):  # there is no noise
+        if not noisy:
             return
         with th.no_grad():
             features = self.actor.features(self.actor.obs_to_tensor(self._last_obs)[0]).repeat(2, 1)  # type: ignore[arg-type]
             both = self.inputs.tensor(np.concatenate([actions, self._meant]).reshape(len(features), -1))
             done, meant = self.critic.first().project(th.cat([features, both], dim=1)).mean(1).view(2, -1).tolist()
         for env in noisy:
-            self.calibration.step(env, done[env] - meant[env], meant[env], self.alpha_ext * float(rewards[env]))
+            paid = self.alpha_ext * float(rewards[env])
+            self.calibration.step(env, done[env] - meant[env], meant[env], paid, self.gamma)
             if dones[env]:
                 self.calibration.end(env, self.gamma, terminated=not infos[env].get("TimeLimit.truncated", False))
                 self._follow_calibration()
 
     def _follow_calibration(self) -> None:
-        region = self.policy.trust_region
-        if region is not None and self.calibration is not None and self.calibration.n:
-            region.trust.fill_(self.calibration.trust)
+        if self.policy.trust_region is not None and self.calibration is not None:
+            self.policy.trust_region.trust.fill_(self.calibration.trust)
 
     def _prove(self, rewards: np.ndarray, dones: np.ndarray) -> None:
         """The habit follows from what whole episodes were paid: see :mod:`sb3_actpc.actpc.habit`."""
@@ -853,6 +856,8 @@ class ActPC(OffPolicyAlgorithm):
             return
         self._start_from(self.policy.candidate)
         self.trials.begun_at = self._n_updates
+        if self.calibration is not None:
+            self.calibration.begin_all()
         if self.policy.trust_region is not None:
             self.policy.trust_region.begin()
 
@@ -1181,6 +1186,8 @@ class ActPC(OffPolicyAlgorithm):
             group["lr_scale"] = scale
         if self.trials is not None:
             self.trials = self.trials.forgotten(self.n_envs, goes_on=True)
+        if self.calibration is not None:  # this is another critic
+            self.calibration = Calibration(self.n_envs)
 
     def checkpoint_state(self) -> dict[str, Any]:
         """What a checkpoint (:mod:`sb3_actpc.checkpoints`) keeps beside SB3's state: plain values and arrays."""
@@ -1223,7 +1230,6 @@ class ActPC(OffPolicyAlgorithm):
         self.trials = None if state["trials"] is None else Trials(**state["trials"])
         if state.get("calibration") is not None:  # none in a checkpoint of before
             self.calibration = Calibration(**state["calibration"])
-            self._follow_calibration()
         self.imitation.restore_checkpoint_state(state.get("imitation"))  # none in a checkpoint of before
 
     @classmethod

@@ -8,6 +8,7 @@ import numpy as np
 
 WINDOW = 2000.0  # noisy steps, over which the weight of an episode falls to a third
 FEWEST = 3  # steps of an episode, below which it says nothing
+ENOUGH = 200.0  # of all, below which nothing is disproven
 
 
 @dataclass
@@ -15,7 +16,7 @@ class Step:
     """
     A step of the learning actor with exploration noise, before it is learned.
 
-    :param said: what the critic says that the noise gains, Q(s, a) - Q(s, μ(s))
+    :param said: what the critic says that the noise gains, Q(s, a) - Q(s, μ(s)); it has not learned the step by then
     :param value: what it says that the state is worth, Q(s, μ(s))
     :param reward: what the step was paid
     """
@@ -31,9 +32,9 @@ class Calibration:
     The slope of what noise gains on what the critic says that it gains.
 
     An action's gain is r + γ Q(s', μ(s')) - Q(s, μ(s)): what it was paid and what the next state is worth, beyond what the
-    state was worth. Both are measured before the step is learned, so that the critic cannot know them, and within an episode,
-    so that they say nothing of how well it ranks states. A critic that is right has a slope of 1 (calibration by linear
-    regression: Cox, 1958), one that guesses a slope of 0, and one whose gradient points downhill less.
+    state was worth. What is said is said before the step is learned, so that the critic cannot know; and both are taken about
+    their episode's mean, so that they say nothing of how well it ranks states. A critic that is right has a slope of 1
+    (calibration by linear regression: Cox, 1958), one that guesses a slope of 0, and one whose gradient points downhill less.
 
     :param n_envs: environments, each with an episode of its own
     """
@@ -63,8 +64,11 @@ class Calibration:
         """
         return replace(self, n_envs=n_envs, running=[])
 
-    def step(self, env: int, said: float, value: float, reward: float) -> None:
-        """A step of ``env``; see :class:`Step`."""
+    def step(self, env: int, said: float, value: float, reward: float, gamma: float) -> None:
+        """A step of ``env``; see :class:`Step`. An episode that goes on and on is counted piece by piece."""
+        if len(self.running[env]) >= WINDOW:
+            self._count(self.running[env], [], gamma)
+            self.running[env] = []
         self.running[env].append(Step(said, value, reward))
 
     def end(self, env: int, gamma: float, terminated: bool) -> None:
@@ -75,7 +79,11 @@ class Calibration:
         :param terminated: whether nothing follows; after a time limit the last step's gain is unknown
         """
         steps, self.running[env] = self.running[env], []
-        values = np.array([step.value for step in steps] + [0.0] * terminated)
+        self._count(steps, [0.0] * terminated, gamma)
+
+    def _count(self, steps: list[Step], after: list[float], gamma: float) -> None:
+        """``after``: what is worth what comes after the last of the steps, if that is known."""
+        values = np.array([step.value for step in steps] + after)
         said, rewards = (np.array([getattr(step, name) for step in steps])[: len(values) - 1] for name in ("said", "reward"))
         if len(said) < FEWEST:
             return
@@ -102,7 +110,7 @@ class Calibration:
     def trust(self) -> float:
         """How likely so negative a slope is of a critic that knows nothing (p-value, two-sided); 1 for a positive one. What
         its word is worth, if not less than nothing, the radius leaves to outcomes."""
-        if self.slope >= 0.0:
+        if self.slope >= 0.0 or self.n < ENOUGH:
             return 1.0
         return erfc(-self.slope / self.error / 2**0.5) if self.error else 0.0
 

@@ -46,7 +46,7 @@ class TrustRegion(nn.Module):
     below the radius, and falls quickly while it is above. So a set of demonstrations that holds one action for a state allows
     little, one that holds many allows much; and the radius follows outcomes: it widens with candidates that hold their own,
     and shrinks with those that do not. Of the radius the critic has what its calibration leaves it (``trust``,
-    :mod:`sb3_actpc.actpc.calibration`): none where its word is disproven. Where the unit is unknown the multiplier has a
+    :mod:`sb3_actpc.actpc.calibration`): none where it is surely wrong. Where the unit is unknown the multiplier has a
     bound of its own (``LARGEST_UNHELD``).
 
     Where the habit holds the learning actor the radius begins small, and follows every episode of that one in the place of
@@ -78,7 +78,7 @@ class TrustRegion(nn.Module):
         self.register_buffer("radius", th.tensor(float(radius)))
         self.register_buffer("deviation", th.tensor(0.0))
         self.register_buffer("multiplier", th.tensor(0.0))
-        self.register_buffer("trust", th.tensor(1.0), persistent=False)  # the share of the radius that the critic has proven
+        self.register_buffer("trust", th.tensor(1.0), persistent=False)  # the share of the radius that the critic has
         self.register_buffer("holds", th.tensor(0.0))  # 1 where the habit teaches the learning actor, which goes with the unit
         self.begin()
 
@@ -125,7 +125,7 @@ class TrustRegion(nn.Module):
         :param verdict: about a candidate, a key of ``RADIUS_FACTORS``
         """
         if not self.holds:
-            self.radius.mul_(RADIUS_FACTORS[verdict]).clamp_(*RADII)
+            self.radius.mul_(self._trusted(RADIUS_FACTORS[verdict])).clamp_(*RADII)
 
     def follow(self, gain: float) -> None:
         """
@@ -134,4 +134,9 @@ class TrustRegion(nn.Module):
         :param gain: of an episode of the learning actor over the habit's mean return, as a share of that: from -1 to 1
         """
         if self.holds:
-            self.radius.mul_(math.exp(FOLLOWING_RATE * gain)).clamp_(self.first_radius, max(self.first_radius, LARGEST_HELD))
+            factor = self._trusted(math.exp(FOLLOWING_RATE * gain))
+            self.radius.mul_(factor).clamp_(self.first_radius, max(self.first_radius, LARGEST_HELD))
+
+    def _trusted(self, factor: float) -> float:
+        """Where the critic has little of the radius, outcomes are not its own, and widen it little."""
+        return factor ** float(self.trust) if factor > 1.0 else factor

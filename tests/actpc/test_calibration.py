@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 import torch as th
 from scipy.stats import linregress, norm
+from stable_baselines3.common.vec_env import DummyVecEnv
 
-from sb3_actpc.actpc.calibration import FEWEST, WINDOW, Calibration
+from sb3_actpc.actpc.calibration import ENOUGH, FEWEST, WINDOW, Calibration, Step
 from sb3_actpc.actpc.trust_region import FALL, FIRST_MULTIPLIER, RISE, TrustRegion
 from tests.actpc.agents import imitating
 from tests.actpc.envs import CountingEnv
@@ -22,7 +23,7 @@ def played(said, gained, calibration=None, env=0, terminated=True, offset=0.0):
     values = np.random.default_rng(len(said)).normal(size=len(said)) + offset
     following = np.append(values[1:], 0.0 if terminated else 100.0)
     for step in zip(said, values, np.asarray(gained) - GAMMA * following + values, strict=True):
-        calibration.step(env, *map(float, step))
+        calibration.step(env, *map(float, step), GAMMA)
     calibration.end(env, GAMMA, terminated)
     return calibration
 
@@ -57,6 +58,8 @@ def test_before_anything_is_known_nothing_is_disproven():
     calibration = Calibration(2)
     assert (calibration.slope, calibration.error, calibration.trust, calibration.n) == (0.0, 0.0, 1.0, 0.0)
     assert played([1.0] * (FEWEST - 1), [1.0] * (FEWEST - 1)).n == 0.0
+    said, gained = drawn(n=int(ENOUGH) - 1, slope=-1.0, noise=0.0)
+    assert played(said, gained).trust == 1.0 and played(*drawn(n=int(ENOUGH), slope=-1.0, noise=0.0)).trust == 0.0
     assert played([2.0] * 9, [1.0] * 9).trust == 1.0  # said the same of every action: nothing is known
 
 
@@ -90,7 +93,7 @@ def test_after_a_time_limit_the_last_step_says_nothing():
 def test_environments_have_episodes_of_their_own():
     calibration = Calibration(2)
     said, gained = drawn()
-    calibration.step(1, 100.0, 0.0, 5.0)
+    calibration.step(1, 100.0, 0.0, 5.0, GAMMA)
     assert played(said, gained, calibration).slope == pytest.approx(played(said, gained).slope)
     assert len(calibration.running[1]) == 1
     again = Calibration(**calibration.checkpoint_state())
@@ -114,39 +117,76 @@ def test_trust_is_not_in_the_parameters():
     assert "trust" not in TrustRegion(1, 2).state_dict()
 
 
-def test_the_critic_is_asked_of_the_noise_before_the_step_is_learned(monkeypatch):
-    model, asked = imitating(partial(CountingEnv, returns=(1.0, 2.0, 3.0)), exploration_noise=0.1, alpha_ext=0.5), []
-    real = Calibration.step
+def test_an_episode_that_goes_on_is_counted_piece_by_piece():
+    calibration = Calibration(1)
+    for _ in range(int(2.5 * WINDOW)):
+        calibration.step(0, 0.0, 1.0, 0.0, GAMMA)
+    assert calibration.n == pytest.approx((WINDOW - 1) * (1 + exp(-(WINDOW - 1) / WINDOW)))
+    assert len(calibration.running[0]) == WINDOW / 2
 
-    def step(self, env, said, value, reward):
-        with th.no_grad():
-            features = model.actor.features(model.actor.obs_to_tensor(model._last_obs)[0])
-            both = [
-                model.critic.first().project(th.cat([features, model.inputs.tensor(actions)], 1)).mean().item()
-                for actions in (model._meant, model._last_noisy)
-            ]
-        asked.append((model.num_timesteps, said, both[1] - both[0], value, both[0], reward))
-        real(self, env, said, value, reward)
 
-    store = type(model)._store_transition
+@pytest.mark.parametrize("saturated", [False, True])
+def test_the_agent_calibrates_its_critic_on_the_noisy_steps_of_every_environment(saturated, monkeypatch):
+    """Two environments whose episodes end and are cut; nothing learns, so that the critic can be asked again afterwards."""
+    monkeypatch.setattr("sb3_actpc.actpc.habit.PROOF_STEPS", 10**6)  # no verdict
+    pays = partial(CountingEnv, lengths=(5, 9, 7, 4), returns=(1.0, 2.0, 3.0))
+    model = imitating(DummyVecEnv([pays, pays]), exploration_noise=0.5, alpha_ext=0.5, gamma=GAMMA)
+    monkeypatch.setattr(model, "train", lambda *_, **__: None)
+    model.pretrain()
+    model.policy.spread.fill_(0.5)
+    model.set_env(DummyVecEnv([pays, partial(pays, lengths=(6, 3, 8))]))
+    if saturated:  # noise that points outwards is lost: such a step is one of the episode nonetheless
+        model.actor.circuit.biases[-1].fill_(20.0)
+    played_, sample = [], type(model)._sample_action
 
-    def stored(self, buffer, actions, *others):
-        self._last_noisy = actions
-        store(self, buffer, actions, *others)
+    def sampled(self, *others):
+        roles, seen = list(self.trials.roles), np.array(self._last_obs)
+        actions = sample(self, *others)
+        played_.append([seen, roles, actions[1]])
+        return actions
 
-    monkeypatch.setattr(Calibration, "step", step)
-    monkeypatch.setattr(type(model), "_store_transition", stored)
-    model.learn(60)
-    assert 10 < len(asked) < 60  # noisy episodes alone
-    for _, said, expected, value, meant, _reward in asked:
-        assert said == pytest.approx(expected, abs=1e-5) and value == pytest.approx(meant, abs=1e-5)
-    assert any(abs(said) > 1e-4 for _, said, *_ in asked) and {reward for *_, reward in asked} & {0.5, 1.0, 1.5}
-    assert model.calibration.n > 0.0
-    assert float(model.policy.trust_region.trust) == pytest.approx(model.calibration.trust)
+    stepped = model.env.step
+    monkeypatch.setattr(type(model), "_sample_action", sampled)
+    monkeypatch.setattr(model.env, "step", lambda actions: played_[-1].append(stepped(actions)) or played_[-1][-1])
+    model.learn(160)
+    expected = Calibration(2)
+    with th.no_grad():
+        features = [model.actor.features(th.as_tensor(seen)) for seen, *_ in played_]
+        meant = [model.actor.circuit.project(one) for one in features]
+        worth = [model.critic.first().project(th.cat([f, m], 1)).mean(1) for f, m in zip(features, meant, strict=True)]
+        done = [
+            model.critic.first().project(th.cat([f, th.as_tensor(step[2])], 1)).mean(1)
+            for f, step in zip(features, played_, strict=True)
+        ]
+    kinds = set()
+    ended = sorted((t, env) for t, step in enumerate(played_) for env in range(2) if step[3][2][env])
+    begun = [0, 0]
+    for t, env in ended:
+        times, begun[env] = range(begun[env], t + 1), t + 1
+        if played_[t][1][env] != "actor":
+            continue
+        terminated = not played_[t][3][3][env]["TimeLimit.truncated"]
+        kinds.add((env, terminated))
+        values = [worth[time][env].item() for time in times] + [0.0] * terminated
+        rewards = [0.5 * float(played_[time][3][1][env]) for time in times]
+        gained = [r + GAMMA * after - before for r, after, before in zip(rewards, values[1:], values, strict=False)]
+        said = [(done[time][env] - worth[time][env]).item() for time in times][: len(gained)]
+        played(said, gained, expected)
+    assert kinds == {(0, True), (0, False), (1, True), (1, False)}
+    found = model.calibration
+    for name in ("n", "said_squared", "gained_squared", "products"):
+        assert getattr(found, name) == pytest.approx(getattr(expected, name), rel=1e-3), name
 
 
 @pytest.mark.parametrize(
-    "keywords", [{"exploration_noise": 0.0}, {"policy_kwargs": {"habit": False}}, {"policy_kwargs": {"trust_radius": 0.0}}]
+    "keywords",
+    [
+        {"exploration_noise": 0.0},
+        {"policy_kwargs": {"habit": False}},
+        {"policy_kwargs": {"trust_radius": 0.0}},
+        {"actor_pressure": 0.0},
+        {"alpha_in": 1.0},
+    ],
 )
 def test_without_noise_or_a_region_nothing_is_asked(keywords):
     model = imitating(**keywords)
@@ -156,14 +196,34 @@ def test_without_noise_or_a_region_nothing_is_asked(keywords):
     assert region is None or float(region.trust) == 1.0
 
 
-def test_a_loaded_agent_goes_on_with_what_is_known(tmp_path):
+def test_another_critic_is_tested_anew(tmp_path):
     model = imitating(exploration_noise=0.1)
     model.learn(60)
-    model.calibration.products, model.calibration.said_squared = -10.0, 20.0  # a slope of -0.5, which is sure
-    model.save(tmp_path / "agent.zip")
-    loaded = type(model).load(tmp_path / "agent.zip", env=model.env)
-    assert loaded.calibration == model.calibration.forgotten(1)
-    loaded.learn(1, reset_num_timesteps=False)
-    assert (
-        float(loaded.policy.trust_region.trust) == pytest.approx(loaded.calibration.trust) and loaded.calibration.trust < 0.1
-    )
+    assert model.calibration.n > 0.0
+    model.calibration.n, model.calibration.products, model.calibration.said_squared = 1000.0, -10.0, 20.0
+    model.learn(1, reset_num_timesteps=False)
+    assert float(model.policy.trust_region.trust) == pytest.approx(model.calibration.trust) and model.calibration.trust < 0.1
+    model.set_parameters(model.get_parameters())
+    assert model.calibration == Calibration(1)
+    model.learn(1, reset_num_timesteps=False)
+    assert float(model.policy.trust_region.trust) == 1.0
+
+
+def test_with_another_clone_running_episodes_do_not_count():
+    model = imitating(exploration_noise=0.1)
+    model.learn(3)
+    model.calibration.running[0] = [Step(1.0, 1.0, 1.0)] * 2
+    model.trials.is_clone = True
+    model._accept_candidate()
+    assert model.calibration.running == [[]]
+
+
+@pytest.mark.parametrize(("trust", "factor"), [(1.0, 2.0), (0.5, 2.0**0.5), (0.0, 1.0)])
+def test_outcomes_widen_the_region_as_far_as_the_critic_is_trusted(trust, factor):
+    """A learner that is held at its habit ties with it, which says nothing of the pressure."""
+    region = TrustRegion(1, 2)
+    region.trust.fill_(trust)
+    region.resize("tied")
+    assert float(region.radius) == pytest.approx(factor)
+    region.resize("rejected")
+    assert float(region.radius) == pytest.approx(0.7 * factor)
