@@ -209,6 +209,16 @@ def test_another_critic_is_tested_anew(tmp_path):
     assert float(model.policy.trust_region.trust) == 1.0
 
 
+def test_what_is_known_reaches_the_region(monkeypatch):
+    monkeypatch.setattr(Calibration, "trust", 0.25)
+    model = imitating(exploration_noise=0.1)
+    region = model.policy.trust_region
+    follow = type(model)._follow_calibration
+    monkeypatch.setattr(type(model), "_follow_calibration", lambda self: follow(self) if self.num_timesteps else None)
+    model.learn(30)
+    assert float(region.trust) == 0.25
+
+
 def test_with_another_clone_running_episodes_do_not_count():
     model = imitating(exploration_noise=0.1)
     model.learn(3)
