@@ -226,7 +226,7 @@ MUTANTS = [
     Mutant(
         "a CUDA graph presses before the critic is warm",
         "actpc/compiled.py",
-        "pressure if is_pressed else None",
+        "pressure if agent.is_pressing else None",
         "pressure",
         "tests/actpc/test_captured.py -k equal",
     ),
@@ -513,8 +513,8 @@ MUTANTS = [
     Mutant(
         "pressure from the first update on",
         AGENT,
-        "self.actor_pressure if self._n_updates > self.critic_warmup else 0.0",
-        "self.actor_pressure",
+        "return bool(self.actor_pressure) and self._n_updates > self.critic_warmup",
+        "return bool(self.actor_pressure)",
         f"{LEARNS} -k warmup",
     ),
     Mutant("the weight of refresh is ignored", AGENT, "changes.scale_(refresh_weight)", "changes", f"{LEARNS} -k refresh"),

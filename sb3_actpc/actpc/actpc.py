@@ -990,13 +990,13 @@ class ActPC(OffPolicyAlgorithm):
     def _update_actor(self, batch: Batch) -> None:
         """Motor-action circuit: pressure of the critic (line 19) plus refresh (line 26), in one step of the optimiser."""
         imitated = self._imitated(batch)
-        pressure = self.actor_pressure if self._n_updates > self.critic_warmup else 0.0
-        changes = self._actor_changes(batch, imitated, self.refresh_weight, pressure or None)
+        pressure = self.actor_pressure if self.is_pressing else None
+        changes = self._actor_changes(batch, imitated, self.refresh_weight, pressure)
         if changes is not None:
             self.actor.circuit.apply_changes(changes)
-        region = self.policy.trust_region
         if self.trials is not None:
             self.diagnostics.follow(pressure=lambda: self.pressure)
+        region = self.policy.trust_region
         if self.trials is not None and region is not None:
             self.diagnostics.follow(trust_radius=lambda: float(region.radius), critic_trust=lambda: float(region.trust))
 
@@ -1041,6 +1041,11 @@ class ActPC(OffPolicyAlgorithm):
         state = self.actor.circuit.settle(*imitated)
         self.diagnostics.settled("actor", state)
         return self.actor.circuit.hebbian_update(state)
+
+    @property
+    def is_pressing(self) -> bool:
+        """Whether the critic's pressure reaches the actor by now."""
+        return bool(self.actor_pressure) and self._n_updates > self.critic_warmup
 
     @property
     def pressure(self) -> float:

@@ -10,6 +10,8 @@ from typing import Any
 
 import torch as th
 
+from sb3_actpc.actpc.transfer import map_nested
+
 # updates that run as ever before one of their kind is recorded: optimisers and libraries set up what they need
 N_WARM_UP = 2
 MOST_KINDS = 8  # of updates, each of which has a graph; then all are recorded anew
@@ -70,9 +72,10 @@ class CapturedUpdate:
         device = state[0].device
         groups = [group for optimizer in optimizers for group in optimizer.param_groups]
         rates = [th.zeros((), device=device) for _ in groups]
-        graph = new_graph()
-        with _with_rates(groups, rates), capture(graph, device):
-            self.update(_replaced(given, copies))
+        graph = th.cuda.CUDAGraph()
+        # while this lasts kernels are recorded and do not run
+        with _with_rates(groups, rates), th.cuda.graph(graph, stream=th.cuda.Stream(device)):
+            self.update(map_nested(lambda tensor: copies[id(tensor)], given))
         return _Recorded(graph, list(copies.values()), groups, rates, state)
 
 
@@ -132,16 +135,6 @@ def _numbers(optimizers: list[th.optim.Optimizer]) -> Iterator[Any]:
             yield from (value for name, value in group.items() if name not in ("params", "lr", "lr_scale", "capturable"))
 
 
-def new_graph() -> Any:
-    """A CUDA graph."""
-    return th.cuda.CUDAGraph()
-
-
-def capture(graph: Any, device: th.device) -> Any:
-    """While this context lasts, kernels of the device are recorded into the graph and do not run."""
-    return th.cuda.graph(graph, stream=th.cuda.Stream(device))
-
-
 def _parts(given: Any) -> Iterator[Any]:
     """Tensors and Nones, depth first."""
     for part in given:
@@ -163,12 +156,3 @@ def _same(tensors: list[th.Tensor]) -> list[int]:
     """Of every tensor, which one of them it is: circuits with one batch size are given one batch."""
     first: dict[int, int] = {}
     return [first.setdefault(id(tensor), index) for index, tensor in enumerate(tensors)]
-
-
-def _replaced(given: Any, copies: dict[int, th.Tensor]) -> Any:
-    if given is None:
-        return None
-    if isinstance(given, th.Tensor):
-        return copies[id(given)]
-    parts = [_replaced(part, copies) for part in given]
-    return type(given)(*parts) if hasattr(given, "_fields") else tuple(parts)

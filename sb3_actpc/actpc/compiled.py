@@ -111,10 +111,9 @@ class CompiledUpdate:
         # drawn in the order of the eager update
         imitated = None if actor is None else agent._imitated(actor)
         refresh, pressure = (self._weight(name, getattr(agent, name)) for name in ("refresh_weight", "actor_pressure"))
-        is_pressed = agent.actor_pressure and agent._n_updates > agent.critic_warmup
         asked = critic if agent.actor_pressure else None
         noise = None if asked is None else agent._target_noise(asked)
-        given = _Given((refresh, pressure if is_pressed else None), actor, asked, generator, imitated, noise)
+        given = _Given((refresh, pressure if agent.is_pressing else None), actor, asked, generator, imitated, noise)
         try:
             update = self._prepared(given)
         except Exception as error:

@@ -1,5 +1,6 @@
 """Arrays to the agent's device: to a GPU all of them at once."""
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -15,23 +16,24 @@ def to_device(arrays: Any, device: th.device) -> Any:
     :return: the same, of tensors
     """
     if device.type == "cpu":
-        return _replaced(arrays, th.as_tensor)
+        return map_nested(th.as_tensor, arrays)
     kinds: dict[np.dtype, list[np.ndarray]] = {}
-    _replaced(arrays, lambda array: kinds.setdefault(array.dtype, []).append(array))
+    map_nested(lambda array: kinds.setdefault(array.dtype, []).append(array), arrays)
     moved: dict[int, th.Tensor] = {}
     for kind in kinds.values():
         together = th.as_tensor(np.concatenate([array.ravel() for array in kind]), device=device)
         pieces = together.split([array.size for array in kind])
         moved |= {id(array): piece.view(array.shape) for array, piece in zip(kind, pieces, strict=True)}
-    return _replaced(arrays, lambda array: moved[id(array)])
+    return map_nested(lambda array: moved[id(array)], arrays)
 
 
-def _replaced(part: Any, function: Any) -> Any:
+def map_nested(function: Callable[[Any], Any], part: Any) -> Any:
+    """Apply ``function`` to every array or tensor in (named) tuples and dicts; None stays None."""
     if part is None:
         return None
     if isinstance(part, dict):
-        return {key: _replaced(value, function) for key, value in part.items()}
+        return {key: map_nested(function, value) for key, value in part.items()}
     if isinstance(part, tuple):
-        replaced = [_replaced(value, function) for value in part]
-        return type(part)(*replaced) if hasattr(part, "_fields") else tuple(replaced)
+        mapped = [map_nested(function, value) for value in part]
+        return type(part)(*mapped) if hasattr(part, "_fields") else tuple(mapped)
     return function(part)

@@ -12,6 +12,7 @@ from sb3_actpc.actpc import actpc as actpc_module
 from sb3_actpc.actpc import captured as captured_module
 from sb3_actpc.actpc.captured import MOST_KINDS, N_WARM_UP, CapturedUpdate
 from sb3_actpc.actpc.compiled import CompiledUpdate, compiled_update
+from sb3_actpc.actpc.transfer import map_nested
 from tests.actpc.agents import EQUATION_1, PARTS, make, with_all_parts
 
 DEVICE = "cuda" if th.cuda.is_available() else "cpu"
@@ -25,7 +26,7 @@ def recorded(monkeypatch):
     def record(self, given, optimizers, state):
         copies = {id(tensor): th.empty_like(tensor) for tensor in captured_module._tensors(given)}
         groups = [group for optimizer in optimizers for group in optimizer.param_groups]
-        rates, replaced = [th.zeros(()) for _ in groups], captured_module._replaced(given, copies)
+        rates, replaced = [th.zeros(()) for _ in groups], map_nested(lambda tensor: copies[id(tensor)], given)
 
         def replay():
             with captured_module._with_rates(groups, rates):
