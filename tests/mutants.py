@@ -571,7 +571,27 @@ MUTANTS = [
     ),
     Mutant("random actions prove something", AGENT, "if is_random or env in", "if env in", f"{HABIT} -k random"),
     Mutant("an episode's rest is a whole one", AGENT, " or env in self.trials.skipped", "", f"{HABIT} -k 'random or counts'"),
-    Mutant("the habit is not copied", AGENT, "_copy(self.policy.candidate, self.actor.habit)", "pass", f"{HABIT} -k predict"),
+    Mutant("the habit is not copied", AGENT, "_copy(circuit, self.actor.habit)", "pass", f"{HABIT} -k predict"),
+    Mutant("no habit is kept", AGENT, "_copy(self.actor.habit, self.policy.former_habit)", "pass", f"{HABIT} -k recalled"),
+    Mutant(
+        "who is recalled does not act",
+        AGENT,
+        "(self.policy.former_habit, is_of",
+        "(self.actor.habit, is_of",
+        f"{HABIT} -k recalled",
+    ),
+    Mutant(
+        "a recalled habit takes its clone for a learner",
+        AGENT,
+        'trials.is_by_clone if verdict == "recalled" else trials.is_clone',
+        "False",
+        f"{HABIT} -k 'recalled or begins'",
+    ),
+    Mutant("nobody is recalled", TRIALS, "if not self.former_returns or ", "if True or ", f"{HABIT} -k gives_way"),
+    Mutant(
+        "recalled at par", TRIALS, ">= fmean(self.former_returns)", "> fmean(self.former_returns)", f"{HABIT} -k gives_way"
+    ),
+    Mutant("recalled for ever", TRIALS, "self.former_returns, []", "self.former_returns, [1e9]", f"{HABIT} -k gives_way"),
     Mutant("the learning actor acts", POLICIES, "self.circuit if self.habit is None", "self.circuit if True", HABIT),
     Mutant("one proof is enough", TRIALS, "if n < N_PROOFS:", "if n < 1:", HABIT),
     Mutant("a tie is a proof", TRIALS, "gain >= max(smallest, (SURE", "gain >= max(0.0, (SURE", HABIT),
@@ -622,7 +642,7 @@ MUTANTS = [
         "self.n_rejected > 0",
         f"{HABIT} -k better",
     ),
-    Mutant("a clone's noise is the last one's", TRIALS, "[] if self.is_clone else", "", f"{HABIT} -k not_count"),
+    Mutant("a clone's noise is the last one's", TRIALS, "[] if self.is_by_clone else", "", f"{HABIT} -k not_count"),
     Mutant(
         "a learner that is ahead bars clones",
         TRIALS,
@@ -659,7 +679,7 @@ MUTANTS = [
     Mutant(
         "a late clone is on trial against itself",
         TRIALS,
-        "self.has_learned = self.has_learned and not self.is_clone",
+        "self.has_learned = self.has_learned and not self.is_by_clone",
         "pass",
         f"{HABIT} -k against_itself",
     ),
@@ -787,7 +807,7 @@ MUTANTS = [
     Mutant("clones for ever", TRIALS, "not self.n_clones or ", "", f"{HABIT} -k clone"),
     Mutant(
         "clones after every learner",
-        TRIALS,
+        'self.tests_habit = verdict != "accepted"',
         'verdict == "rejected" and not self.is_clone',
         "not self.is_clone",
         f"{HABIT} -k learner",
@@ -795,22 +815,22 @@ MUTANTS = [
     Mutant(
         "the habit is not tested again",
         TRIALS,
-        "self.tests_habit = not is_accepted",
+        'self.tests_habit = verdict != "accepted"',
         "self.tests_habit = False",
         f"{HABIT} -k tested",
     ),
     Mutant(
         "a clone's verdict moves the radius",
         AGENT,
-        "and trials.habit_return != 0.0 and not trials.is_clone",
+        "and trials.habit_return != 0.0 and not is_of_clone",
         "and trials.habit_return != 0.0",
         f"{HABIT} -k begins",
     ),
     Mutant(
         "an accepted clone does not learn",
         AGENT,
-        "self._start_from(self.policy.candidate)",
-        "_copy(self.policy.candidate, self.actor.habit)",
+        "self._start_from(circuit)",
+        "_copy(circuit, self.actor.habit)",
         f"{HABIT} -k begins",
     ),
     Mutant(
@@ -1413,11 +1433,11 @@ MUTANTS = [
     Mutant(
         "old candidates count",
         TRIALS,
-        'if one.role == "habit" and not is_accepted',
-        'if one.role == "candidate" or not is_accepted',
+        'if one.role == "habit" and not is_other',
+        'if one.role == "candidate" or not is_other',
         f"{HABIT} -k judged_meanwhile",
     ),
-    Mutant("old habits count", TRIALS, " and not is_accepted]", "]", f"{HABIT} -k old_habit"),
+    Mutant("old habits count", TRIALS, " and not is_other]", "]", f"{HABIT} -k old_habit"),
     Mutant(
         "short episodes prove at once",
         TRIALS,

@@ -841,20 +841,28 @@ class ActPC(OffPolicyAlgorithm):
         if region is not None and self._n_updates > self.critic_warmup:
             region.follow(trials.noisy_gain(env))
         verdict = trials.end(env, has_learned=self._n_updates > pressed_since + CANDIDATE_AGE)
+        is_of_clone = trials.is_by_clone if verdict == "recalled" else trials.is_clone
         # nothing is proven where nothing is paid, and a clone proves nothing about the pressure
-        if region is not None and verdict is not None and trials.habit_return != 0.0 and not trials.is_clone:
+        if region is not None and verdict is not None and trials.habit_return != 0.0 and not is_of_clone:
             region.resize(verdict)
         if verdict == "accepted":
-            self._accept_candidate()
+            _copy(self.actor.habit, self.policy.former_habit)
+            self._replace_habit(self.policy.candidate, is_of_clone)
+        elif verdict == "recalled":
+            self._replace_habit(self.policy.former_habit, is_of_clone)
         if trials.begin(env):
             self._make_candidate()
 
-    def _accept_candidate(self) -> None:
-        assert self.trials is not None and self.policy.candidate is not None
-        if not self.trials.is_clone:
-            _copy(self.policy.candidate, self.actor.habit)
+    def _replace_habit(self, circuit: NGCCircuit | None, is_beginning: bool) -> None:
+        """
+        :param circuit: the habit from now on
+        :param is_beginning: whether learning begins with it
+        """
+        assert self.trials is not None and circuit is not None
+        if not is_beginning:
+            _copy(circuit, self.actor.habit)
             return
-        self._start_from(self.policy.candidate)
+        self._start_from(circuit)
         self.trials.begun_at = self._n_updates
         if self.calibration is not None:
             self.calibration.begin_all()

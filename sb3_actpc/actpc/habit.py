@@ -3,7 +3,8 @@
 The circuit that learns is pressed by a critic that can be wrong, so it does not act for others at once. A *candidate*, the
 slow average of the learning actor, is frozen and plays the episodes without exploration noise. When it is paid more
 than the habit, by more than chance would have it, it becomes the habit. The warm-started clone is the first habit: what the
-agent does is imitation until something better is proven; other clones can be candidates too.
+agent does is imitation until something better is proven; other clones can be candidates too. A habit that is paid less in the
+end than the one before it gives way to that one again.
 """
 
 from dataclasses import asdict, dataclass, field
@@ -11,7 +12,7 @@ from statistics import fmean
 from typing import Any, Literal
 
 Role = Literal["actor", "candidate", "habit"]
-Verdict = Literal["accepted", "tied", "undecided", "rejected"]
+Verdict = Literal["accepted", "tied", "undecided", "rejected", "recalled"]
 
 N_PROOFS = 2  # episodes of a candidate at least, before it is judged by less than a great loss
 # environment steps, or episodes however short: of a candidate before it is judged, and of the habit after one not accepted
@@ -87,6 +88,8 @@ class Trials:
     quiet: list[QuietEpisode] = field(default_factory=list)  # that run, or wait for one that does; as they began
     quiet_due: list[int] = field(default_factory=list)  # steps without noise that are still due, for each environment
     habit_returns: list[float] = field(default_factory=list)
+    former_returns: list[float] = field(default_factory=list)  # of the habit before, while it may be recalled
+    is_by_clone: bool = False  # a clone has taken its place
     noisy_returns: list[float] = field(default_factory=list)  # the learning actor's last ones
     candidate_returns: list[float] = field(default_factory=list)
     candidate_steps: int = 0
@@ -180,8 +183,8 @@ class Trials:
         :param has_learned: whether the learning actor differs from the habit by more than imitation; before, clones alone are
             candidates
         :return: "accepted": the candidate becomes the habit; "tied": it is dropped, being neither proven better nor worse;
-            "undecided": it is dropped, its episodes being too few; "rejected": it is dropped, being worse; None: nothing
-            follows yet
+            "undecided": it is dropped, its episodes being too few; "rejected": it is dropped, being worse; "recalled": the
+            habit before becomes the habit again, and a candidate, if there is one, is dropped; None: nothing follows yet
         """
         self.has_learned = has_learned
         role, episode_return, length = self.roles[env], self.returns[env], self.lengths[env]
@@ -211,7 +214,10 @@ class Trials:
         self.habit_returns = [*self.habit_returns, episode_return][-KEPT_RETURNS:]
         self.habit_proofs, self.habit_steps = self.habit_proofs + 1, self.habit_steps + length
         self.tests_habit = len(self.habit_returns) < N_PROOFS or not _is_tried(self.habit_proofs, self.habit_steps)
-        return None
+        if not self.former_returns or self.habit_return >= fmean(self.former_returns):
+            return None
+        self._conclude("recalled")
+        return "recalled"
 
     def begin(self, env: int) -> bool:
         """
@@ -276,17 +282,21 @@ class Trials:
         return max(1.0 / (len(self.candidate_returns) + 2) - 1.0 / (n_habit + 2), 0.0)
 
     def _conclude(self, verdict: Verdict) -> None:
-        """The candidate is judged: what is counted begins anew."""
-        is_accepted = verdict == "accepted"
-        if is_accepted:
-            self.habit_returns = self.candidate_returns[-KEPT_RETURNS:]
-            self.noisy_returns = [] if self.is_clone else self.noisy_returns
+        """The candidate or the habit is judged: what is counted begins anew."""
+        is_other = verdict in ("accepted", "recalled")  # the habit is
+        if verdict == "accepted":
+            self.former_returns, self.habit_returns = self.habit_returns, self.candidate_returns[-KEPT_RETURNS:]
+            self.is_by_clone = self.is_clone
+        elif verdict == "recalled":
+            self.habit_returns, self.former_returns = self.former_returns, []
+        if is_other:
+            self.noisy_returns = [] if self.is_by_clone else self.noisy_returns
             # what the old habit has begun elsewhere is no return of the new one
             self.roles = ["actor" if role == "habit" else role for role in self.roles]
-            self.has_learned = self.has_learned and not self.is_clone  # the next learner begins as this clone
+            self.has_learned = self.has_learned and not self.is_by_clone  # the next learner begins as it
         self.n_rejected = self.n_rejected + 1 if verdict == "rejected" and not self.is_clone else 0
-        self.tests_habit = not is_accepted
-        self.quiet = [one for one in self.quiet if one.role == "habit" and not is_accepted]
+        self.tests_habit = verdict != "accepted"
+        self.quiet = [one for one in self.quiet if one.role == "habit" and not is_other]
         self.candidate_returns, self.candidate_steps, self.on_trial = [], 0, False
         self.habit_proofs, self.habit_steps = 0, 0
         self.generation += 1

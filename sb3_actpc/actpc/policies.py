@@ -381,9 +381,10 @@ class ActPCPolicy(BasePolicy):
         # what the demonstrations have taught, which goes where the synapses go; floats, as SB3 expects of parameters
         self.register_buffer("has_imitated", th.tensor(0.0))
         self.register_buffer("n_prior_updates", th.tensor(0.0))
-        # the slow average of the learning actor, and a frozen copy of it that has to prove itself
-        self.actor_average = copy.deepcopy(self.actor.circuit) if self.habit else None
-        self.candidate = copy.deepcopy(self.actor.circuit) if self.habit else None
+        # the slow average of the learning actor, a frozen copy of it that has to prove itself, and the habit before this one
+        self.actor_average, self.candidate, self.former_habit = (
+            copy.deepcopy(self.actor.circuit) if self.habit else None for _ in range(3)
+        )
         self.trust_region = TrustRegion(self.trust_radius, n_actions) if self.habit and self.trust_radius else None
         for name, circuit in self.named_circuits():
             circuit.optimizer = self._optimizer(name.partition(".")[0], circuit)

@@ -19,7 +19,7 @@ MULTIPLIERS, FIRST_MULTIPLIER = (0.02, 200.0), 0.05
 LARGEST_UNHELD = 3.0
 RADII = 0.1, 1000.0  # below a third of a standard deviation nothing is learned
 # what a verdict about a candidate (:mod:`sb3_actpc.actpc.habit`) does to the radius
-RADIUS_FACTORS = {"accepted": 1.25, "tied": 2.0, "undecided": 1.0, "rejected": 0.7}
+RADIUS_FACTORS = {"accepted": 1.25, "tied": 2.0, "undecided": 1.0, "rejected": 0.7, "recalled": 0.7}
 # of the radius's logarithm, where the habit holds the learning actor: for an episode of that one which is paid twice what the
 # habit is, or nothing. Some 250 episodes of a gain of a fifth are a radius ten times as wide
 FOLLOWING_RATE = 0.05
@@ -122,7 +122,7 @@ class TrustRegion(nn.Module):
         """
         Where the habit does not hold the learning actor.
 
-        :param verdict: about a candidate, a key of ``RADIUS_FACTORS``
+        :param verdict: about a candidate or a habit that was one, a key of ``RADIUS_FACTORS``
         """
         if not self.holds:
             self.radius.mul_(self._trusted(RADIUS_FACTORS[verdict])).clamp_(*RADII)

@@ -224,7 +224,7 @@ def test_with_another_clone_running_episodes_do_not_count():
     model.learn(3)
     model.calibration.running[0] = [Step(1.0, 1.0, 1.0)] * 2
     model.trials.is_clone = True
-    model._accept_candidate()
+    model._replace_habit(model.policy.candidate, model.trials.is_clone)
     assert model.calibration.running == [[]]
 
 

@@ -465,6 +465,66 @@ def test_what_the_old_habit_has_begun_elsewhere_is_no_return_of_the_new_one():
     assert trials.habit_returns == [200.0, 200.0]
 
 
+def accepted(is_clone=False, **keywords):
+    """Trials whose habit, a learner or a clone, has 120 of two episodes, after one that had 100, 110 and 90."""
+    trials = Trials(1, habit_returns=[100.0, 110.0, 90.0], tests_habit=False, on_trial=True, is_clone=is_clone, **keywords)
+    cast(trials, "candidate")
+    assert [play(trials, one)[1] for one in (118.0, 122.0)] == [None, "accepted"]
+    return trials
+
+
+@pytest.mark.parametrize(
+    ("paid", "verdicts"),
+    [
+        ([60.0], [None]),  # 100 in the mean, as the one before
+        ([59.0], ["recalled"]),
+        ([110.0, 90.0, 59.0], [None, None, "recalled"]),  # 99.8 of five
+        ([110.0, 90.0, 61.0], [None] * 3),
+    ],
+)
+def test_a_habit_that_is_paid_less_in_the_end_than_the_one_before_it_gives_way_to_that_again(paid, verdicts):
+    trials = accepted()
+    for one, verdict in zip(paid, verdicts, strict=True):
+        generation = trials.generation
+        cast(trials, "habit")
+        assert play(trials, one)[1] == verdict and trials.generation == generation + (verdict is not None)
+    if verdict is None:
+        assert trials.habit_returns == [118.0, 122.0, *paid] and trials.former_returns == [100.0, 110.0, 90.0]
+        return
+    assert trials.habit_returns == [100.0, 110.0, 90.0] and not trials.former_returns and trials.tests_habit
+    cast(trials, "habit")
+    assert play(trials, 0.0)[1] is None and trials.habit_return == 75.0  # there is nobody to go back to
+
+
+def test_a_habit_is_followed_by_the_last_one_alone():
+    trials = accepted()
+    cast(trials, "candidate")
+    trials.on_trial = True
+    assert [play(trials, one)[1] for one in (150.0, 150.0)] == [None, "accepted"]
+    assert trials.former_returns == [118.0, 122.0]
+
+
+@pytest.mark.parametrize("is_clone", [False, True])
+def test_who_is_on_trial_when_a_habit_is_recalled_is_dropped(is_clone):
+    """It was weighed against another; and after a clone nothing has been learned from the recalled one."""
+    trials = accepted(is_clone, has_learned=True, noisy_returns=[3.0, 4.0])
+    trials.on_trial, trials.candidate_returns, trials.candidate_steps, trials.n_rejected = True, [300.0], PROOF_STEPS, 1
+    trials.has_learned, trials.noisy_returns = True, [3.0, 4.0]
+    cast(trials, "habit")
+    assert play(trials, 0.0)[1] == "recalled"
+    assert not trials.on_trial and trials.candidate_returns == [] and trials.candidate_steps == 0 and not trials.n_rejected
+    assert trials.has_learned == (not is_clone) and trials.noisy_returns == ([] if is_clone else [3.0, 4.0])
+
+
+def test_what_a_habit_has_begun_elsewhere_is_no_return_of_the_recalled_one():
+    trials = Trials(2, habit_returns=[120.0, 120.0], former_returns=[100.0, 100.0])
+    for env in (0, 1):
+        cast(trials, "habit", env)
+    assert play(trials, 0.0, env=0) == ("habit", "recalled")
+    play(trials, 0.0, env=1)
+    assert trials.habit_returns == [100.0, 100.0]
+
+
 def test_of_several_environments_episodes_count_in_the_order_in_which_they_began():
     """Else the shortest, a bad gait's falls, would be all that a candidate is judged by."""
     trials = Trials(2, habit_returns=[100.0, 100.0], tests_habit=False, has_learned=True)
@@ -564,7 +624,7 @@ def test_an_accepted_clone_begins_with_the_first_radius_and_is_held_whatever_is_
         region.radius.fill_(3.0)
         model.actor_pressure = 0.0
         model.trials.is_clone = True
-        model._accept_candidate()
+        model._replace_habit(model.policy.candidate, model.trials.is_clone)
         assert float(region.radius) == (0.25 if held else 3.0)
         assert bool(region.holds) == held
 
@@ -897,6 +957,32 @@ def test_a_clone_that_is_accepted_is_where_learning_begins(paid, verdict, monkey
         assert model.trials.begun_at == model._n_updates
     else:
         assert float(region.multiplier) == pytest.approx(0.7) and model.trials.begun_at == 0
+
+
+@pytest.mark.parametrize("is_clone", [False, True])
+def test_a_recalled_habit_acts_again_and_after_a_clone_learning_begins_with_it_again(is_clone):
+    """What was learned since goes on where a learner had been accepted; its pressure has lost."""
+    model = imitating(**ONE_CLONE)
+    model.learn(30)
+    region, first = model.policy.trust_region, weights_of(model.actor.habit)
+    model.trials = Trials(1, habit_returns=[1.0, 1.0], on_trial=True, is_clone=is_clone, tests_habit=False)
+    disturb(model.policy.candidate)
+    second, radius = weights_of(model.policy.candidate), float(region.radius)
+    cast(model.trials, "candidate")
+    model._n_updates = model.critic_warmup + 1
+    prove(model, 2.0, 2.0)
+    assert not differ(second, weights_of(model.actor.habit)) and not differ(first, weights_of(model.policy.former_habit))
+    radius *= 1.0 if is_clone else RADIUS_FACTORS["accepted"]
+    disturb(model.actor.circuit)
+    learner = weights_of(model.actor.circuit)
+    model.trials.tests_habit = True
+    cast(model.trials, "habit")
+    model.trials.begun_at = -1
+    prove(model, -2.0)  # 2/3 in the mean
+    assert not differ(first, weights_of(model.actor.habit)) and model.trials.habit_returns == [1.0, 1.0]
+    assert not differ(first if is_clone else learner, weights_of(model.actor.circuit))
+    assert float(region.radius) == pytest.approx(radius * (1.0 if is_clone else RADIUS_FACTORS["recalled"]))
+    assert model.trials.begun_at == (model._n_updates if is_clone else -1)
 
 
 @pytest.mark.parametrize(
