@@ -807,7 +807,7 @@ MUTANTS = [
     Mutant("clones for ever", TRIALS, "not self.n_clones or ", "", f"{HABIT} -k clone"),
     Mutant(
         "clones after every learner",
-        'self.tests_habit = verdict != "accepted"',
+        TRIALS,
         'verdict == "rejected" and not self.is_clone',
         "not self.is_clone",
         f"{HABIT} -k learner",
