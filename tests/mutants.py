@@ -119,10 +119,24 @@ MUTANTS = [
         "tests/actpc/test_calibration.py -k time_limit",
     ),
     Mutant(
-        "a critic is distrusted unless it has proven itself",
+        "a critic that points downhill a little is trusted",
         "actpc/calibration.py",
         "if self.slope >= 0.0 or",
-        "if self.slope >= 1.0 or",
+        "if self.slope >= -1.0 or",
+        "tests/actpc/test_calibration.py -k p_value",
+    ),
+    Mutant(
+        "what any noise costs is held against the critic",
+        "actpc/actpc.py",
+        "(noisy_value[env] - opposite_value[env]) / 2.0",
+        "noisy_value[env] - meant[env]",
+        "tests/actpc/test_calibration.py -k held_against",
+    ),
+    Mutant(
+        "any negative slope is held against the critic",
+        "actpc/calibration.py",
+        "/ 2**0.5) / DOUBT)",
+        "/ 2**0.5))",
         "tests/actpc/test_calibration.py -k p_value",
     ),
     Mutant(
@@ -149,8 +163,8 @@ MUTANTS = [
     Mutant(
         "the critic is asked of its actor's own actions",
         "actpc/actpc.py",
-        "np.concatenate([actions, self._meant])",
-        "np.concatenate([self._meant, actions])",
+        "np.concatenate([self._meant, actions, opposite])",
+        "np.concatenate([actions, self._meant, opposite])",
         "tests/actpc/test_calibration.py -k every_environment",
     ),
     Mutant(
@@ -170,8 +184,8 @@ MUTANTS = [
     Mutant(
         "an environment's critic is asked of another's state",
         "actpc/actpc.py",
-        ".repeat(2, 1)  # type: ignore[arg-type]",
-        ".repeat_interleave(2, 0)  # type: ignore[arg-type]",
+        ".repeat(3, 1)  # type: ignore[arg-type]",
+        ".repeat_interleave(3, 0)  # type: ignore[arg-type]",
         "tests/actpc/test_calibration.py -k every_environment",
     ),
     Mutant(

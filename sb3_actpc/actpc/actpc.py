@@ -800,12 +800,15 @@ class ActPC(OffPolicyAlgorithm):
         if not noisy:
             return
         with th.no_grad():
-            features = self.actor.features(self.actor.obs_to_tensor(self._last_obs)[0]).repeat(2, 1)  # type: ignore[arg-type]
-            both = self.inputs.tensor(np.concatenate([actions, self._meant]).reshape(len(features), -1))
-            done, meant = self.critic.first().project(th.cat([features, both], dim=1)).mean(1).view(2, -1).tolist()
+            features = self.actor.features(self.actor.obs_to_tensor(self._last_obs)[0]).repeat(3, 1)  # type: ignore[arg-type]
+            opposite = np.clip(2.0 * self._meant - actions, -1.0, 1.0)
+            tried = self.inputs.tensor(np.concatenate([self._meant, actions, opposite]).reshape(len(features), -1))
+            values = self.critic.first().project(th.cat([features, tried], dim=1)).mean(1)
+            meant, noisy_value, opposite_value = values.view(3, -1).tolist()
         for env in noisy:
             paid = self.alpha_ext * float(rewards[env])
-            self.calibration.step(env, done[env] - meant[env], meant[env], paid, self.gamma)
+            said = (noisy_value[env] - opposite_value[env]) / 2.0
+            self.calibration.step(env, said, meant[env], paid, self.gamma)
             if dones[env]:
                 self.calibration.end(env, self.gamma, terminated=not infos[env].get("TimeLimit.truncated", False))
                 self._follow_calibration()

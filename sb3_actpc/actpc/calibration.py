@@ -9,6 +9,7 @@ import numpy as np
 WINDOW = 2000.0  # noisy steps, over which the weight of an episode falls to a third
 FEWEST = 3  # steps of an episode, below which it says nothing
 ENOUGH = 200.0  # of all, below which nothing is disproven
+DOUBT = 0.05  # a slope that is as negative by chance less often than this is held against the critic
 
 
 @dataclass
@@ -16,7 +17,8 @@ class Step:
     """
     A step of the learning actor with exploration noise, before it is learned.
 
-    :param said: what the critic says that the noise gains, Q(s, a) - Q(s, μ(s)); it has not learned the step by then
+    :param said: what the critic says that the noise ε gains by its direction, (Q(s, μ(s) + ε) - Q(s, μ(s) - ε)) / 2; it has
+        not learned the step by then
     :param value: what it says that the state is worth, Q(s, μ(s))
     :param reward: what the step was paid
     """
@@ -33,8 +35,10 @@ class Calibration:
 
     An action's gain is r + γ Q(s', μ(s')) - Q(s, μ(s)): what it was paid and what the next state is worth, beyond what the
     state was worth. What is said is said before the step is learned, so that the critic cannot know; and both are taken about
-    their episode's mean, so that they say nothing of how well it ranks states. A critic that is right has a slope of 1
-    (calibration by linear regression: Cox, 1958), one that guesses a slope of 0, and one whose gradient points downhill less.
+    their episode's mean, so that they say nothing of how well it ranks states. Nor does it say anything of the state whether
+    noise or the opposite noise is tried: what any noise costs there, by the critic, is left out, as that goes with the errors
+    of its values. A critic that is right has a slope of 1 (calibration by linear regression: Cox, 1958), one that guesses a
+    slope of 0, and one whose gradient points downhill less.
 
     :param n_envs: environments, each with an episode of its own
     """
@@ -108,11 +112,11 @@ class Calibration:
 
     @property
     def trust(self) -> float:
-        """How likely so negative a slope is of a critic that knows nothing (p-value, two-sided); 1 for a positive one. What
-        its word is worth, if not less than nothing, the radius leaves to outcomes."""
+        """How likely so negative a slope is of a critic that knows nothing (p-value, two-sided), over ``DOUBT``; 1 at most,
+        and for a positive one. What its word is worth, if not less than nothing, the radius leaves to outcomes."""
         if self.slope >= 0.0 or self.n < ENOUGH:
             return 1.0
-        return erfc(-self.slope / self.error / 2**0.5) if self.error else 0.0
+        return min(1.0, erfc(-self.slope / self.error / 2**0.5) / DOUBT) if self.error else 0.0
 
     def checkpoint_state(self) -> dict[str, Any]:
         """Everything, as plain values."""

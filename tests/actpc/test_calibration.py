@@ -9,7 +9,7 @@ import torch as th
 from scipy.stats import linregress, norm
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from sb3_actpc.actpc.calibration import ENOUGH, FEWEST, WINDOW, Calibration, Step
+from sb3_actpc.actpc.calibration import DOUBT, ENOUGH, FEWEST, WINDOW, Calibration, Step
 from sb3_actpc.actpc.trust_region import FALL, FIRST_MULTIPLIER, RISE, TrustRegion
 from tests.actpc.agents import imitating
 from tests.actpc.envs import CountingEnv
@@ -40,11 +40,13 @@ def test_it_is_the_regression_of_what_is_gained_on_what_was_said():
     assert found.slope == pytest.approx(line.slope) and found.error == pytest.approx(line.stderr)
 
 
+@pytest.mark.parametrize("true_slope", [-0.1, -0.15])
 @pytest.mark.parametrize("seed", range(4))
-def test_trust_is_the_p_value_of_a_negative_slope(seed):
-    said, gained = drawn(slope=-0.05, seed=seed)
+def test_trust_is_the_p_value_of_a_negative_slope_where_that_is_small(true_slope, seed):
+    said, gained = drawn(slope=true_slope, seed=seed)
     found, line = played(said, gained), linregress(said, gained)
-    assert found.trust == pytest.approx(2 * norm.cdf(line.slope / line.stderr) if line.slope < 0.0 else 1.0)
+    p_value = 2 * norm.cdf(-abs(line.slope) / line.stderr)
+    assert found.trust == pytest.approx(min(p_value / DOUBT, 1.0) if line.slope < 0.0 else 1.0)
     assert 0.0 < found.trust
 
 
@@ -154,10 +156,13 @@ def test_the_agent_calibrates_its_critic_on_the_noisy_steps_of_every_environment
         features = [model.actor.features(th.as_tensor(seen)) for seen, *_ in played_]
         meant = [model.actor.circuit.project(one) for one in features]
         worth = [model.critic.first().project(th.cat([f, m], 1)).mean(1) for f, m in zip(features, meant, strict=True)]
-        done = [
-            model.critic.first().project(th.cat([f, th.as_tensor(step[2])], 1)).mean(1)
-            for f, step in zip(features, played_, strict=True)
-        ]
+        done, opposite = (
+            [
+                model.critic.first().project(th.cat([f, (m + sign * (th.as_tensor(step[2]) - m)).clamp(-1.0, 1.0)], 1)).mean(1)
+                for f, m, step in zip(features, meant, played_, strict=True)
+            ]
+            for sign in (1.0, -1.0)
+        )
     kinds = set()
     ended = sorted((t, env) for t, step in enumerate(played_) for env in range(2) if step[3][2][env])
     begun = [0, 0]
@@ -170,12 +175,31 @@ def test_the_agent_calibrates_its_critic_on_the_noisy_steps_of_every_environment
         values = [worth[time][env].item() for time in times] + [0.0] * terminated
         rewards = [0.5 * float(played_[time][3][1][env]) for time in times]
         gained = [r + GAMMA * after - before for r, after, before in zip(rewards, values[1:], values, strict=False)]
-        said = [(done[time][env] - worth[time][env]).item() for time in times][: len(gained)]
+        said = [(done[time][env] - opposite[time][env]).item() / 2.0 for time in times][: len(gained)]
         played(said, gained, expected)
     assert kinds == {(0, True), (0, False), (1, True), (1, False)}
     found = model.calibration
     for name in ("n", "said_squared", "gained_squared", "products"):
         assert getattr(found, name) == pytest.approx(getattr(expected, name), rel=1e-3), name
+
+
+@pytest.mark.parametrize(("curvature", "slope"), [(-100.0, 0.0), (100.0, 0.0), (-100.0, 3.0)])
+def test_what_any_noise_costs_is_not_held_against_a_critic(curvature, slope, monkeypatch):
+    """It may have its top where the actor acts, or not: its direction alone is tested."""
+    model = imitating(exploration_noise=0.1)
+    model.learn(2)
+
+    def project(seen):
+        features, actions = seen.split([3, 2], 1)
+        noise = actions - model.actor.circuit.project(features)
+        return curvature * noise**2 + slope * noise
+
+    monkeypatch.setattr(model, "train", lambda *_, **__: None)
+    monkeypatch.setattr(model.critic.first(), "project", project)
+    said, step = [], Calibration.step
+    monkeypatch.setattr(Calibration, "step", lambda self, env, *others: (said.append(others[0]), step(self, env, *others)))
+    model.learn(60, reset_num_timesteps=False)
+    assert len(said) > 10 and (np.abs(said).max() < 1e-4) == (slope == 0.0)
 
 
 @pytest.mark.parametrize(
