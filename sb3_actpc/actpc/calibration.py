@@ -35,10 +35,10 @@ class Calibration:
 
     An action's gain is r + γ Q(s', μ(s')) - Q(s, μ(s)): what it was paid and what the next state is worth, beyond what the
     state was worth. What is said is said before the step is learned, so that the critic cannot know; and both are taken about
-    their episode's mean, so that they say nothing of how well it ranks states. Nor does it say anything of the state whether
-    noise or the opposite noise is tried: what any noise costs there, by the critic, is left out, as that goes with the errors
-    of its values. A critic that is right has a slope of 1 (calibration by linear regression: Cox, 1958), one that guesses a
-    slope of 0, and one whose gradient points downhill less.
+    their episode's mean, so that they say nothing of how well it ranks states. Noise is compared with the opposite noise: what
+    the critic takes off for any noise says nothing of its direction, and goes with the errors of its values. A critic that is
+    right has a slope of 1 (calibration by linear regression: Cox, 1958), one that guesses a slope of 0, and one whose
+    gradient points downhill less.
 
     :param n_envs: environments, each with an episode of its own
     """

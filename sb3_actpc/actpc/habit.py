@@ -293,7 +293,7 @@ class Trials:
             self.noisy_returns = [] if self.is_by_clone else self.noisy_returns
             # what the old habit has begun elsewhere is no return of the new one
             self.roles = ["actor" if role == "habit" else role for role in self.roles]
-            self.has_learned = self.has_learned and not self.is_by_clone  # the next learner begins as it
+            self.has_learned = self.has_learned and not self.is_by_clone  # the next learner begins with it
         self.n_rejected = self.n_rejected + 1 if verdict == "rejected" and not self.is_clone else 0
         self.tests_habit = verdict != "accepted"
         self.quiet = [one for one in self.quiet if one.role == "habit" and not is_other]
