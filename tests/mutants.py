@@ -808,7 +808,7 @@ MUTANTS = [
         "signals",
         f"{LEARNS} -k loaded_agents",
     ),
-    Mutant("early clones for ever", TRIALS, "else self.generation < EARLY_CLONES", "else True", f"{HABIT} -k half"),
+    Mutant("early clones for ever", TRIALS, "else self.n_judged < EARLY_CLONES", "else True", f"{HABIT} -k half"),
     Mutant("noise between a candidate's first episodes", TRIALS, "is_quiet = begins or ", "is_quiet = ", f"{HABIT} -k turns"),
     Mutant("candidates play alone", TRIALS, " and len(self.candidate_returns) < N_PROOFS", "", f"{HABIT} -k turns"),
     Mutant(

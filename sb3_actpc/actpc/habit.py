@@ -83,6 +83,7 @@ class Trials:
     roles: list[Role] = field(default_factory=list)
     generations: list[int] = field(default_factory=list)  # which candidate an environment plays
     generation: int = 0
+    n_judged: int = 0  # candidates; a recall is about the habit
     returns: list[float] = field(default_factory=list)  # so far, of the running episodes
     lengths: list[int] = field(default_factory=list)
     quiet: list[QuietEpisode] = field(default_factory=list)  # that run, or wait for one that does; as they began
@@ -154,7 +155,7 @@ class Trials:
 
     def needs_clone(self) -> bool:
         """Whether the next candidate is a clone."""
-        is_due = self.n_rejected > self.is_ahead() if self.has_learned else self.generation < EARLY_CLONES
+        is_due = self.n_rejected > self.is_ahead() if self.has_learned else self.n_judged < EARLY_CLONES
         if not self.n_clones or not is_due:
             return False
         shortfall = SHORTFALL if self.has_learned else GREAT_SHORTFALL
@@ -300,6 +301,7 @@ class Trials:
         self.candidate_returns, self.candidate_steps, self.on_trial = [], 0, False
         self.habit_proofs, self.habit_steps = 0, 0
         self.generation += 1
+        self.n_judged += verdict != "recalled"
 
     def _standard_error(self) -> float:
         """Of the difference of the two means, from the variance within both."""

@@ -516,6 +516,19 @@ def test_who_is_on_trial_when_a_habit_is_recalled_is_dropped(is_clone):
     assert trials.has_learned == (not is_clone) and trials.noisy_returns == ([] if is_clone else [3.0, 4.0])
 
 
+def test_a_recall_is_no_early_clone():
+    """The second of the early ones is still due."""
+    trials = Trials(1, n_clones=5, imitated_return=1000.0, habit_returns=[300.0, 300.0], tests_habit=False)
+    trials.on_trial = trials.is_clone = True
+    cast(trials, "candidate")
+    assert [play(trials, 550.0, has_learned=False)[1] for _ in range(2)] == [None, "accepted"]
+    cast(trials, "habit")
+    assert [play(trials, 0.0, has_learned=False)[1] for _ in range(1)] == [None]
+    cast(trials, "habit")
+    assert play(trials, -300.0, has_learned=False)[1] == "recalled"
+    assert trials.needs_clone()
+
+
 def test_what_a_habit_has_begun_elsewhere_is_no_return_of_the_recalled_one():
     trials = Trials(2, habit_returns=[120.0, 120.0], former_returns=[100.0, 100.0])
     for env in (0, 1):
