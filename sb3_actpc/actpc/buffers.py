@@ -336,8 +336,20 @@ class CombinedDictReplayBuffer(SignalReplay, DictReplayBuffer):  # type: ignore[
 class CombinedHerReplayBuffer(SignalReplay, HerReplayBuffer):  # type: ignore[misc]
     """Hindsight experience replay with ActPC's signals: relabelling touches the task's reward and the goals alone.
 
-    The newest transitions are real ones; of the rest SB3's ``her_ratio`` is relabelled.
+    The newest transitions are real ones; of the rest SB3's ``her_ratio`` is relabelled. Goals of their own episode alone
+    would teach the critic that whoever moves slowly is at its goal: what is reached later is then near. So some goals were
+    reached elsewhere, by which what was done leads nowhere (as in HIQL: Park et al., arXiv 2307.11949, and OGBench).
+
+    :param random_goals: share of the relabelled transitions whose goal was reached at any stored step; 0 for SB3's class. By
+        default, and with SB3's ``n_sampled_goal`` of 4, a fifth of what is drawn keeps its goal, half has one of its
+        episode, and three tenths have one of any
+    :raises ValueError: for a share that is not between 0 and 1
     """
+
+    @checked
+    def __init__(self, *args: Any, random_goals: Share = 0.375, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.random_goals = random_goals
 
     @property
     def has_episodes(self) -> bool:
@@ -353,6 +365,12 @@ class CombinedHerReplayBuffer(SignalReplay, HerReplayBuffer):  # type: ignore[mi
             )
         rows, envs = np.unravel_index(np.random.choice(valid, size=n), self.ep_length.shape)
         return rows, envs
+
+    def _sample_goals(self, batch_indices: np.ndarray, env_indices: np.ndarray) -> np.ndarray:
+        goals = super()._sample_goals(batch_indices, env_indices)
+        is_random = np.random.random(len(goals)) < self.random_goals
+        goals[is_random] = self.next_observations["achieved_goal"][self._draw(int(is_random.sum()))]
+        return goals
 
     def cut_running_episodes(self) -> None:
         self._lengths[:] = 0

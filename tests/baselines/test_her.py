@@ -117,7 +117,7 @@ def goal_buffer(size: int = 40, **options: float) -> PrioritizedHerReplayBuffer:
     )
 
 
-def add_episode(buffer: PrioritizedHerReplayBuffer, number: int, length: int) -> None:
+def add_episode(buffer: HerReplayBuffer, number: int, length: int) -> None:
     """Its transitions achieve (number, step) and wish for (0, 0)."""
     for step in range(length):
         goal = np.array([[number, step]], dtype=float)
@@ -260,6 +260,33 @@ def test_actpc_and_her_run_on_fetch(tmp_path) -> None:
         options = {"settings": settings, "progress": False, "eval_episodes": 1, "output": str(tmp_path / algo)}
         result = train_run(Run(env="FetchReach-v4", algo=algo, n_timesteps=55, eval_freq=55, checkpoint_freq=0, **options))
         assert result["success_rate"] in (0.0, 1.0) and result["timesteps"] == 55
+
+
+@pytest.mark.parametrize("share", [None, 0.0, 1.0])
+def test_some_goals_of_actpcs_hindsight_were_reached_in_any_episode(share: float | None) -> None:
+    env = make_vec_env("GoalReacher-v5")
+    given = {} if share is None else {"random_goals": share}
+    buffer = CombinedHerReplayBuffer(40, env.observation_space, env.action_space, env, combined=False, **given)
+    for number in (1, 2, 3, 4):
+        add_episode(buffer, number, 10)
+    batch = buffer.sample(10_000)
+    own, wished = batch.next_observations["achieved_goal"].numpy(), batch.observations["desired_goal"].numpy()
+    assert np.array_equal(wished, batch.next_observations["desired_goal"].numpy())
+    relabelled = wished[:, 0] > 0.0  # a fifth of n_sampled_goal=4 + 1 keeps (0, 0)
+    assert relabelled.mean() == pytest.approx(0.8)
+    elsewhere = relabelled & (wished[:, 0] != own[:, 0])
+    expected = 0.375 if share is None else share
+    assert elsewhere.sum() / relabelled.sum() == pytest.approx(expected * 3 / 4, abs=0.02)  # of four episodes one is its own
+    assert ((own[:, 1] <= wished[:, 1]) | elsewhere | ~relabelled).mean() == pytest.approx(1 - 0.8 * expected / 4 * 0.45, abs=0.01)
+    assert np.array_equal(batch.rewards.numpy()[relabelled, 0] > 0, (own == wished).all(1)[relabelled])
+    if share == 1.0:  # every step of every episode may be a goal
+        assert len(np.unique(wished[relabelled], axis=0)) == 40
+
+
+def test_a_share_of_random_goals_beyond_one_is_refused() -> None:
+    with pytest.raises(ValueError, match="random_goals=1.5"):
+        ActPC("MultiInputPolicy", "GoalReacher-v5", replay_buffer_class="HerReplayBuffer",
+              replay_buffer_kwargs={"random_goals": 1.5})
 
 
 @pytest.mark.slow
