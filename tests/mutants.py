@@ -1634,6 +1634,20 @@ MUTANTS = [
         f"{STORES} {LEARNS} -k 'past or memory'",
     ),
     Mutant(
+        "hindsight has goals of the same episode alone",
+        BUFFERS,
+        "np.random.random(len(goals)) < self.random_goals",
+        "np.random.random(len(goals)) > 2.0 + self.random_goals",
+        "tests/baselines/test_her.py -k any_episode",
+    ),
+    Mutant(
+        "a random goal is where an episode stood, not what it reached",
+        BUFFERS,
+        'self.next_observations["achieved_goal"][self._draw(int',
+        'self.observations["achieved_goal"][self._draw(int',
+        "tests/baselines/test_her.py -k any_episode",
+    ),
+    Mutant(
         "an equally good episode does not enter",
         SELF_IMITATION,
         "or episode_return >= self.best_return",
