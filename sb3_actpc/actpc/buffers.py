@@ -354,16 +354,17 @@ class CombinedHerReplayBuffer(SignalReplay, HerReplayBuffer):  # type: ignore[mi
     @property
     def has_episodes(self) -> bool:
         """Whether an episode has ended, so that there is hindsight."""
-        return bool(self.ep_length.any())
+        return bool(self.ep_length[: self.size()].any())
 
     def _draw(self, n: int) -> tuple[np.ndarray, np.ndarray]:
-        valid = np.flatnonzero(self.ep_length > 0)
+        lengths = self.ep_length[: self.size()]  # a ring of a million rows takes a millisecond to look through
+        valid = np.flatnonzero(lengths > 0)
         if not len(valid):
             raise RuntimeError(
                 "Unable to sample before the end of the first episode. We recommend choosing a value "
                 "for learning_starts that is greater than the maximum number of timesteps in the environment."
             )
-        rows, envs = np.unravel_index(np.random.choice(valid, size=n), self.ep_length.shape)
+        rows, envs = np.unravel_index(np.random.choice(valid, size=n), lengths.shape)
         return rows, envs
 
     def _sample_goals(self, batch_indices: np.ndarray, env_indices: np.ndarray) -> np.ndarray:
