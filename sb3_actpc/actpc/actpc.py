@@ -122,7 +122,8 @@ class ActPC(OffPolicyAlgorithm):
     :param replay_buffer_class: None, or one of SB3's classes or its name (its ActPC counterpart is used)
     :param replay_buffer_kwargs: keywords of the buffer: ``combined`` (True: the newest transition of every environment is in
         every batch, half of which these are at most) and ``self_imitation_size`` (transitions in the memory of the agent's
-        own good episodes: 100,000, or ``buffer_size`` where that is less; 0 for none), and those of SB3's class
+        own good episodes: 100,000, or ``buffer_size`` where that is less; 0 for none), with hindsight ``random_goals``
+        (0.375: share of the relabelled transitions whose goal was reached in any episode), and those of SB3's class
     :param optimize_memory_usage: as in SB3; not with a generator (``alpha_ep``), which learns where every step led
     :param n_steps: length of n-step returns; 1 by default where they cannot be had (hindsight, ``optimize_memory_usage``)
         or mean nothing (``bootstrap="literal"``)

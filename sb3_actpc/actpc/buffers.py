@@ -338,11 +338,12 @@ class CombinedHerReplayBuffer(SignalReplay, HerReplayBuffer):  # type: ignore[mi
 
     The newest transitions are real ones; of the rest SB3's ``her_ratio`` is relabelled. Goals of their own episode alone
     would teach the critic that whoever moves slowly is at its goal: what is reached later is then near. So some goals were
-    reached elsewhere, by which what was done leads nowhere (as in HIQL: Park et al., arXiv 2307.11949, and OGBench).
+    reached elsewhere, by which what was done leads nowhere: three tenths of all, as in HIQL (Park et al., arXiv 2307.11949).
 
     :param random_goals: share of the relabelled transitions whose goal was reached at any stored step; 0 for SB3's class. By
         default, and with SB3's ``n_sampled_goal`` of 4, a fifth of what is drawn keeps its goal, half has one of its
-        episode, and three tenths have one of any
+        episode, and three tenths have one of any. A step that ended its episode has none of these: with another goal it
+        would not have
     :raises ValueError: for a share that is not between 0 and 1
     """
 
@@ -369,8 +370,11 @@ class CombinedHerReplayBuffer(SignalReplay, HerReplayBuffer):  # type: ignore[mi
 
     def _sample_goals(self, batch_indices: np.ndarray, env_indices: np.ndarray) -> np.ndarray:
         goals = super()._sample_goals(batch_indices, env_indices)
-        is_random = np.random.random(len(goals)) < self.random_goals
-        goals[is_random] = self.next_observations["achieved_goal"][self._draw(int(is_random.sum()))]
+        rows = batch_indices, env_indices
+        goes_on = (self.dones[rows] == 0) | (self.timeouts[rows] != 0)
+        is_random = goes_on & (np.random.random(len(goals)) < self.random_goals)
+        any_rows = np.random.randint(len(goals), size=is_random.sum())  # of the batch, which is drawn from all episodes
+        goals[is_random] = self.next_observations["achieved_goal"][batch_indices[any_rows], env_indices[any_rows]]
         return goals
 
     def cut_running_episodes(self) -> None:

@@ -274,14 +274,35 @@ def test_some_goals_of_actpcs_hindsight_were_reached_in_any_episode(share: float
     assert np.array_equal(wished, batch.next_observations["desired_goal"].numpy())
     relabelled = wished[:, 0] > 0.0  # a fifth of n_sampled_goal=4 + 1 keeps (0, 0)
     assert relabelled.mean() == pytest.approx(0.8)
-    elsewhere = relabelled & (wished[:, 0] != own[:, 0])
+    elsewhere, n = relabelled & (wished[:, 0] != own[:, 0]), relabelled.sum()
     expected = 0.375 if share is None else share
-    assert elsewhere.sum() / relabelled.sum() == pytest.approx(expected * 3 / 4, abs=0.02)  # of four episodes one is its own
-    is_earlier = relabelled & ~elsewhere & (wished[:, 1] < own[:, 1])  # 45 of the 100 pairs of steps
-    assert is_earlier.sum() / relabelled.sum() == pytest.approx(expected / 4 * 0.45, abs=0.01)
+    # of four episodes one is its own, and of ten steps the last is its episode's end, which it is with its own goal alone
+    assert elsewhere.sum() / n == pytest.approx(expected * 3 / 4 * 9 / 10, abs=0.025)
+    assert not elsewhere[own[:, 1] == 9].any()
+    is_earlier = relabelled & ~elsewhere & (wished[:, 1] < own[:, 1])  # 36 of the 100 pairs of steps
+    assert is_earlier.sum() / n == pytest.approx(expected / 4 * 0.36, abs=0.02)
     assert np.array_equal(batch.rewards.numpy()[relabelled, 0] > 0, (own == wished).all(1)[relabelled])
-    if share == 1.0:  # every step of every episode may be a goal
-        assert len(np.unique(wished[relabelled], axis=0)) == 40
+    reached = {(number, step) for number in (1, 2, 3, 4) for step in range(10)}
+    assert {tuple(goal) for goal in wished[relabelled].tolist()} == reached
+
+
+def test_random_goals_were_reached_in_all_environments_and_in_episodes_that_have_ended() -> None:
+    """Two environments, one of which has an episode that runs; after the time limit of the others one may go on."""
+    env = make_vec_env("GoalReacher-v5", n_envs=2)
+    spaces = env.observation_space, env.action_space
+    buffer = CombinedHerReplayBuffer(60, *spaces, env, n_envs=2, combined=False, random_goals=1.0)
+    for step in range(15):
+        goal = np.array([[1.0, step], [2.0, step]])
+        row = {"observation": np.zeros((2, 6)), "achieved_goal": goal - [[0, 1]], "desired_goal": np.zeros((2, 2))}
+        done = np.array([step == 9, step == 14])
+        infos = [{"TimeLimit.truncated": bool(one)} for one in done]
+        buffer.add(row, {**row, "achieved_goal": goal}, np.zeros((2, 2)), np.zeros(2), done, infos)
+    batch = buffer.sample(2000)
+    own, wished = batch.next_observations["achieved_goal"].numpy(), batch.observations["desired_goal"].numpy()
+    ended = {(1.0, float(step)) for step in range(10)} | {(2.0, float(step)) for step in range(15)}
+    assert {tuple(goal) for goal in wished[wished[:, 0] > 0.0].tolist()} == ended
+    last = (own == [1.0, 9.0]).all(1) & (wished[:, 0] > 0.0)
+    assert (wished[last] != own[last]).any()
 
 
 def test_a_share_of_random_goals_beyond_one_is_refused() -> None:
@@ -307,7 +328,7 @@ def test_actpc_does_not_fall_below_what_a_slow_arm_shows_of_fetch_reach() -> Non
     shown = Demonstrations.record(slowly, env, n_episodes=40, only_successes=True)
     settings = {**preset("FetchReach-v4"), "demonstrations": shown, "actor_warm_start": 2000}
     model = ActPC(env=env, **settings, seed=0, device="cpu").learn(10_000)
-    played = [episode["r"] for episode in model.ep_info_buffer]  # the last hundred, since the pressure began
+    played = [episode["r"] for episode in model.ep_info_buffer]  # the last hundred: 5,000 steps under pressure
     assert len(played) == 100 and np.mean(played) > shown.episode_returns.mean()
     habit, _ = evaluate_policy(model, model.get_env(), 20)
     model.actor.habit.load_state_dict(model.actor.circuit.state_dict())
