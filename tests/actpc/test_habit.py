@@ -523,7 +523,7 @@ def test_a_recall_is_no_early_clone():
     cast(trials, "candidate")
     assert [play(trials, 550.0, has_learned=False)[1] for _ in range(2)] == [None, "accepted"]
     cast(trials, "habit")
-    assert [play(trials, 0.0, has_learned=False)[1] for _ in range(1)] == [None]
+    assert play(trials, 0.0, has_learned=False)[1] is None
     cast(trials, "habit")
     assert play(trials, -300.0, has_learned=False)[1] == "recalled"
     assert trials.needs_clone()
