@@ -40,6 +40,15 @@ def resolve(
     )
 
 
+def _fits(demonstrations: Demonstrations, *both: spaces.Space[Any]) -> bool:
+    """Whether demonstrations of another environment have these spaces."""
+    try:
+        demonstrations.check(*both)
+    except ValueError:
+        return False
+    return True
+
+
 def is_minari_id(source: Any) -> bool:
     """Whether the source of demonstrations is a text that names a Minari dataset, and no file."""
     return isinstance(source, str) and MINARI_ID.fullmatch(source) is not None and not os.path.exists(source)
@@ -74,11 +83,12 @@ def fit_demonstrations(
             demonstrations = dataclasses.replace(demonstrations, env_id=sparse_id, dense_rewards=demonstrations.rewards)
         if has_goals:
             demonstrations = env.env_method("goal_demonstrations", demonstrations, indices=[0])[0]
+    both = observation_space, action_space
     try:
-        demonstrations.check(observation_space, action_space, env_id)
+        demonstrations.check(*both, env_id)
     except ValueError as error:
         fix = "record them in this environment, wrapped as it is here (Demonstrations.record)"
-        if env_id is not None and base_name(env_id) != base_name(demonstrations.env_id):
+        if env_id is not None and base_name(env_id) != base_name(demonstrations.env_id) and _fits(demonstrations, *both):
             fix += f", or say that it is this one: dataclasses.replace(demonstrations, env_id={env_id!r})"
         raise ValueError(f"{error}: {fix}") from None
     if env is None:

@@ -337,3 +337,13 @@ def test_another_tasks_demonstrations_are_named_by_the_goal_task(recorded_id: st
     with pytest.raises(ValueError, match=rf"{recorded_id}"):
         fit_demonstrations(record(recorded_id), env, env.observation_space, env.action_space)
     env.close()
+
+
+@pytest.mark.parametrize(("env_id", "is_offered"), [("HalfCheetah-v5", True), ("Pendulum-v1", False)])
+def test_another_name_is_offered_only_where_the_shapes_are_the_same(env_id: str, is_offered: bool) -> None:
+    """The Walker2d's rows are as long as the HalfCheetah's, and no name makes a pendulum of it."""
+    env = DummyVecEnv([lambda: gym.make(env_id)])
+    with pytest.raises(ValueError, match="record them in this environment") as raised:
+        fit_demonstrations(record("Walker2d-v5"), env, env.observation_space, env.action_space)
+    assert ("env_id=" in str(raised.value)) == is_offered
+    env.close()

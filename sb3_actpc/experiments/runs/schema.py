@@ -113,7 +113,7 @@ class Run(Schema):
     noise_std: Annotated[Real, Field(ge=0)] | None = None  # its standard deviation
     normalize: Annotated[Keywords | None, BeforeValidator(_keywords)] = None  # keywords of SB3's ``VecNormalize``, or true
     eval_freq: Count | None = None  # environment steps between two evaluations; by default a tenth of the training
-    eval_episodes: Count = 5  # in each evaluation
+    eval_episodes: Count = 10  # in each evaluation
     # environment steps between two checkpoints, 0 for none; by default as ``eval_freq``
     checkpoint_freq: Annotated[int, BeforeValidator(_number), Field(ge=0)] | None = None
     keep: Literal["last", "best"] = "last"  # the agent of which evaluation (best: dense return) is kept as ``model.zip``
