@@ -5,12 +5,14 @@ import shlex
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 import yaml
 
-from sb3_actpc import shipped_demonstrations
+from sb3_actpc import ActPC
 from sb3_actpc.cli import build_parser
+from sb3_actpc.demonstrations import Demonstrations
 from sb3_actpc.experiments.comparison import plan_runs, read_comparison
 
 ROOT = Path(__file__).parents[1]
@@ -77,11 +79,15 @@ def test_the_circuit_of_the_readme_learns() -> None:
     assert energies[-1] < energies[0]
 
 
-def test_the_agents_of_the_readme_can_be_made() -> None:
-    quick, own, *_ = blocks("README.md", "python")
+def test_the_agent_and_the_demonstrations_of_the_readme_can_be_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    quick, recorded, made, *_ = blocks("README.md", "python")
     exec(quick[: quick.index("model.learn")], {})
-    path = repr(shipped_demonstrations("SparseReacher-v5").as_posix())
-    exec(own.replace('"mine.npz"', path), {"env": "SparseReacher-v5"})
+    monkeypatch.chdir(tmp_path)
+    for block in (recorded, made):
+        names: dict[str, Any] = {"policy": lambda observation: np.zeros(1)}
+        exec(block, names)
+        ActPC("MlpPolicy", "Pendulum-v1", demonstrations=names["shown"])
+    assert Demonstrations.load("mine.npz").n_episodes == 20
 
 
 def test_the_file_of_the_comparisons_page_is_one() -> None:

@@ -40,10 +40,10 @@ def resolve(
     )
 
 
-def _fits(demonstrations: Demonstrations, *both: spaces.Space[Any]) -> bool:
-    """Whether demonstrations of another environment have these spaces."""
+def _fits(demonstrations: Demonstrations, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> bool:
+    """Whether demonstrations, of whatever environment, have these spaces."""
     try:
-        demonstrations.check(*both)
+        demonstrations.check(observation_space, action_space)
     except ValueError:
         return False
     return True
@@ -83,12 +83,12 @@ def fit_demonstrations(
             demonstrations = dataclasses.replace(demonstrations, env_id=sparse_id, dense_rewards=demonstrations.rewards)
         if has_goals:
             demonstrations = env.env_method("goal_demonstrations", demonstrations, indices=[0])[0]
-    both = observation_space, action_space
     try:
-        demonstrations.check(*both, env_id)
+        demonstrations.check(observation_space, action_space, env_id)
     except ValueError as error:
         fix = "record them in this environment, wrapped as it is here (Demonstrations.record)"
-        if env_id is not None and base_name(env_id) != base_name(demonstrations.env_id) and _fits(demonstrations, *both):
+        is_named_otherwise = env_id is not None and base_name(env_id) != base_name(demonstrations.env_id)
+        if is_named_otherwise and _fits(demonstrations, observation_space, action_space):
             fix += f", or say that it is this one: dataclasses.replace(demonstrations, env_id={env_id!r})"
         raise ValueError(f"{error}: {fix}") from None
     if env is None:
