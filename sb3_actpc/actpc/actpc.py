@@ -1245,9 +1245,8 @@ class ActPC(OffPolicyAlgorithm):
         self.signals.restore_checkpoint_state(state["signals"])
         self.diagnostics.values = dict(state["diagnostics"])
         self.trials = None if state["trials"] is None else Trials(**state["trials"])
-        if state.get("calibration") is not None:  # none in a checkpoint of before
-            self.calibration = Calibration(**state["calibration"])
-        self.imitation.restore_checkpoint_state(state.get("imitation"))  # none in a checkpoint of before
+        self.calibration = None if state["calibration"] is None else Calibration(**state["calibration"])
+        self.imitation.restore_checkpoint_state(state["imitation"])
 
     @classmethod
     def load_checkpoint(cls: type[SelfActPC], path: str | PathLike[str], env: GymEnv | str, **keywords: Any) -> Restored:

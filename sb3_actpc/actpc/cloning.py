@@ -80,7 +80,7 @@ class Cloning:
     def restore_checkpoint_state(self, state: dict[str, Any]) -> None:
         """:param state: what :meth:`checkpoint_state` returned"""
         self.n_updates, self.ensemble_size = state["n_updates"], state["ensemble_size"]
-        self.weight_decay = state.get("weight_decay")  # None in a checkpoint of before
+        self.weight_decay = state["weight_decay"]
         self.teachers = [self.make_circuit() for _ in state["teachers"]]
         for teacher, (synapses, moments) in zip(self.teachers, state["teachers"], strict=True):
             teacher.load_state_dict(synapses)
