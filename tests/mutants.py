@@ -601,13 +601,6 @@ MUTANTS = [
         "False",
         f"{HABIT} -k 'recalled or begins'",
     ),
-    Mutant(
-        "a dropped clone is spent",
-        TRIALS,
-        "is_unjudged = self.on_trial and self.is_clone",
-        "is_unjudged = False",
-        f"{HABIT} -k recalled",
-    ),
     Mutant("nobody is recalled", TRIALS, "if not self.former_returns or ", "if True or ", f"{HABIT} -k gives_way"),
     Mutant(
         "recalled at par", TRIALS, ">= fmean(self.former_returns)", "> fmean(self.former_returns)", f"{HABIT} -k gives_way"

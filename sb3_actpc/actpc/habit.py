@@ -290,8 +290,6 @@ class Trials:
             self.is_by_clone = self.is_clone
         elif verdict == "recalled":
             self.habit_returns, self.former_returns = self.former_returns, []
-            is_unjudged = self.on_trial and self.is_clone  # another one is made in its place
-            self.n_clones, self.n_tried = self.n_clones + is_unjudged, self.n_tried - is_unjudged
         if is_other:
             self.noisy_returns = [] if self.is_by_clone else self.noisy_returns
             # what the old habit has begun elsewhere is no return of the new one

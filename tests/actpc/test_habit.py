@@ -506,14 +506,12 @@ def test_a_habit_is_followed_by_the_last_one_alone():
 
 @pytest.mark.parametrize("is_clone", [False, True])
 def test_who_is_on_trial_when_a_habit_is_recalled_is_dropped(is_clone):
-    """It was weighed against another, so that a clone may be tried again; and after a clone nothing has been learned from the
-    recalled one."""
+    """It was weighed against another; and after a clone nothing has been learned from the recalled one."""
     trials = accepted(is_clone, has_learned=True, noisy_returns=[3.0, 4.0])
     trials.on_trial, trials.candidate_returns, trials.candidate_steps, trials.n_rejected = True, [300.0], PROOF_STEPS, 1
-    trials.has_learned, trials.noisy_returns, trials.n_clones, trials.n_tried = True, [3.0, 4.0], 2, 3
+    trials.has_learned, trials.noisy_returns = True, [3.0, 4.0]
     cast(trials, "habit")
     assert play(trials, 0.0)[1] == "recalled"
-    assert (trials.n_clones, trials.n_tried) == ((3, 2) if is_clone else (2, 3))
     assert not trials.on_trial and trials.candidate_returns == [] and trials.candidate_steps == 0 and not trials.n_rejected
     assert trials.has_learned == (not is_clone) and trials.noisy_returns == ([] if is_clone else [3.0, 4.0])
 
