@@ -39,7 +39,7 @@ def build_parser() -> argparse.ArgumentParser:
     return parser
 
 
-def add_run_options(parser: argparse.ArgumentParser, eval_episodes: int) -> None:
+def add_run_options(parser: argparse.ArgumentParser) -> None:
     """Options that ``train`` and ``compare`` share, keys of a run and ``--no-progress``; what is not given is None."""
     add = parser.add_argument
     add("--steps", metavar="N", help="environment steps of a run, such as 1e5 (default: the preset's)")
@@ -48,7 +48,7 @@ def add_run_options(parser: argparse.ArgumentParser, eval_episodes: int) -> None
     modules = "import these, which register environments; also from this folder"
     add("--gym-packages", nargs="+", metavar="MODULE", help=modules)
     add("--eval-freq", metavar="N", help="steps between evaluations (default: a tenth of all)")
-    add("--eval-episodes", type=int, metavar="N", help=f"episodes in each (default: {eval_episodes})")
+    add("--eval-episodes", type=int, metavar="N", help="episodes in each (default: 10)")
     checkpoints = "steps between checkpoints, 0 for none (default: as --eval-freq)"
     add("--checkpoint-freq", metavar="N", help=checkpoints)
     add("--device", help="torch device (default: cpu)")

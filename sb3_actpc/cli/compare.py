@@ -25,7 +25,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
     add("--seeds", type=int, metavar="N", help="how many seeds (default: 3)")
     add("--first-seed", type=int, metavar="N", help="the first of them (default: 0)")
     add("--output", metavar="DIR", help="folder of the comparison (default: runs/comparison)")
-    add_run_options(parser, eval_episodes=10)
+    add_run_options(parser)
     add("--workers", type=int, metavar="N", help="runs at a time (default: one for each core)")
     add("--engine", default="local", metavar="{local,ray}", help="processes, or a Ray cluster (default: local)")
     add("--address", help="Ray cluster to use (default: one is started on this machine)")

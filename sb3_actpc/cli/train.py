@@ -28,7 +28,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
     add("--seed", type=int, help="seed (default: 0)")
     add("--output", metavar="DIR", help="run folder (default: runs/ENV/ALGO_PRESET_seedSEED)")
     add("--n-envs", type=int, metavar="N", help="parallel environments (default: the preset's, or 1)")
-    add_run_options(parser, eval_episodes=10)
+    add_run_options(parser)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -46,7 +46,7 @@ def read_comparison(given: Mapping[str, Any]) -> Comparison:
     given = {str(key): value for key, value in given.items() if value is not None or key in CAN_BE_NONE}
     own = {key: given.pop(key) for key in OWN_KEYS if key in given}
     check_kind("ablate", own.get("ablate", False), bool)
-    shared = part_of_run({"eval_episodes": 10, "continuable": False, **given}, OWN_KEYS, (*OF_TASKS, *OF_VARIANTS))
+    shared = part_of_run({"continuable": False, **given}, OWN_KEYS, (*OF_TASKS, *OF_VARIANTS))
     variants = [parse_variant(entry) for entry in _list(own, "algos")]
     if own.get("ablate"):
         variants += [variant for variant in ablation_variants() if variant not in variants]
