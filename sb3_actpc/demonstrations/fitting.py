@@ -40,15 +40,6 @@ def resolve(
     )
 
 
-def _fits(demonstrations: Demonstrations, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> bool:
-    """Whether demonstrations, of whatever environment, have these spaces."""
-    try:
-        demonstrations.check(observation_space, action_space)
-    except ValueError:
-        return False
-    return True
-
-
 def is_minari_id(source: Any) -> bool:
     """Whether the source of demonstrations is a text that names a Minari dataset, and no file."""
     return isinstance(source, str) and MINARI_ID.fullmatch(source) is not None and not os.path.exists(source)
@@ -113,3 +104,12 @@ def scaled_actions(demonstrations: Demonstrations, action_space: spaces.Box) -> 
     """(N, action_dim) float32, the actions scaled to [-1, 1]."""
     low, high = action_space.low.ravel(), action_space.high.ravel()
     return np.clip(2.0 * (demonstrations.actions - low) / (high - low) - 1.0, -1.0, 1.0).astype(np.float32)
+
+
+def _fits(demonstrations: Demonstrations, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> bool:
+    """Whether demonstrations, of whatever environment, have these spaces."""
+    try:
+        demonstrations.check(observation_space, action_space)
+    except ValueError:
+        return False
+    return True
