@@ -75,7 +75,7 @@ SMALLEST_VALUE_SCALE = 1.0
 FROM_DEMONSTRATIONS = ("demonstrations", "episodes")  # normalisations
 NEED_DEMONSTRATIONS = ("demonstration_fraction", "actor_warm_start", "n_demonstrations", "n_demonstration_transitions")
 EXPERT_SIGNALS_INTERVAL = 1000  # updates between two evaluations of the demonstrations' signals
-PRETRAINING_INTERVAL = 1000  # updates between two lines about pre-training
+PRETRAINING_INTERVAL = 5000  # updates between two lines about pre-training
 TARGET_NOISE_CLIP = 2.5  # standard deviations, as TD3's 0.5 for 0.2
 AVERAGING_RATE = 0.001  # per update, of the average of the actor that becomes the habit
 LARGEST_BOUND = 1e6  # of an observation; larger ones stand for none
@@ -556,7 +556,7 @@ class ActPC(OffPolicyAlgorithm):
                 memory.episodes.neighbours = None  # the demonstrations may be others by now
         self._warn_of_idle_settings()
         if self.verbose:
-            print(self.describe())
+            print(self.describe(), flush=True)
         self._has_bar = _shows_progress(result[1])
         self.pretrain(between_updates(result[1]), self._has_bar)
         self._is_taught = self.imitation.is_taught
@@ -656,9 +656,10 @@ class ActPC(OffPolicyAlgorithm):
             self._show_to_vec_normalize()
             self.cloning = self.imitation.clone_into(self.actor.circuit)
         n_updates = max(n_prior, 0) + (0 if self.cloning is None else len(self.cloning) - self.n_cloning_updates)
-        for update in tqdm(range(n_updates), "pre-training", disable=not progress_bar):
-            if self.verbose and update % PRETRAINING_INTERVAL == 0:
-                print(f"pre-training: update {update} of {n_updates}")
+        bar = tqdm(range(n_updates), "pre-training", disable=None if progress_bar else True)  # None: not into a file
+        for update in bar:
+            if self.verbose and bar.disable and update % PRETRAINING_INTERVAL == 0:
+                print(f"pre-training: update {update} of {n_updates}", flush=True)
             before_update()
             if update < n_prior:
                 self._update_prior(self.policy.batch_size_of("prior", self.batch_size))
@@ -883,9 +884,10 @@ class ActPC(OffPolicyAlgorithm):
             cloning = self.imitation.clone_into(self.policy.make_actor(), self.trials.n_tried)
             if self.verbose:
                 paid, imitated = self.trials.habit_return, self.trials.imitated_return
-                how = f"noise of {self.imitation.noise_of(self.trials.n_tried):g} of a step's length"
-                print(f"another clone is tried ({how}): the habit is paid {paid:.4g}, what it imitates {imitated:.4g}")
-            for update in tqdm(range(len(cloning)), "another clone", disable=not self._has_bar, leave=False):
+                noise = self.imitation.noise_of(self.trials.n_tried)
+                why = f"the habit is paid {paid:.4g}, what it imitates {imitated:.4g}"
+                print(f"another clone is tried (noise of {noise:g} of a step's length): {why}", flush=True)
+            for update in tqdm(range(len(cloning)), "another clone", disable=None if self._has_bar else True, leave=False):
                 cloning.update(update)
         except BaseException:  # Ctrl-C: nobody is on trial then, nor was, and every environment begins anew
             self.trials.n_clones, self.trials.n_tried = self.trials.n_clones + 1, self.trials.n_tried - 1

@@ -155,7 +155,7 @@ class Imitation:
             parts, helps = split(agent.expert.episodes), True
             if parts is not None and agent.actor_warm_start:
                 if agent.verbose:
-                    print("two short clones are asked whether to imitate steps between the demonstrations")
+                    print("two short clones are asked whether to imitate steps between the demonstrations", flush=True)
                 with random_numbers_of_its_own(agent.device):
                     without, between = (self._error_when_held_out(noise, *parts) for noise in (0.0, 1.0))
                 helps = between <= MOST_BLUR * without

@@ -3,17 +3,18 @@
 import argparse
 from collections.abc import Iterator
 
-KINDS = ("tasks", "algos", "presets", "demos")
+KINDS = ("tasks", "algos", "variants", "presets", "demos")
 
 
 def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    parser = subparsers.add_parser("list", help="what there is: tasks, algorithms, presets, demonstrations")
-    parser.add_argument("kind", choices=KINDS, help="tasks (--env), algos (--algo, and variants of compare), presets, demos")
+    parser = subparsers.add_parser("list", help="what there is: tasks, algorithms, variants, presets, demonstrations")
+    about = "tasks (--env), algos (--algo), variants of these (compare --algos), presets, demos"
+    parser.add_argument("kind", choices=KINDS, help=about)
 
 
 def run(args: argparse.Namespace) -> int:
     """Print a line for each."""
-    rows = list({"tasks": _tasks, "algos": _algos, "presets": _presets, "demos": _demos}[args.kind]())
+    rows = list({"tasks": _tasks, "algos": _algos, "variants": _variants, "presets": _presets, "demos": _demos}[args.kind]())
     width = max(len(name) for name, _ in rows)
     for name, about in rows:
         print(f"{name:{width}}  {about}".rstrip())
@@ -33,14 +34,19 @@ def _tasks() -> Iterator[tuple[str, str]]:
 
 
 def _algos() -> Iterator[tuple[str, str]]:
-    from sb3_actpc.experiments.comparison import find_variant, variant_names
     from sb3_actpc.experiments.runs.algorithms import ALGORITHMS, load_algorithm
 
     for name in ALGORITHMS:
         yield name, (load_algorithm(name).__doc__ or "").strip().partition("\n")[0]
+
+
+def _variants() -> Iterator[tuple[str, str]]:
+    from sb3_actpc.experiments.comparison import find_variant, variant_names
+    from sb3_actpc.experiments.runs.algorithms import ALGORITHMS
+
     for name in variant_names():
         if name not in ALGORITHMS:
-            yield name, f"for compare, {find_variant(name).algo}: {find_variant(name).about}"
+            yield name, f"{find_variant(name).algo}: {find_variant(name).about}"
 
 
 def _presets() -> Iterator[tuple[str, str]]:

@@ -1201,14 +1201,14 @@ def test_a_path_of_demonstrations_is_saved_as_it_was_given(tmp_path, monkeypatch
 
 
 def test_learning_says_what_the_reward_is_made_of_and_how_far_pre_training_is(capsys):
-    model = make(demonstrations=demonstrations(), alpha_ep=0.5, alpha_ext=0.0, actor_warm_start=1200, verbose=1)
+    model = make(demonstrations=demonstrations(), alpha_ep=0.5, alpha_ext=0.0, actor_warm_start=1300, verbose=1)
     began = time.time_ns()
     model.learn(20)
     printed = capsys.readouterr().out
     assert "reward: 0 x task (alpha_ext) + 0.5 x epistemic (alpha_ep) + 1 x instrumental signal (alpha_in)" in printed
     assert "3 episodes, 60 transitions" in printed and "mean return 1.0" in printed
     assert "off: the task's reward, demonstrations in the critic's batch, working memory" in printed
-    assert "update 1000 of 4805" in printed  # of three teachers and the actor
+    assert "update 5000 of 5205" in printed  # of three teachers and the actor
     assert model.start_time > began and model.start_time - began > 0.5 * (time.time_ns() - began)  # time/fps leaves it out
 
 

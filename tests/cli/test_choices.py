@@ -74,10 +74,14 @@ def test_public_names_are_completed() -> None:
     assert {"ActPC", "preset", "Demonstrations"} <= set(dir(sb3_actpc))
 
 
-@pytest.mark.parametrize(("kind", "found"), [("tasks", "SparseHopper-v5"), ("algos", "sac_rlpd"), ("demos", "20 episodes")])
+@pytest.mark.parametrize(
+    ("kind", "found"),
+    [("tasks", "SparseHopper-v5"), ("algos", "sac_rlpd"), ("variants", "refresh_alone  "), ("demos", "20 episodes")],
+)
 def test_what_there_is_can_be_listed(kind: str, found: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["list", kind]) == 0
-    assert found in capsys.readouterr().out
+    assert found in (listed := capsys.readouterr().out)
+    assert ("refresh_alone" in listed) == (kind == "variants")
 
 
 @pytest.mark.filterwarnings("ignore:.*is set to None:UserWarning", "ignore:env_spec is None:UserWarning")
@@ -131,8 +135,8 @@ def test_steps_that_are_no_whole_number_are_refused(
     assert message in (line := capsys.readouterr().err) and option.replace("-", "_") in line
 
 
-def test_an_environment_of_the_working_folder_with_observations_of_two_parts(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_an_environment_of_the_working_folder_with_observations_of_two_parts_and_one_reward(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "own_task.py").write_text(OWN_TASK, encoding="utf-8")
     monkeypatch.setattr(sys, "path", [path for path in sys.path if path not in ("", str(tmp_path))])
@@ -141,6 +145,23 @@ def test_an_environment_of_the_working_folder_with_observations_of_two_parts(
     record = json.loads(Path("own/config.json").read_text(encoding="utf-8"))
     assert (record["policy"], record["gym_packages"]) == ("MultiInputPolicy", ["own_task"])
     assert main(["evaluate", "own", "--episodes", "1", "--no-video"]) == 0
+    printed = capsys.readouterr().out
+    assert "step       30  return       5.0" in printed and "\nreturn  " in printed and "dense" not in printed
+
+
+@pytest.mark.parametrize("named", [["--env", "Own-v0", "--gym-packages", "no_such_task"], ["--env", "no_such_task:Own-v0"]])
+def test_a_module_that_is_not_there_is_asked_for(named: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["train", *named, "--algo", "td3", "--preset", "small.yml"]) == 2
+    assert "'no_such_task', which is to register an environment: run the command in the folder" in capsys.readouterr().err
+
+
+def test_what_a_module_of_ones_own_lacks_is_no_module_of_ones_own(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "lacking_task.py").write_text("import no_such_library\n", encoding="utf-8")
+    monkeypatch.setattr(sys, "path", [path for path in sys.path if path not in ("", str(tmp_path))])
+    assert main(["train", "--env", "lacking_task:Own-v0", "--algo", "td3", "--preset", "small.yml"]) == 2
+    assert capsys.readouterr().err.strip() == "sb3-actpc: error: No module named 'no_such_library'"
 
 
 def test_a_finished_run_is_given_more_steps(capsys: pytest.CaptureFixture[str]) -> None:

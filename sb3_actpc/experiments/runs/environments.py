@@ -77,11 +77,18 @@ def register_tasks(env_id: str) -> None:
 
 def check_env_id(env_id: str, gym_packages: Sequence[str] = ()) -> None:
     """Check that an environment is registered; ids with a module (``module:Name-v0``) are left to ``gymnasium.make``.
-    Modules that register environments are imported first; the working folder is looked in, too."""
+    Modules that register environments are imported first; the working folder is looked in, too. gymnasium.error.Error where
+    it is not, ModuleNotFoundError where a module is missing."""
     if os.getcwd() not in sys.path:  # as with `python -m`
         sys.path.append(os.getcwd())
-    for package in gym_packages:
-        importlib.import_module(package)
+    for module in [*gym_packages, *env_id.split(":")[:-1]]:
+        try:
+            importlib.import_module(module)
+        except ModuleNotFoundError as error:
+            if error.name != module.partition(".")[0]:  # one that it imports itself
+                raise
+            fix = "run the command in the folder that holds it, or put that into PYTHONPATH"
+            raise ModuleNotFoundError(f"{error}, which is to register an environment: {fix}", name=error.name) from error
     register_tasks(env_id)
     if ":" not in env_id:
         own = f"; if a module of yours registers it, name that: MODULE:{env_id}, or --gym-packages MODULE"

@@ -2,7 +2,7 @@
 
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from io import BufferedIOBase
 from pathlib import Path
@@ -105,6 +105,11 @@ class EpisodeStatistics:
         """Farthest stage of the episodes without success -> how many; empty where stages are not reported."""
         stages = (stage for stage, success in zip(self.stages, self.successes, strict=True) if not success)
         return dict(Counter(filter(None, stages)))
+
+
+def says_one_return(summary: Mapping[str, Any]) -> bool:
+    """Whether the dense returns of a summary are the sparse ones: of an environment that reports none, or is paid densely."""
+    return all(summary[f"dense_{name}"] == summary[f"sparse_{name}"] for name in ("return", "return_std"))
 
 
 def play_episodes(model: Predictor, envs: Sequence[gym.Env[Any, Any]], n_episodes: int, seed: int) -> EpisodeStatistics:
@@ -269,7 +274,8 @@ class EvaluationCallback(CsvCallback):
         self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
         self.logger.dump(self.num_timesteps)  # a row of the agent's own figures beside each evaluation
         summary, success = self.last_summary, self.last_summary["success_rate"]
-        self.report(
-            f"step {self.num_timesteps:>8}  dense return {summary['dense_return']:9.1f} ± {summary['dense_return_std']:<7.1f} "
-            f"sparse return {summary['sparse_return']:7.1f}  success {'n/a' if success is None else f'{success:.2f}'}"
-        )
+        shown = [f"return {summary['dense_return']:9.1f} ± {summary['dense_return_std']:<7.1f}"]
+        if not says_one_return(summary):
+            shown = [f"dense {shown[0]}", f"sparse return {summary['sparse_return']:7.1f} "]
+        shown += [] if success is None else [f"success {success:.2f}"]
+        self.report(f"step {self.num_timesteps:>8}  {' '.join(shown)}")

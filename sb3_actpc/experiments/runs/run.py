@@ -186,6 +186,7 @@ def _train(
     (folder / RESULT).unlink(missing_ok=True)  # of a finished run that gets more steps, as the settings then say
     write_config(run)
     model.set_logger(_logger(model, folder))
+    model.verbose = max(model.verbose, int(report is not silent))  # it says what it is about, too
     seed = run.seed + EVALUATION_SEED_OFFSET
     evaluation = EvaluationCallback(
         eval_envs, folder, run.eval_freq or 1, run.eval_episodes, seed, report, run.keep == "best", run.target_return

@@ -6,22 +6,28 @@ from typing import Any
 
 import pandas as pd
 
+from sb3_actpc.experiments.runs.evaluation import says_one_return
 from sb3_actpc.utils.files import atomic_write
 
 
 def result_table(result: Mapping[str, Any]) -> str:
     """The result of ``train_run`` or ``evaluate_run`` as aligned text, a line per quantity."""
-    rows = [
-        ("dense return", f"{result['dense_return']:.1f} ± {result['dense_return_std']:.1f}"),
-        ("demonstrators' dense return", _number(result.get("demonstrators_return"), ".1f")),
-        ("sparse return", f"{result['sparse_return']:.1f} ± {result['sparse_return_std']:.1f}"),
+    dense, sparse = (f"{result[f'{kind}_return']:.1f} ± {result[f'{kind}_return_std']:.1f}" for kind in ("dense", "sparse"))
+    rows = [("return", sparse)]
+    if not says_one_return(result):
+        rows = [
+            ("dense return", dense),
+            ("demonstrators' dense return", _number(result.get("demonstrators_return"), ".1f")),
+            ("sparse return", sparse),
+        ]
+    rows += [
         ("success rate", _number(result["success_rate"], ".2f")),
         ("episode length", f"{result['episode_length']:.1f}"),
     ]
     if result.get("failed_after"):
         rows.append(("failed, farthest stage", ", ".join(f"{stage} {n}" for stage, n in result["failed_after"].items())))
     if "steps_per_second" in result:
-        rows.append(("training steps per second", f"{result['steps_per_second']:.0f}"))
+        rows.append(("steps per second, warm start included", f"{result['steps_per_second']:.0f}"))
     title = f"{result['env']}, {result['algo']}, seed {result['seed']}: mean ± std of {result['eval_episodes']} episodes"
     width = max(len(name) for name, _ in rows)
     return "\n".join([title, "-" * len(title), *(f"{name:<{width}}  {value}" for name, value in rows)])
