@@ -1,5 +1,6 @@
 """ActPC: active predictive coding as a Stable-Baselines3 algorithm (Ororbia & Mali, arXiv 2209.09174, Algorithm 1)."""
 
+import sys
 import time
 import warnings
 from collections.abc import Callable, Iterable
@@ -656,9 +657,8 @@ class ActPC(OffPolicyAlgorithm):
             self._show_to_vec_normalize()
             self.cloning = self.imitation.clone_into(self.actor.circuit)
         n_updates = max(n_prior, 0) + (0 if self.cloning is None else len(self.cloning) - self.n_cloning_updates)
-        bar = tqdm(range(n_updates), "pre-training", disable=None if progress_bar else True)  # None: not into a file
-        for update in bar:
-            if self.verbose and bar.disable and update % PRETRAINING_INTERVAL == 0:
+        for update in _counted(n_updates, "pre-training", progress_bar):
+            if self.verbose and not progress_bar and update % PRETRAINING_INTERVAL == 0:
                 print(f"pre-training: update {update} of {n_updates}", flush=True)
             before_update()
             if update < n_prior:
@@ -887,7 +887,7 @@ class ActPC(OffPolicyAlgorithm):
                 noise = self.imitation.noise_of(self.trials.n_tried)
                 why = f"the habit is paid {paid:.4g}, what it imitates {imitated:.4g}"
                 print(f"another clone is tried (noise of {noise:g} of a step's length): {why}", flush=True)
-            for update in tqdm(range(len(cloning)), "another clone", disable=None if self._has_bar else True, leave=False):
+            for update in _counted(len(cloning), "another clone", self._has_bar, leave=False):
                 cloning.update(update)
         except BaseException:  # Ctrl-C: nobody is on trial then, nor was, and every environment begins anew
             self.trials.n_clones, self.trials.n_tried = self.trials.n_clones + 1, self.trials.n_tried - 1
@@ -1320,6 +1320,12 @@ def _follow(targets: list[NGCCircuit], circuits: list[NGCCircuit], tau: float) -
 def _shows_progress(callback: BaseCallback) -> bool:
     """Whether there is a progress bar among them, asked for by ``progress_bar`` or given."""
     return isinstance(callback, ProgressBarCallback) or any(map(_shows_progress, getattr(callback, "callbacks", ())))
+
+
+def _counted(n: int, what: str, is_shown: bool, **keywords: Any) -> Iterable[int]:
+    """0 to n - 1, with a bar where it is shown; into a file, or a notebook, it is drawn now and then."""
+    seldom = is_shown and not sys.stderr.isatty()
+    return tqdm(range(n), what, disable=not is_shown, mininterval=5.0 if seldom else 0.1, **keywords)
 
 
 def _copy(source: NGCCircuit | None, *targets: NGCCircuit | None) -> None:
