@@ -17,8 +17,8 @@ The YAML file, named from the Markdown file's folder, says for each name what st
 What a row or a column says is added to what the table says, the row last; a text alone is the variant of a row and the task
 of a column. ``from``, ``task``, ``variant``, ``settings``, ``seed`` and ``planned_steps`` choose runs, ``cell`` says what is
 written of them: columns of ``results.csv`` with a format, which give the mean over the seeds, or with ``each``, ``min``,
-``max``, ``std`` or ``interval`` (the mean's, of 95 %) before it, as in ``{dense_return:each .0f}``; ``{n}``, the number of
-seeds; ``{paper}``, what the paper gives for the algorithm; and ``{score}``, which stands for what ``score`` says. A cell
+``max``, ``std``, ``interval`` (the mean's, of 95 %) or ``curve`` (every evaluation, seed by seed) before it, as in
+``{dense_return:each .0f}``; ``{n}``, the number of seeds; ``{paper}``, what the paper gives for the algorithm; and ``{score}``, which stands for what ``score`` says. A cell
 without runs is empty; † marks one with runs from a source tree with uncommitted changes. The variants ``demonstrators``,
 ``random`` and ``paper:ALGO`` are known everywhere.
 """
@@ -77,15 +77,18 @@ def fill_tables(text: str, folder: Path) -> str:
 
 
 class _OverSeeds:
-    """Values of the seeds, which a format makes into one text."""
+    """Values of the seeds, which a format makes into one text; ``evaluations`` are those of the runs."""
 
-    def __init__(self, values: pd.Series) -> None:
-        self.values = values.astype(float)
+    def __init__(self, values: pd.Series, evaluations: pd.DataFrame) -> None:
+        self.values, self.evaluations = values.astype(float), evaluations
 
     def __format__(self, form: str) -> str:
         how, _, form = form.rpartition(" ")
-        if how not in ("", "each", "min", "max", "std", "interval"):
-            raise ValueError(f"unknown {how!r} in a format: each, min, max, std, interval, or nothing for the mean")
+        if how not in ("", "each", "min", "max", "std", "interval", "curve"):
+            raise ValueError(f"unknown {how!r} in a format: each, min, max, std, interval, curve, or nothing for the mean")
+        if how == "curve":
+            curves = [self.evaluations.loc[self.evaluations["run"] == run, self.values.name] for run in self.values.index]
+            return "; ".join(", ".join(number(value, form) for value in curve) for curve in curves)
         if how == "interval":
             bounds = [number(float(bound), form) for bound in mean_interval(self.values.to_numpy())[1:]]
             return "" if UNDEFINED in bounds else "[{}, {}]".format(*bounds)
@@ -122,17 +125,22 @@ def _cell(spec: dict[str, Any], folder: Path) -> str:
         raise ValueError(
             f"several runs with one seed for {spec}: name settings ({', '.join(runs['settings'].unique())}) or one export"
         )
-    fields: dict[str, Any] = {name: _OverSeeds(runs[name]) for name in map(str, runs.select_dtypes("number"))}
-    fields["n"] = _OverSeeds(runs["algorithm"].notna().groupby(runs["task"]).sum().replace(0, np.nan))
+    evaluations = pd.concat(_results(folder / name).evaluations for name in folders)
+    n_runs = runs["algorithm"].notna().groupby(runs["task"]).sum().replace(0, np.nan)
+    fields: dict[str, Any] = {name: _OverSeeds(runs[name], evaluations) for name in map(str, runs.select_dtypes("number"))}
+    fields["n"] = _OverSeeds(n_runs, evaluations)
     fields["score"] = spec.get("score", "").format(**fields)
     text = re.sub(rf"(\s*\(|, | x ){UNDEFINED}\)?", "", spec["cell"].format(**fields)).strip()  # what is not known is left out
     return "" if text == UNDEFINED else f"{text} †" if runs["dirty"].any() else text
 
 
+_results = cache(load_results)
+
+
 @cache
 def _runs(folder: Path) -> pd.DataFrame:
     """The finished runs of an export, and a row for each of the references of its tasks."""
-    results = load_results(folder)
+    results = _results(folder)
     papers, rows = {}, []
     for task in results.finished["task"].unique():
         measure = measure_of(task)

@@ -64,6 +64,10 @@ def test_other_figures_than_the_mean(folder: Path) -> None:
     )
 
 
+def test_a_curve_is_every_evaluation_seed_by_seed(folder: Path) -> None:
+    assert lines(folder, "ActPC: actpc", "{dense_return:curve .0f}")[2] == "| ActPC | 0, 50, 100; 0, 150, 300 | 0, -2, -4 |"
+
+
 def test_an_interval_of_the_mean_is_students(folder: Path) -> None:
     """Two seeds, 200 ± 100 (standard error) times t's 12.706; a single one has none."""
     row = lines(folder, "ActPC: actpc", "{dense_return:.0f} {dense_return:interval .0f}")[2]
