@@ -18,9 +18,9 @@ What a row or a column says is added to what the table says, the row last; a tex
 of a column. ``from``, ``task``, ``variant``, ``settings``, ``seed`` and ``planned_steps`` choose runs, ``cell`` says what is
 written of them: columns of ``results.csv`` with a format, which give the mean over the seeds, or with ``each``, ``min``,
 ``max``, ``std``, ``interval`` (the mean's, of 95 %) or ``curve`` (every evaluation, seed by seed) before it, as in
-``{dense_return:each .0f}``; ``{n}``, the number of seeds; ``{paper}``, what the paper gives for the algorithm; and ``{score}``, which stands for what ``score`` says. A cell
-without runs is empty; † marks one with runs from a source tree with uncommitted changes. The variants ``demonstrators``,
-``random`` and ``paper:ALGO`` are known everywhere.
+``{dense_return:each .0f}``; ``{n}``, the number of seeds; ``{paper}``, what the paper gives for the algorithm; and
+``{score}``, which stands for what ``score`` says. A cell without runs is empty; † marks one with runs from a source tree with
+uncommitted changes. The variants ``demonstrators``, ``random`` and ``paper:ALGO`` are known everywhere.
 """
 
 import re
