@@ -87,7 +87,8 @@ class _OverSeeds:
         if how not in ("", "each", "min", "max", "std", "interval", "curve"):
             raise ValueError(f"unknown {how!r} in a format: each, min, max, std, interval, curve, or nothing for the mean")
         if how == "curve":
-            curves = [self.evaluations.loc[self.evaluations["run"] == run, self.values.name] for run in self.values.index]
+            column, of_run = self.evaluations[str(self.values.name)], self.evaluations["run"]
+            curves = [column[of_run == run].tolist() for run in self.values.index]
             return "; ".join(", ".join(number(value, form) for value in curve) for curve in curves)
         if how == "interval":
             bounds = [number(float(bound), form) for bound in mean_interval(self.values.to_numpy())[1:]]
