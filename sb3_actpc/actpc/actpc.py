@@ -714,9 +714,13 @@ class ActPC(OffPolicyAlgorithm):
     # ------------------------------------------------------------------ collecting
 
     def collect_rollouts(self, *args: Any, **kwargs: Any) -> RolloutReturn:
-        """As in SB3. A callback that stops leaves a step that was made and is not stored: the next ``learn`` must not go on
-        from the observation before it, but reset the environments."""
-        rollout = super().collect_rollouts(*args, **kwargs)
+        """As in SB3. A callback that stops, or Ctrl-C, leaves a step that was made and is not stored: the next ``learn`` must
+        not go on from the observation before it, but reset the environments."""
+        try:
+            rollout = super().collect_rollouts(*args, **kwargs)
+        except BaseException:
+            self._last_obs = None
+            raise
         if not rollout.continue_training:
             self._last_obs = None
         return rollout

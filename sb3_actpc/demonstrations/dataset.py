@@ -131,7 +131,7 @@ class Demonstrations:
         count where all have them. ValueError when there are none, or they do not fit together."""
         if not episodes:
             raise field_error(source, "observations", "at least one episode", "none")
-        episodes = [whole_columns(episode, source) for episode in episodes]
+        episodes = [whole_columns(episode, COLUMNS, source) for episode in episodes]
         columns = {}
         for name in COLUMNS:
             if name == "dense_rewards" and not all(episode.get(name) is not None for episode in episodes):

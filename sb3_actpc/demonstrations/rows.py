@@ -1,6 +1,6 @@
 """Between the observations of an environment and rows of numbers; how a wrong field of demonstrations is named."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -76,17 +76,25 @@ def transition_columns(rows: np.ndarray, actions: Any, where: str) -> dict[str, 
     return {"observations": rows[:-1], "actions": np.asarray(actions).reshape(n, -1), "next_observations": rows[1:]}
 
 
-def whole_columns(episode: Mapping[str, Any], source: str) -> dict[str, Any]:
+def whole_columns(episode: Mapping[str, Any], known: Sequence[str], source: str) -> dict[str, Any]:
     """An episode's columns, with those that may be left out (see ``Demonstrations.from_episodes``); ValueError when another
-    one is missing."""
+    one is missing or unknown, when there are no steps, or not as many in every column."""
     columns = {name: column for name, column in episode.items() if column is not None}
+    for name in columns.keys() - set(known):
+        raise field_error(source, name, f"one of {', '.join(known)}", "a column of this name")
     for name in ("observations", "actions", "rewards"):
         if name not in columns:
             raise field_error(source, name, "a column of every episode", f"only {', '.join(sorted(columns)) or 'none'}")
+    n = len(columns["actions"])
+    if not n:
+        raise field_error(source, "actions", "a step of every episode", "an episode of none; leave it out")
     if "next_observations" not in columns:
         seen, where = np.asarray(columns["observations"]), "an episode without next_observations,"
         columns |= transition_columns(seen, columns["actions"], where)
-    return {"terminations": np.zeros(len(columns["rewards"]), dtype=bool), **columns}
+    for name, column in columns.items():
+        if len(column) != n:
+            raise field_error(source, name, f"{n} rows, as the episode has actions", f"{len(column)}")
+    return {"terminations": np.zeros(n, dtype=bool), **columns}
 
 
 def unchained_indices(observations: np.ndarray, next_observations: np.ndarray, episode_starts: np.ndarray) -> np.ndarray:

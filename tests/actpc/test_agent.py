@@ -10,7 +10,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from stable_baselines3.common.callbacks import StopTrainingOnMaxEpisodes
+from stable_baselines3.common.callbacks import BaseCallback, StopTrainingOnMaxEpisodes
 from stable_baselines3.common.env_checker import check_env
 from stable_baselines3.common.envs import BitFlippingEnv
 from stable_baselines3.common.evaluation import evaluate_policy
@@ -1342,6 +1342,25 @@ def test_a_callback_that_stops_cuts_the_episode_it_interrupts(n_envs):
     steps = buffer.observations[rows, envs, 1] * 11  # of the episode
     _, mask = buffer._history_at(rows, envs, None)
     assert np.allclose(mask.sum(1), np.minimum(steps, 3))
+
+
+def test_an_interrupt_cuts_the_episode_too():
+    """As from a notebook's button: the step that was made and not stored is no part of what follows."""
+
+    class Interrupts(BaseCallback):
+        def _on_step(self):
+            if self.n_calls == 8:
+                raise KeyboardInterrupt
+            return True
+
+    model = make(DummyVecEnv([Paying]), learning_starts=0)
+    with pytest.raises(KeyboardInterrupt):
+        model.learn(1000, callback=Interrupts())
+    model.learn(20, reset_num_timesteps=False)
+    buffer = model.replay_buffer
+    steps = np.round(buffer.observations[: buffer.pos, 0, 1] * 11)
+    followed = np.round(buffer.next_observations[: buffer.pos, 0, 1] * 11)
+    assert np.array_equal(followed, steps + 1) and set(buffer.self_imitation.lengths) == {5}
 
 
 def test_vec_normalize_relabels_the_task_reward_alone():

@@ -750,9 +750,16 @@ def test_an_episode_of_ones_own_arrays() -> None:
         ({"observations": np.zeros((3, 2))}, "must have 4 observations, found 3"),
         ({"rewards": None}, "'rewards': expected a column of every episode, found only actions, observations"),
         ({"actions": None}, "'actions': expected a column of every episode"),
+        (
+            {"termination": np.zeros(3)},
+            r"'termination': expected one of observations, actions, .*, found a column of this name",
+        ),
+        ({"rewards": np.ones(2)}, "'rewards': expected 3 rows, as the episode has actions, found 2"),
+        ({"terminations": np.zeros(4)}, "'terminations': expected 3 rows, as the episode has actions, found 4"),
+        ({"observations": np.zeros((1, 2)), "actions": np.zeros((0, 1)), "rewards": np.ones(0)}, "found an episode of none"),
     ],
 )
-def test_columns_that_are_missing_are_named(change: dict[str, Any], named: str) -> None:
+def test_columns_that_are_missing_or_do_not_fit_are_named(change: dict[str, Any], named: str) -> None:
     one = {"observations": np.zeros((4, 2)), "actions": np.zeros((3, 1)), "rewards": np.ones(3), **change}
     with pytest.raises(ValueError, match=named):
         Demonstrations.from_episodes([one], "Mine-v0")
