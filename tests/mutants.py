@@ -1091,7 +1091,14 @@ MUTANTS = [
         "the first step as it was seen", AGENT, "if self._last_original_obs is not None:", "if False:", f"{STRANGERS} -k first"
     ),
     Mutant("a rate of a file", AGENT, 'group["lr_scale"] = scale', "pass", f"{STRANGERS} -k outlasts"),
-    Mutant("anybody's buffer", AGENT, "n_envs == self.n_envs", "True", f"{STRANGERS} -k buffers"),
+    Mutant("anybody's buffer", AGENT, "held == needed", "True", f"{STRANGERS} -k buffers"),
+    Mutant("the file's memory", AGENT, "            loaded.history = self.memory_history\n", "", f"{STRANGERS} -k remembers"),
+    Mutant("evaluations go on", AGENT, "self._steps_at_pause != self._steps_of_envs()", "False", f"{LEARNS} -k who_plays"),
+    Mutant(
+        "a loaded critic is new", AGENT, "not _init_setup_model  #", "False  #", "tests/actpc/test_calibration.py -k loaded"
+    ),
+    Mutant("hindsight waits in silence", AGENT, "if ENDLESS in", "if not", f"{LEARNS} -k hindsight_that_waits"),
+    Mutant("features without end", WITHIN, "[:MOST_ALONE]", "", f"{WITHINS} -k wide"),
     Mutant("buffers that are refused stay", AGENT, "        self.replay_buffer = given", "", f"{STRANGERS} -k buffers"),
     Mutant(
         "loaded synapses aside", CIRCUIT, "    circuit._list_synapses()", "    pass", "tests/ngc/test_settling.py -k loaded"

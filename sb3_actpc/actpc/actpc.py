@@ -3,7 +3,7 @@
 import sys
 import time
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial, reduce
 from os import PathLike
 from pathlib import Path
@@ -15,9 +15,11 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback, ProgressBarCallback
-from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.noise import ActionNoise, VectorizedActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.preprocessing import get_action_dim, get_obs_shape
 from stable_baselines3.common.type_aliases import (
     GymEnv,
     MaybeCallback,
@@ -310,6 +312,8 @@ class ActPC(OffPolicyAlgorithm):
         self._meant: np.ndarray | None = None  # what the last actions were before their noise
         self._has_bar = False  # whether learning shows its progress
         self._is_taught = False  # whether the habit teaches the learning actor
+        self._awaits_parameters = not _init_setup_model  # ``load`` sets them
+        self._steps_at_pause: list[int] | None = None  # that the environments had made when ``learn`` ended
         if _init_setup_model:
             self._setup_model()
             self._check_learning_rates()
@@ -382,6 +386,12 @@ class ActPC(OffPolicyAlgorithm):
             raise ValueError(f"replay_buffer_kwargs has {name!r}, which {kind.__name__} does not take{nearest(name, known)}")
         if issubclass(kind, HerReplayBuffer):
             assert self.env is not None, "You must pass an environment when using `HerReplayBuffer`"  # as SB3 does
+            assert isinstance(self.observation_space, spaces.Dict)
+            if not {"achieved_goal", "desired_goal"} <= set(self.observation_space) or not self.env.has_attr("compute_reward"):
+                raise ValueError(
+                    f"replay_buffer_class={kind.__name__} relabels goals: the environment needs 'achieved_goal' and "
+                    "'desired_goal' in its observations, and compute_reward, as gymnasium_robotics.GoalEnv has them"
+                )
             kwargs["env"] = self.env
         # SB3 checks by assertion what does not go together
         where = f"buffer_size={self.buffer_size}, replay_buffer_kwargs={self.replay_buffer_kwargs!r}"
@@ -436,12 +446,14 @@ class ActPC(OffPolicyAlgorithm):
                 self.demonstrations, self.env, self.observation_space, self.action_space, *limits
             )
         except (FileNotFoundError, ImportError, ValueError) as error:
-            if not self._is_trained() or not (isinstance(error, FileNotFoundError) or self.env is None):
+            if not self._is_trained():
                 raise
+            if not isinstance(error, FileNotFoundError) and self.env is not None:
+                raise type(error)(f"{error}. A trained agent can do without: demonstrations=None") from error
             return  # a trained agent acts without them; ``learn`` says what is missing
         assert isinstance(self.action_space, spaces.Box)
         self.expert = DemonstrationReplay(demonstrations, self.observation_space, self.action_space, self.memory_history)
-        if self.observation_normalization in FROM_DEMONSTRATIONS and not self.pretrained:
+        if self.observation_normalization in FROM_DEMONSTRATIONS and not (self.pretrained or self._awaits_parameters):
             self.actor.normalizer.begin()
             if not self.inputs.are_normalised:
                 self._fit_to_demonstrations(self.expert.episodes)
@@ -494,6 +506,7 @@ class ActPC(OffPolicyAlgorithm):
         """As in SB3. What was paid in another environment, the habit's and the own episodes', is forgotten; ValueError where
         demonstrations do not fit."""
         super().set_env(env, force_reset)
+        self._steps_at_pause = None
         if self.trials is not None:  # another environment may pay for other steps
             self.trials = self.trials.forgotten(self.n_envs, goes_on=not force_reset)
         if self.calibration is not None:
@@ -534,6 +547,10 @@ class ActPC(OffPolicyAlgorithm):
     ) -> tuple[int, BaseCallback]:
         self._check_together()
         self._check_learning_rates()
+        if self._steps_at_pause is not None and self._steps_at_pause != self._steps_of_envs():
+            self._last_obs = None  # somebody else has played in them, as ``evaluate_policy`` does: they are reset
+        if isinstance(self.action_noise, VectorizedActionNoise) and self.action_noise.n_envs != self.n_envs:
+            self.action_noise = self.action_noise.base_noise  # of a loaded agent; SB3 makes it one for each environment
         if reset_num_timesteps or self._last_obs is None:  # SB3 resets the environments
             self._rollout_state: tuple[np.ndarray, ...] | None = None
             self._rollout_starts = np.ones(self.n_envs, dtype=bool)
@@ -565,6 +582,11 @@ class ActPC(OffPolicyAlgorithm):
         self.start_time = time.time_ns()  # of the frames per second: pre-training has none
         self._compiled = self._compiled or compiled_update(self, self._total_timesteps)  # resumed, as straight
         return result
+
+    def _steps_of_envs(self) -> list[int] | None:
+        """How many steps each environment has made, whoever acted; None without SB3's Monitor, which counts them."""
+        assert self.env is not None
+        return self.env.get_attr("total_steps") if all(self.env.env_is_wrapped(Monitor)) else None
 
     def _check_together(self) -> None:
         """
@@ -794,6 +816,8 @@ class ActPC(OffPolicyAlgorithm):
         if self.expert is not None and np.any(dones):
             self.expert.check_scale(replay_buffer.rewards[: replay_buffer.size()])
         self._prove(paid, dones)
+        if ENDLESS in replay_buffer.running_lengths:
+            self._warn_of_endless_episodes()
 
     def _calibrate(self, actions: np.ndarray, rewards: np.ndarray, dones: np.ndarray, infos: list[dict[str, Any]]) -> None:
         """Whether the critic knows what the learning actor's noise gains: see :mod:`sb3_actpc.actpc.calibration`. Not where it
@@ -835,12 +859,16 @@ class ActPC(OffPolicyAlgorithm):
             self.trials.step(env, float(reward))
             if done:
                 self._end_episode(self.trials, env)
-            elif self.trials.lengths[env] == ENDLESS:
-                warnings.warn(
-                    f"an episode has gone on for {ENDLESS} steps: the habit is replaced by what whole episodes are paid, "
-                    "so end them with gymnasium.wrappers.TimeLimit",
-                    stacklevel=2,
-                )
+
+    def _warn_of_endless_episodes(self) -> None:
+        waits = ["the habit is replaced by what whole episodes are paid"] if self.trials is not None else []
+        waits += ["hindsight learns from episodes that have ended"] if isinstance(self.replay_buffer, HerReplayBuffer) else []
+        if waits:
+            warnings.warn(
+                f"an episode has gone on for {ENDLESS} steps: {' and '.join(waits)}, so end them with "
+                "gymnasium.wrappers.TimeLimit",
+                stacklevel=2,
+            )
 
     def _end_episode(self, trials: Trials, env: int) -> None:
         """What follows from the episode of ``env``, and who plays the next one."""
@@ -1169,7 +1197,9 @@ class ActPC(OffPolicyAlgorithm):
         environment steps, and where something that was set since does not fit."""
         check_kind("total_timesteps", total_timesteps, float)
         Between(0)("total_timesteps", total_timesteps)
-        return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+        super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+        self._steps_at_pause = self._steps_of_envs()
+        return self
 
     @classmethod
     def load(cls: type[SelfActPC], path: str | PathLike[str], *args: Any, **kwargs: Any) -> SelfActPC:  # type: ignore[override]
@@ -1179,6 +1209,7 @@ class ActPC(OffPolicyAlgorithm):
         :raises ValueError: for a file of a version whose classes are not here, or of another algorithm
         """
         of_another_version = f"{path} is of another version of sb3_actpc ({{}}): load it with that one"
+        own = kwargs.get("policy_kwargs")
         try:
             model = super().load(path, *args, **kwargs)  # type: ignore[arg-type]
         except ModuleNotFoundError as error:
@@ -1186,6 +1217,10 @@ class ActPC(OffPolicyAlgorithm):
                 raise
             raise ValueError(of_another_version.format(error)) from error
         except ValueError as error:
+            if "policy kwargs do not equal" in str(error) and isinstance(own, Mapping) and "habit" not in own:
+                return cls.load(
+                    path, *args, **{**kwargs, "policy_kwargs": {"habit": True, **own}}
+                )  # as demonstrations have it
             if not str(error).startswith("policy="):
                 raise
             raise ValueError(f"{path} holds no ActPC: load it with the class that saved it ({error})") from error
@@ -1207,6 +1242,11 @@ class ActPC(OffPolicyAlgorithm):
         groups = [group for _, circuit in self.policy.named_circuits() for group in circuit.optimizer.param_groups]
         for group, scale in zip(groups, scales, strict=True):
             group["lr_scale"] = scale
+        if self._awaits_parameters:  # these are the agent's own
+            self._awaits_parameters = False
+            if self.demonstrations is not None and not self.pretrained:
+                self._setup_demonstrations()
+            return
         if self.trials is not None:
             self.trials = self.trials.forgotten(self.n_envs, goes_on=True)
         if self.calibration is not None:  # this is another critic
@@ -1269,18 +1309,22 @@ class ActPC(OffPolicyAlgorithm):
         """
         As in SB3, which unpickles: load files that you trust.
 
-        :raises ValueError: for a buffer of another algorithm, or of as many environments as this agent has not
+        :raises ValueError: for a buffer of another algorithm, of as many environments as this agent has not, or of
+            observations or actions of another shape
         """
         given = self.replay_buffer
         super().load_replay_buffer(path, truncate_last_traj)
         loaded = self.replay_buffer
-        n_envs = getattr(loaded, "n_envs", None)
-        if isinstance(loaded, SignalReplay) and n_envs == self.n_envs:
+        needed = self.n_envs, get_obs_shape(self.observation_space), get_action_dim(self.action_space)
+        held = getattr(loaded, "n_envs", None), getattr(loaded, "obs_shape", None), getattr(loaded, "action_dim", None)
+        if isinstance(loaded, SignalReplay) and held == needed:
+            loaded.history = self.memory_history
             return
         self.replay_buffer = given
+        shapes = "{} environments, observations of {} and {} actions".format
         raise ValueError(
-            f"{path} holds a {type(loaded).__name__} of {n_envs} environments: this agent, of {self.n_envs}, needs "
-            "what save_replay_buffer of such an ActPC has written"
+            f"{path} holds a {type(loaded).__name__} of {shapes(*held)}: this agent, of {shapes(*needed)}, needs what "
+            "save_replay_buffer of such an ActPC has written"
         )
 
     def save_weights(self, path: str | PathLike[str]) -> Path:
@@ -1308,6 +1352,7 @@ class ActPC(OffPolicyAlgorithm):
     def _excluded_save_params(self) -> list[str]:
         aliases = ["actor", "critic", "generator", "prior", "actor_target", "critic_target"]
         derived = ["expert", "imitation", "_followed", "diagnostics", "_compiled", "refresh", "cloning"]
+        derived += ["_awaits_parameters", "_steps_at_pause"]
         return [*super()._excluded_save_params(), *aliases, *derived]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:

@@ -52,7 +52,7 @@ def checked(init: Callable[Parameters, None]) -> Callable[Parameters, None]:
     """A constructor that refuses values which its annotations do not allow.
 
     :param init: an ``__init__``; a function (name, value) in an ``Annotated`` raises ValueError for a bad value
-    :return: the same, checked; it names the nearest keyword to one that it does not know
+    :return: the same, checked; it names the nearest keyword to one that it does not know, and takes NumPy's numbers
     """
     signature = inspect.signature(init, eval_str=True)
     known = list(signature.parameters)[1:]
@@ -67,10 +67,18 @@ def checked(init: Callable[Parameters, None]) -> Callable[Parameters, None]:
         given = signature.bind(*args, **kwargs)
         given.apply_defaults()
         for name, value in given.arguments.items():
-            _check(name, value, signature.parameters[name].annotation)
-        init(*args, **kwargs)
+            given.arguments[name] = _plain(value)
+            _check(name, given.arguments[name], signature.parameters[name].annotation)
+        init(*given.args, **given.kwargs)
 
     return checking
+
+
+def _plain(value: Any) -> Any:
+    """Python's own numbers in the place of NumPy's, which SB3 does not take everywhere."""
+    if type(value) is tuple:
+        return tuple(map(_plain, value))
+    return value.item() if isinstance(value, np.generic) else value
 
 
 def check_settings(kind: type, settings: Mapping[str, Any]) -> None:

@@ -144,6 +144,11 @@ class SignalReplay(ReplayBuffer):
             self.self_imitation.store(observations, self.actions[rows, env].astype(np.float32), episode_return)
 
     @property
+    def running_lengths(self) -> np.ndarray:
+        """(n_envs,), steps of the running episodes."""
+        return self._lengths
+
+    @property
     def newest(self) -> int:
         """Row of the newest transitions."""
         return (self.pos - 1) % self.buffer_size
@@ -434,6 +439,11 @@ def combined_buffer_class(
     if given is not None and not (isinstance(given, type) and issubclass(given, ReplayBuffer)):
         raise ValueError(f"replay_buffer_class={given!r} must be None or a subclass of SB3's ReplayBuffer")
     _check_n_steps(n_steps, given)
+    if given is not None and issubclass(given, DictReplayBuffer) != isinstance(observation_space, spaces.Dict):
+        fix = "DictReplayBuffer, HerReplayBuffer" if isinstance(observation_space, spaces.Dict) else "ReplayBuffer"
+        raise ValueError(
+            f"replay_buffer_class={given.__name__} does not keep observations of {observation_space}: use {fix} or None"
+        )
     if given is None and isinstance(observation_space, spaces.Dict):
         return CombinedDictReplayBuffer
     if given is None:

@@ -18,6 +18,7 @@ SMALLEST_GAIN, SMALLEST_NEED = 0.05, 0.1
 SMALL_SHARE = 0.5  # of a feature that is asked for on its own
 CONTEXT = 1e-4  # a share below which there is rounding alone: the feature never changes within an episode, and may be a goal
 MOST_ASKED, MOST_ANSWERING = 1000, 4000  # steps
+MOST_ALONE = 100  # features that are asked for on their own, those that would be left least first: each takes long
 
 
 def feature_weights(features: th.Tensor, actions: th.Tensor, episodes: np.ndarray) -> th.Tensor:
@@ -42,7 +43,7 @@ def feature_weights(features: th.Tensor, actions: th.Tensor, episodes: np.ndarra
     smallest = error(weights)
     if smallest >= (1.0 - SMALLEST_GAIN) * error(as_it_is):
         return as_it_is
-    for feature in weights.argsort().tolist():
+    for feature in weights.argsort().tolist()[:MOST_ALONE]:
         if weights[feature] < SMALL_SHARE:
             needed = weights.index_fill(0, th.tensor(feature, device=weights.device), 1.0)
             if (with_it := error(needed)) < (1.0 - SMALLEST_NEED) * smallest:

@@ -12,6 +12,7 @@ import pytest
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback, StopTrainingOnMaxEpisodes
 from stable_baselines3.common.env_checker import check_env
+from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import BitFlippingEnv
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.noise import NormalActionNoise
@@ -1277,6 +1278,15 @@ def test_hindsight_learns_from_the_first_episode_that_has_ended():
     assert 0 < model._n_updates <= 15
 
 
+def test_hindsight_that_waits_for_an_episode_to_end_says_so(monkeypatch):
+    monkeypatch.setattr(actpc_module, "ENDLESS", 30)
+    env = BitFlippingEnv(n_bits=6, continuous=True, max_steps=1000)
+    model = ActPC("MultiInputPolicy", env, **plain(replay_buffer_class=HerReplayBuffer, learning_starts=0))
+    with pytest.warns(UserWarning, match="gone on for 30 steps: hindsight learns from episodes that have ended, so") as said:
+        model.learn(70)
+    assert len([one for one in said if "gone on" in str(one.message)]) == 1 and model._n_updates == 0
+
+
 @pytest.mark.parametrize("delay", [1, 2, 3, 100, 250])
 def test_what_is_measured_is_an_update_of_the_actor_once_in_a_hundred_or_a_few_more(delay):
     measured, diagnostics = [], Diagnostics(make().policy)
@@ -1361,6 +1371,29 @@ def test_an_interrupt_cuts_the_episode_too():
     steps = np.round(buffer.observations[: buffer.pos, 0, 1] * 11)
     followed = np.round(buffer.next_observations[: buffer.pos, 0, 1] * 11)
     assert np.array_equal(followed, steps + 1) and set(buffer.self_imitation.lengths) == {5}
+
+
+@pytest.mark.parametrize("more_steps", [0, 2])
+def test_who_plays_in_the_training_environment_between_two_runs_cuts_the_episode(more_steps):
+    """It is another episode that would go on, even where it is as long by then: of two steps."""
+    model = make(make_vec_env(Paying), learning_starts=0, policy_kwargs={"habit": True})
+    model.learn(7)
+    evaluate_policy(model, model.get_env(), 1)
+    for _ in range(more_steps):
+        model.get_env().step(np.zeros((1, 2), np.float32))
+    model.learn(20, reset_num_timesteps=False)
+    buffer, trials = model.replay_buffer, model.trials
+    followed = np.round((buffer.next_observations - buffer.observations)[: buffer.pos, 0, :2] * [7, 11])
+    assert buffer.pos == 27
+    assert set(buffer.self_imitation.lengths) == {5} and set(trials.noisy_returns) | set(trials.habit_returns) == {5.0}
+    assert np.array_equal(followed, np.tile([0, 1], (27, 1)))
+
+
+def test_an_episode_goes_on_where_nobody_has_played_in_between():
+    model = make(make_vec_env(Paying), learning_starts=0)
+    for _ in range(3):
+        model.learn(3, reset_num_timesteps=False)
+    assert model.replay_buffer.dones[:9, 0].tolist() == [0, 0, 0, 0, 1, 0, 0, 0, 0]
 
 
 def test_vec_normalize_relabels_the_task_reward_alone():

@@ -9,6 +9,7 @@ import torch as th
 from scipy.stats import linregress, norm
 from stable_baselines3.common.vec_env import DummyVecEnv
 
+from sb3_actpc import ActPC
 from sb3_actpc.actpc.calibration import DOUBT, ENOUGH, FEWEST, WINDOW, Calibration, Step
 from sb3_actpc.actpc.trust_region import FALL, FIRST_MULTIPLIER, RISE, TrustRegion
 from tests.actpc.agents import imitating
@@ -112,6 +113,17 @@ def test_the_region_is_as_wide_as_the_critic_is_trusted(trust, change):
     actions = th.full((4, 2), 0.5**0.5)
     region.regulate(actions, th.zeros(4, 2), th.ones(4))
     assert float(region.multiplier / FIRST_MULTIPLIER) == pytest.approx(exp(change), rel=1e-4)
+
+
+def test_a_loaded_agents_critic_is_trusted_as_it_was(tmp_path):
+    """It is the same critic; other parameters that are given to an agent are another one's."""
+    model = imitating(exploration_noise=0.5).learn(100)
+    model.save(tmp_path / "agent")
+    known = model.calibration.n
+    loaded = ActPC.load(tmp_path / "agent", env=model.env)
+    assert loaded.calibration.n == known > 0.0
+    loaded.set_parameters(model.get_parameters())
+    assert loaded.calibration.n == 0.0
 
 
 def test_trust_is_not_in_the_parameters():

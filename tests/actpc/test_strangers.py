@@ -6,13 +6,14 @@ import pytest
 import torch as th
 from gymnasium.wrappers import TimeLimit
 from stable_baselines3 import TD3
+from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
 from sb3_actpc import ActPC
 from sb3_actpc.actpc.policies import ActPCPolicy, ObservationNormalizer
 from sb3_actpc.utils.tasks import task_id
-from tests.actpc.agents import QUICK, imitating, make
+from tests.actpc.agents import QUICK, SMALL, imitating, make
 from tests.actpc.envs import CountingEnv, demonstrations
 
 # ---------------------------------------------------------------------- units
@@ -251,6 +252,68 @@ def test_buffers_of_others_are_refused(tmp_path):
     model.save_replay_buffer(tmp_path / "own")
     model.load_replay_buffer(tmp_path / "own")
     assert model.replay_buffer is not mine and model.replay_buffer.pos == 12
+    pendulum = ActPC("MlpPolicy", "Pendulum-v1", policy_kwargs={"net_arch": [4]})
+    with pytest.raises(ValueError, match=r"observations of \(3,\) and 2 actions: this agent, of .* and 1 actions"):
+        pendulum.load_replay_buffer(tmp_path / "own")
+
+
+def test_a_buffer_remembers_as_much_as_the_agent_that_loads_it(tmp_path):
+    model = make().learn(12)
+    model.save_replay_buffer(tmp_path / "own")
+    remembers = make(policy_kwargs={"memory_history": 3})
+    remembers.load_replay_buffer(tmp_path / "own")
+    remembers.learn(20, reset_num_timesteps=False)
+    assert remembers.replay_buffer.history == 3 and remembers.replay_buffer.sample(4).history.shape == (4, 3, 3)
+
+
+def test_numpys_numbers_are_numbers():
+    settings = {"seed": np.int64(3), "learning_rate": np.float32(1e-3), "gamma": np.float64(0.9)}
+    model = make(train_freq=np.int64(2), stats_window_size=np.int64(5), **settings).learn(15)
+    assert model.num_timesteps == 16 and model._n_updates > 0
+    assert [type(getattr(model, name)) for name in settings] == [int, float, float]
+    assert make(train_freq=(np.int64(2), "episode")).learn(15).train_freq.frequency == 2
+
+
+@pytest.mark.parametrize("kind", ["ReplayBuffer", "NStepReplayBuffer", "DictReplayBuffer", "HerReplayBuffer"])
+@pytest.mark.parametrize("dict_observations", [False, True])
+def test_a_buffer_must_fit_the_observations(kind, dict_observations):
+    env = CountingEnv(dict_observations=dict_observations)
+    fits = dict_observations == (kind in ("DictReplayBuffer", "HerReplayBuffer"))
+    policy = "MultiInputPolicy" if dict_observations else "MlpPolicy"
+    if fits and kind != "HerReplayBuffer":
+        assert ActPC(policy, env, replay_buffer_class=kind, **SMALL).learn(15).replay_buffer.pos == 15
+        return
+    use = "DictReplayBuffer, HerReplayBuffer" if dict_observations else "ReplayBuffer"
+    wrong = "goals" if fits else f"replay_buffer_class={kind} does not keep observations of .*: use {use} or None"
+    with pytest.raises(ValueError, match=wrong):
+        ActPC(policy, env, replay_buffer_class=kind, **SMALL)
+
+
+def test_noise_of_several_environments_is_that_of_one_in_another_number_of_them(tmp_path):
+    noise = NormalActionNoise(np.zeros(2), np.ones(2))
+    make(n_envs=2, action_noise=noise).learn(20).save(tmp_path / "agent")
+    for n_envs in (1, 3):
+        loaded = ActPC.load(tmp_path / "agent", env=DummyVecEnv([CountingEnv] * n_envs)).learn(30)
+        assert loaded.num_timesteps == 30 and getattr(loaded.action_noise, "n_envs", 1) == n_envs
+
+
+def test_the_keywords_of_an_agents_policy_are_those_of_the_loaded_one(tmp_path):
+    """What demonstrations add to them is none that the user has given."""
+    imitating().save(tmp_path / "agent")
+    for given in ({"net_arch": [16, 16]}, {"net_arch": [16, 16], "habit": True}):
+        assert ActPC.load(tmp_path / "agent", policy_kwargs=given).policy.habit
+    for other in ({"net_arch": [16, 16], "habit": False}, {"net_arch": [8]}):
+        with pytest.raises(ValueError, match="policy kwargs do not equal the stored"):
+            ActPC.load(tmp_path / "agent", policy_kwargs=other)
+
+
+def test_a_trained_agent_in_another_task_is_told_that_it_can_do_without_demonstrations(tmp_path):
+    gym.register("OtherCounted-v0", CountingEnv)
+    other = gym.make("OtherCounted-v0", disable_env_checker=True)
+    imitating().learn(10).save(tmp_path / "agent")
+    with pytest.raises(ValueError, match=r"env_id.*A trained agent can do without: demonstrations=None"):
+        ActPC.load(tmp_path / "agent", env=other)
+    assert ActPC.load(tmp_path / "agent", env=other, demonstrations=None).expert is None
 
 
 def test_a_file_of_another_algorithm_is_refused(tmp_path):

@@ -180,6 +180,34 @@ def test_arms_are_weighed_and_neither_gaits_nor_the_reacher_whose_goal_stays_the
     assert bool((feature_weights(features, th.as_tensor(shown.actions), episodes) < 1.0).any()) == is_weighed
 
 
+def test_of_wide_observations_those_that_would_be_left_least_are_asked_for(monkeypatch):
+    """Each takes as long as all together."""
+    asked, data = [], named()
+    names = np.arange(len(data.observations)) // 30
+    features = th.as_tensor(names[:, None] + np.linspace(1.0, 3.0, 9) * np.random.default_rng(0).normal(size=(len(names), 9)))
+    features = features / features.std(0)
+    monkeypatch.setattr(within_episodes, "SMALLEST_GAIN", -1.0)  # taken smaller for nothing
+    monkeypatch.setattr(within_episodes, "SMALL_SHARE", 2.0)
+    monkeypatch.setattr(within_episodes, "MOST_ALONE", 4)
+    monkeypatch.setattr(within_episodes, "error_of_neighbours", lambda weighed, *_: asked.append(weighed) or 1.0)
+    weights = feature_weights(features, th.as_tensor(data.actions), names)
+    alone = [int((one / features)[0].sub(weights).abs().argmax()) for one in asked[2:]]
+    assert alone == weights.argsort().tolist()[:4]
+
+
+def test_a_loaded_agent_does_not_ask_again(tmp_path, monkeypatch):
+    model = imitating(demonstrations=named())
+    model.save(tmp_path / "new")
+    model.learn(10).save(tmp_path / "trained")
+    with monkeypatch.context() as then:
+        then.delattr("sb3_actpc.actpc.actpc.feature_weights")
+        trained = ActPC.load(tmp_path / "trained", env=model.env)
+    assert th.equal(trained.actor.normalizer.scale, model.actor.normalizer.scale)
+    other = dataclasses.replace(named(), observations=3.0 * named().observations)
+    new = ActPC.load(tmp_path / "new", demonstrations=other)  # that has imitated nothing yet
+    assert th.allclose(new.actor.normalizer.scale, model.actor.normalizer.scale / 3.0)
+
+
 def test_weights_of_features_are_kept_in_a_file(tmp_path):
     model = imitating(demonstrations=named())
     path = model.save_weights(tmp_path / "agent")
