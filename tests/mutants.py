@@ -1012,8 +1012,8 @@ MUTANTS = [
     Mutant(
         "no more steps for a stopped run",
         "experiments/runs/run.py",
-        "max(more, 0), is_held=True",
-        "0, is_held=True",
+        "callbacks, more, is_held=True)\n        except",
+        "callbacks, 0, is_held=True)\n        except",
         "tests/cli/test_choices.py -k stopped_run",
     ),
     Mutant(

@@ -82,8 +82,9 @@ def _plain(value: Any) -> Any:
 
 
 def check_settings(kind: type, settings: Mapping[str, Any]) -> None:
-    """ValueError for the first of the settings that a :func:`checked` constructor of a class would refuse."""
-    annotations: dict[str, Any] = {}
+    """ValueError for the first of the settings that a :func:`checked` constructor of a class would refuse, or that SB3's own,
+    which check little, cannot work with."""
+    annotations: dict[str, Any] = dict(OF_SB3)
     for init in constructors(kind):
         if hasattr(init, "__wrapped__"):
             own = inspect.signature(init, eval_str=True).parameters.values()
@@ -190,6 +191,21 @@ def check_actions(space: gym.spaces.Box, noise: ActionNoise | None) -> None:
             f"action_noise has a mean and a sigma of shapes {shapes[0]} and {shapes[1]}, an action has {space.shape}: use "
             f"NormalActionNoise(np.zeros({space.shape}), 0.1 * np.ones({space.shape}))"
         )
+
+
+# keywords of SB3's constructors, as theirs that are not ``checked`` mean them
+OF_SB3: dict[str, Any] = {
+    "learning_rate": Annotated[Any, check_learning_rate],
+    **dict.fromkeys(("buffer_size", "batch_size", "n_steps", "n_epochs", "stats_window_size"), Size),
+    **dict.fromkeys(("policy_delay", "target_update_interval"), Positive),
+    **dict.fromkeys(("gamma", "tau", "gae_lambda"), Share),
+    **dict.fromkeys(("learning_starts", "vf_coef", "max_grad_norm", "target_policy_noise", "target_noise_clip"), Weight),
+    "train_freq": Annotated[Any, check_train_freq],
+    "gradient_steps": Annotated[int, Between(-1)],
+    "target_kl": Annotated[float | None, Between(0)],
+    "use_sde": bool,
+    "tensorboard_log": str | None,
+}
 
 
 # ---------------------------------------------------------------------- of the policy

@@ -2,8 +2,9 @@
 
 import argparse
 import shlex
+import sys
 from collections.abc import Callable, Sequence
-from contextlib import suppress
+from contextlib import closing, suppress
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -78,7 +79,7 @@ def _add_convert(commands: Subparsers) -> None:
     ).add_argument
     add("file", type=Path, metavar="FILE", help=".hdf5 or .npz")
     add("--env", metavar="ID", help=f"task of an .hdf5 file, one of {', '.join(ROBOSUITE_IDS)}")
-    add("--obs", default="paper", metavar="LAYOUT", help="observations, paper or robomimic (default: paper)")
+    add("--obs", metavar="LAYOUT", help="observations, paper or robomimic (default: paper)")
     add("--filter-key", metavar="KEY", help="only robomimic's mask/KEY, such as better or 20_percent")
     add("--output", type=Path, metavar="FILE", help="file to write (default: FILE with the other suffix)")
 
@@ -99,8 +100,14 @@ def _add_download(commands: Subparsers) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
+    from sb3_actpc.checkpoints import EXIT_STOPPED, TrainingStopped
+
     commands = {"collect": _collect, "convert": _convert, "download": _download, "info": _info}
-    return commands[args.demos_command](args)
+    try:
+        return commands[args.demos_command](args)
+    except TrainingStopped as stop:  # of a demonstrator
+        print(f"sb3-actpc: {stop}; the same command goes on with it", file=sys.stderr)
+        return EXIT_STOPPED
 
 
 def _collect(args: argparse.Namespace) -> int:
@@ -115,8 +122,11 @@ def _collect(args: argparse.Namespace) -> int:
         number = getattr(args, option)
         if number is not None and number < 1:
             raise ValueError(f"--{option.replace('_', '-')} {number} must be at least 1")
+    output = args.output or _default_output(args.env)
+    if output.is_dir():
+        raise IsADirectoryError(f"--output {output} is a folder: give the file in it, such as {output / 'demos.npz'}")
     demonstrations = _collect_scripted(args) if demonstrator == "scripted" else _collect_trained(args)
-    return _save(demonstrations, args.output or _default_output(args.env))
+    return _save(demonstrations, output)
 
 
 def _default_output(env_id: str, suffix: str = "") -> Path:
@@ -154,7 +164,11 @@ def _collect_scripted(args: argparse.Namespace) -> "Demonstrations":
 
 
 def _collect_trained(args: argparse.Namespace) -> "Demonstrations":
+    import gymnasium as gym
+
+    from sb3_actpc.demonstrations.rows import box_paths
     from sb3_actpc.experiments import demonstrators
+    from sb3_actpc.experiments.runs.environments import check_env_id, make_env
 
     target = args.target_return
     if args.quality is not None:
@@ -166,6 +180,11 @@ def _collect_trained(args: argparse.Namespace) -> "Demonstrations":
     options = {"seed": args.seed, "n_envs": args.n_envs, "eval_freq": args.save_every, "progress": False}
     run = demonstrators.demonstrator_run(args.env, args.algo, args.steps, target, args.gym_packages, **options)
     folder = args.work_dir or Path("demonstrators") / f"{folder_name(run.env)}_{args.algo}_{args.seed}"
+    check_env_id(run.env, run.gym_packages)
+    with closing(make_env(run.env, {})) as env:  # before anybody is trained in it
+        if not isinstance(env.action_space, gym.spaces.Box):
+            raise ValueError(f"{run.env}: demonstrations need a Box action space, found {env.action_space}")
+        box_paths(env.observation_space)
     _report(f"demonstrator: {args.algo} on {run.env} for {run.n_timesteps} steps at most, in {folder}")
     if args.mixed:
         trained = demonstrators.train_mixed(run, folder, _report)
@@ -204,11 +223,19 @@ def command_line(args: argparse.Namespace, options: Sequence[str]) -> str:
 def _convert(args: argparse.Namespace) -> int:
     from sb3_actpc.demonstrations import Demonstrations, write_robomimic
 
-    if args.file.suffix != ".npz":
-        return _save(_read_hdf5(args), args.output or args.file.with_suffix(".npz"))
-    output = args.output or args.file.with_suffix(".hdf5")
+    is_npz = args.file.suffix == ".npz"
+    output = args.output or args.file.with_suffix(".hdf5" if is_npz else ".npz")
+    if output.resolve() == args.file.resolve() or (args.output is None and output.exists()):
+        raise FileExistsError(f"{output} is there already: give another --output, what it holds may be more")
+    if not is_npz:
+        if output.suffix != ".npz":
+            raise ValueError(f"--output {output} must end in .npz")
+        return _save(_read_hdf5(args), output)
     if output.suffix not in HDF5_SUFFIXES:
         raise ValueError(f"--output {output} must end in {' or '.join(HDF5_SUFFIXES)}: it will be a robomimic file")
+    for option in ("env", "obs", "filter_key"):
+        if getattr(args, option) is not None:
+            raise ValueError(f"--{option.replace('_', '-')} is for HDF5 files: leave it out, {args.file} is written as it is")
     return _save(Demonstrations.load(args.file), output, write_robomimic)
 
 
@@ -221,10 +248,10 @@ def _read_hdf5(args: argparse.Namespace) -> "Demonstrations":
     with open_hdf5(args.file) as data:
         is_robomimic = "env_args" in data.attrs
     if is_robomimic:
-        return read_robomimic(args.file, args.env, args.obs, args.filter_key)
+        return read_robomimic(args.file, args.env, args.obs or "paper", args.filter_key)
     if args.filter_key is not None:
         raise ValueError(f"--filter-key {args.filter_key}: {args.file} is not a robomimic file and has no masks; leave it out")
-    return read_robosuite(args.file, args.env, args.obs)
+    return read_robosuite(args.file, args.env, args.obs or "paper")
 
 
 def _download(args: argparse.Namespace) -> int:

@@ -55,6 +55,9 @@ def write_minari(
 ) -> Any:
     """The ``minari.MinariDataset`` of the columns of each episode, with further metadata; for the rest see
     ``Demonstrations.to_minari``."""
+    images = [space for space in _boxes(observation_space) if space.dtype == np.uint8 and len(space.shape) == 3]
+    if images:
+        raise ValueError(f"Minari stores images such as {images[0]} as JPEG, which changes them: keep them with save(path)")
     dataset = import_extra("minari", "minari").create_dataset_from_buffers(
         dataset_id,
         [episode_buffer(episode, observation_space, action_space) for episode in episodes],
@@ -65,6 +68,14 @@ def write_minari(
     )
     dataset.storage.update_metadata({**metadata, "observation_keys": box_paths(observation_space)})
     return dataset
+
+
+def _boxes(space: spaces.Space[Any]) -> list[spaces.Box]:
+    """The Boxes in a space of such."""
+    if isinstance(space, spaces.Dict | spaces.Tuple):
+        parts = space.values() if isinstance(space, spaces.Dict) else space
+        return [box for part in parts for box in _boxes(part)]
+    return [space] if isinstance(space, spaces.Box) else []
 
 
 def episode_buffer(episode: dict[str, Any], observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> Any:

@@ -49,6 +49,8 @@ def record_episodes(
         raise ValueError(f"n_episodes={n_episodes} must be at least 1: give the number of demonstrated episodes")
     if not isinstance(env.action_space, spaces.Box):
         raise ValueError(f"demonstrations need a Box action space, found {env.action_space}")
+    if not demonstrators:
+        raise ValueError("demonstrator=[] must be at least one: an object with predict, or a function of the observation")
     max_tries = 10 * n_episodes if max_tries is None else max_tries
     actors = [_actor(demonstrator, deterministic) for demonstrator in demonstrators]
     episodes: list[Columns] = []

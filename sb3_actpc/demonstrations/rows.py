@@ -79,7 +79,10 @@ def transition_columns(rows: np.ndarray, actions: Any, where: str) -> dict[str, 
 def whole_columns(episode: Mapping[str, Any], known: Sequence[str], source: str) -> dict[str, Any]:
     """An episode's columns, with those that may be left out (see ``Demonstrations.from_episodes``); ValueError when another
     one is missing or unknown, when there are no steps, or not as many in every column."""
-    columns = {name: column for name, column in episode.items() if column is not None}
+    if not isinstance(episode, Mapping):
+        found = f"a {type(episode).__name__}"
+        raise field_error(source, "episodes", "a sequence of dictionaries, one of each episode", found)
+    columns = {name: _array(column, name, source) for name, column in episode.items() if column is not None}
     for name in columns.keys() - set(known):
         raise field_error(source, name, f"one of {', '.join(known)}", "a column of this name")
     for name in ("observations", "actions", "rewards"):
@@ -95,6 +98,23 @@ def whole_columns(episode: Mapping[str, Any], known: Sequence[str], source: str)
         if len(column) != n:
             raise field_error(source, name, f"{n} rows, as the episode has actions", f"{len(column)}")
     return {"terminations": np.zeros(n, dtype=bool), **columns}
+
+
+def _array(column: Any, name: str, source: str) -> np.ndarray:
+    """A column as an array with a row for each step."""
+    wanted = "an array with a row for each step"
+    if isinstance(column, Mapping):
+        flatten = "np.array([gymnasium.spaces.flatten(space, one) for one in ...])"
+        raise field_error(source, name, wanted, f"a dictionary: flatten it, as {flatten}")
+    if isinstance(column, np.ma.MaskedArray):
+        raise field_error(source, name, wanted, "a masked array, of which nobody knows what the masked rows are: fill them")
+    try:
+        rows = np.asarray(column)
+    except ValueError as error:
+        raise field_error(source, name, "rows of one size", " ".join(str(error).split())) from None
+    if not rows.ndim:
+        raise field_error(source, name, wanted, f"{column!r}")
+    return rows
 
 
 def unchained_indices(observations: np.ndarray, next_observations: np.ndarray, episode_starts: np.ndarray) -> np.ndarray:

@@ -16,6 +16,7 @@ from sb3_actpc.demonstrations.recording import Report, silent
 from sb3_actpc.envs import ROBOSUITE_IDS, SPARSE_MUJOCO_IDS, dense_env_id, sparse_env_id
 from sb3_actpc.experiments.runs.environments import check_env_id
 from sb3_actpc.experiments.runs.evaluation import Predictor
+from sb3_actpc.experiments.runs.record import read_run
 from sb3_actpc.experiments.runs.run import finish_run, load_run
 from sb3_actpc.experiments.runs.schema import Run
 from sb3_actpc.utils.files import folder_lock
@@ -87,8 +88,22 @@ def train_demonstrator(run: Run, folder: Path, report: Report = silent) -> Demon
     """Train a demonstrator (see :func:`demonstrator_run`), go on with a training that was stopped, or take the one that is
     there: the agent of the best evaluation."""
     with folder_lock(folder):
+        _check_no_longer(folder, run)
         result = finish_run(run.model_copy(update={"output": str(folder)}), report)
     return Demonstrator(load_run(folder)[1], result["timesteps"], result["dense_return"])
+
+
+def _check_no_longer(folder: Path, run: Run) -> None:
+    """:raises ValueError: where the training that is there had more steps, and may have made a better demonstrator"""
+    try:
+        stored = read_run(folder).n_timesteps or 0
+    except (FileNotFoundError, ValueError):  # none is there, or a damaged one, which is begun anew
+        return
+    if stored > (run.n_timesteps or 0):
+        raise ValueError(
+            f"{folder} holds a training of {stored} steps, not of {run.n_timesteps}: remove it, choose another --work-dir, or "
+            f"say --steps {stored}"
+        )
 
 
 def train_mixed(run: Run, folder: Path, report: Report = silent) -> list[Demonstrator]:

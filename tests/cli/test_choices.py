@@ -188,6 +188,25 @@ def test_a_finished_run_without_a_checkpoint_says_so(capsys: pytest.CaptureFixtu
     assert "kept no checkpoint to go on from" in capsys.readouterr().err
 
 
+def test_a_stopped_run_without_a_checkpoint_is_not_begun_anew_in_its_place(capsys: pytest.CaptureFixture[str]) -> None:
+    """Unless it has nothing to lose."""
+    assert train("--demonstrations", "none", "--steps", "20", "--checkpoint-freq", "0", "--output", "mine") == 0
+    Path("mine/result.json").unlink()  # it was stopped
+    kept = {name: Path("mine", name).read_bytes() for name in ("progress.csv", "model.zip", "episodes.csv")}
+    assert main(["train", "--resume", "mine", "--no-progress"]) == 2
+    assert "has evaluations but no checkpoint to go on from, and would begin anew" in capsys.readouterr().err
+    assert {name: Path("mine", name).read_bytes() for name in kept} == kept
+    rows = Path("mine/progress.csv").read_text(encoding="utf-8").splitlines(keepends=True)
+    Path("mine/progress.csv").write_text("".join(rows[:2]), encoding="utf-8")
+    assert main(["train", "--resume", "mine", "--no-progress"]) == 0
+
+
+@pytest.mark.parametrize("reward", ["nan", "inf"])
+def test_a_dense_reward_that_is_no_number_is_the_environments(reward: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert train("--demonstrations", "none", "--steps", "20", "--env-kwarg", f"gain=.{reward}", "--output", "mine") == 2
+    assert f"environment: info['dense_reward'] is {reward}: check the environment" in capsys.readouterr().err
+
+
 def test_a_finished_run_whose_checkpoint_is_damaged_stays_finished(capsys: pytest.CaptureFixture[str]) -> None:
     assert train("--demonstrations", "none", "--steps", "20", "--output", "mine") == 0
     kept = {name: Path("mine", name).read_bytes() for name in ("config.json", "result.json")}

@@ -601,6 +601,16 @@ class TestMinari:
         assert dataset.recover_environment().spec.id == "Pendulum-v1"
         assert Demonstrations.from_minari(dataset).env_id == "Pendulum-v1"
 
+    def test_images_which_it_would_change_are_refused(self) -> None:
+        images = spaces.Box(0, 255, (4, 4, 3), np.uint8)
+        env: Any = gym.Env()
+        env.observation_space = spaces.Dict({"camera": images, "joints": spaces.Box(-1, 1, (2,))})
+        env.action_space = spaces.Box(-9, 9, (ACTION_DIM,))
+        seen = np.zeros((N, 50), dtype=np.float32)
+        shown = make_demonstrations(observations=seen, next_observations=seen)
+        with pytest.raises(ValueError, match=r"Minari stores images such as Box\(0, 255, .*: keep them with save"):
+            shown.to_minari("tiny/images-v0", env)
+
     def test_truncation_and_termination_are_told_apart(self) -> None:
         dataset = make_demonstrations().to_minari("tiny/ends-v0")
         ends = [(bool(episode.terminations[-1]), bool(episode.truncations[-1])) for episode in dataset.iterate_episodes()]
@@ -757,12 +767,25 @@ def test_an_episode_of_ones_own_arrays() -> None:
         ({"rewards": np.ones(2)}, "'rewards': expected 3 rows, as the episode has actions, found 2"),
         ({"terminations": np.zeros(4)}, "'terminations': expected 3 rows, as the episode has actions, found 4"),
         ({"observations": np.zeros((1, 2)), "actions": np.zeros((0, 1)), "rewards": np.ones(0)}, "found an episode of none"),
+        ({"rewards": 1.0}, "'rewards': expected an array with a row for each step, found 1.0"),
+        ({"observations": {"a": np.zeros((4, 2))}}, r"'observations': .* found a dictionary: flatten it, as .*spaces.flatten"),
+        ({"rewards": np.ma.array(np.ones(3), mask=[0, 1, 0])}, "'rewards': .* found a masked array"),
+        ({"observations": [[0.0, 1.0], [0.0]]}, "'observations': expected rows of one size"),
     ],
 )
 def test_columns_that_are_missing_or_do_not_fit_are_named(change: dict[str, Any], named: str) -> None:
     one = {"observations": np.zeros((4, 2)), "actions": np.zeros((3, 1)), "rewards": np.ones(3), **change}
     with pytest.raises(ValueError, match=named):
         Demonstrations.from_episodes([one], "Mine-v0")
+
+
+def test_what_is_no_sequence_of_episodes_says_so() -> None:
+    one: Any = {"observations": np.zeros((4, 2)), "actions": np.zeros((3, 1)), "rewards": np.ones(3)}
+    for given, named in ((one, "found a dictionary: put it in a list"), ([[1.0]], "found a list"), ([], "found none")):
+        with pytest.raises(ValueError, match=named):
+            Demonstrations.from_episodes(given, "Mine-v0")
+    with pytest.raises(ValueError, match=r"'metadata': expected a dictionary, found \[1\]"):
+        Demonstrations.from_episodes([one], "Mine-v0", metadata=[1])  # type: ignore[arg-type]
 
 
 def test_what_is_no_file_is_not_printed_whole(tmp_path: Path) -> None:

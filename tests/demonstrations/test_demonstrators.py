@@ -11,6 +11,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
+from sb3_actpc.checkpoints import EXIT_STOPPED, TrainingStopped
 from sb3_actpc.cli import demos
 from sb3_actpc.demonstrations import Demonstrations, shipped_demonstrations
 from sb3_actpc.envs import SPARSE_MUJOCO_IDS
@@ -121,6 +122,14 @@ def test_a_folder_of_another_target_is_refused(is_finished: bool, tmp_path: Path
     for target in (-1e8, None):
         with pytest.raises(ValueError, match=rf"another run, with target_return=-1000000000.0 and not {target}: .*--work-dir"):
             train_demonstrator(short_run(target_return=target), tmp_path)
+
+
+def test_a_folder_of_a_longer_training_is_refused(tmp_path: Path) -> None:
+    """It would be recorded as the shorter one."""
+    train_demonstrator(short_run(), tmp_path)
+    shorter = short_run(n_timesteps=64)
+    with pytest.raises(ValueError, match=r"holds a training of 128 steps, not of 64: .*--work-dir, or say --steps 128"):
+        train_demonstrator(shorter, tmp_path)
 
 
 def test_a_mixed_set_is_by_a_demonstrator_and_itself_at_half_the_return(
@@ -279,11 +288,26 @@ class TestCommand:
             (["--episodes", "0"], "--episodes 0 must be at least 1"),
             (["--env", "SparseLift-v0", "--episodes", "0"], "--episodes 0 must be at least 1"),
             (["--max-tries", "-1"], "--max-tries -1 must be at least 1"),
+            (["--env", "CartPole-v1"], "CartPole-v1: demonstrations need a Box action space, found Discrete"),
         ],
     )
     def test_options_that_do_not_go_together_are_named(self, words: list[str], message: str) -> None:
         with pytest.raises(ValueError, match=message):
             run_demos("collect", "--env", "SparseHopper-v5", *words)
+
+    def test_what_cannot_be_written_is_said_before_anybody_is_trained(self, tmp_path: Path) -> None:
+        with pytest.raises(IsADirectoryError, match=r"is a folder: give the file in it, such as .*demos\.npz"):
+            run_demos("collect", "--env", "SparseHopper-v5", "--output", str(tmp_path))
+
+    def test_a_training_that_is_stopped_says_how_to_go_on(
+        self, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        def stop(*_: Any) -> None:
+            raise TrainingStopped("SIGTERM", 500, "somewhere")
+
+        monkeypatch.setattr(demonstrators, "train_demonstrator", stop)
+        assert run_demos("collect", "--env", "SparseHopper-v5") == EXIT_STOPPED
+        assert "SIGTERM at step 500, saved in somewhere; the same command goes on with it" in capsys.readouterr().err
 
     def test_an_unknown_task_and_a_missing_file_are_named(self, tmp_path: Path) -> None:
         with pytest.raises(gym.error.Error, match="SparseAnt"):

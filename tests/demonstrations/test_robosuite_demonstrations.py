@@ -291,8 +291,33 @@ def test_convert_goes_both_ways(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert main(["demos", "convert", str(tmp_path / "a.npz")]) == 0
     assert main(["demos", "convert", str(tmp_path / "a.hdf5"), "--env", LIFT, "--output", str(tmp_path / "b.npz")]) == 0
     assert_equal(Demonstrations.load(tmp_path / "b.npz"), original, atol=2e-6)
-    assert main(["demos", "convert", str(tmp_path / "a.hdf5")]) == 2
+    assert main(["demos", "convert", str(tmp_path / "a.hdf5"), "--output", str(tmp_path / "c.npz")]) == 2
     assert "--env is needed" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (["a.npz", "--output", "a.npz"], "a.npz is there already: give another --output"),
+        (["a.hdf5", "--env", LIFT], "a.npz is there already: give another --output"),
+        (["a.npz"], "a.hdf5 is there already: give another --output"),
+        (["a.hdf5", "--env", LIFT, "--output", "b.hdf5"], "--output b.hdf5 must end in .npz"),
+        (["a.npz", "--output", "b.npz"], "--output b.npz must end in .hdf5 or .h5"),
+        (["a.npz", "--output", "b.hdf5", "--filter-key", "better"], "--filter-key is for HDF5 files"),
+        (["a.npz", "--output", "b.hdf5", "--obs", "paper"], "--obs is for HDF5 files"),
+    ],
+)
+def test_convert_overwrites_nothing_and_ignores_nothing(
+    arguments: list[str], named: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """What is read holds more than what is written: dense rewards, the simulator's states, masks."""
+    monkeypatch.chdir(tmp_path)
+    made_up(LIFT).save("a.npz")
+    assert main(["demos", "convert", "a.npz"]) == 0
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    assert main(["demos", "convert", *arguments]) == 2
+    assert named in capsys.readouterr().err
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
 def test_a_robomimic_file_in_the_place_of_an_npz_is_recognised(lift_file: Path) -> None:

@@ -1,6 +1,7 @@
 """What a run is, from text to JSON: the same numbers whoever reads them, and mistakes that are named."""
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +44,12 @@ def test_numbers_of_a_comparisons_file_are_numbers() -> None:
     ]  # fmt: skip
 
 
+def test_a_key_that_is_given_twice_is_named_and_one_that_is_merged_is_not() -> None:
+    with pytest.raises(ValueError, match=r"mine\.yml: .*'steps' is given twice"):
+        read_yaml("{envs: [{env: SparseReacher-v5, steps: 10, steps: 20}]}", "mine.yml")
+    assert read_yaml("a: &a {b: 1, c: 2}\nd: {<<: *a, b: 3}", "")["d"] == {"b": 3, "c": 2}
+
+
 @pytest.mark.parametrize(
     ("given", "message"),
     [
@@ -65,6 +72,26 @@ def test_mistakes_are_named_in_one_line(given: dict[str, Any], message: str) -> 
     with pytest.raises(ValueError) as caught:
         Run(**given)
     assert message in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("algo", "settings", "message"),
+    [
+        ("td3", {"batch_size": 100.0}, "batch_size=100.0 must be a whole number"),
+        ("td3", {"batch_size": 0}, "batch_size=0 must be between 1 and"),
+        ("td3", {"gamma": None}, "gamma=None must be a finite number"),
+        ("td3", {"policy_delay": 0}, "policy_delay=0 must be at least 1"),
+        ("td3", {"train_freq": 0}, "train_freq=0 must be a whole number"),
+        ("td3", {"learning_starts": "abc"}, "learning_starts='abc' must be a finite number"),
+        ("ppo", {"gae_lambda": 2.0}, "gae_lambda=2.0 must be between 0 and 1"),
+        ("ppo", {"use_sde": "abc"}, "use_sde='abc' must be True or False"),
+        ("trpo", {"target_kl": "abc"}, "target_kl='abc' must be a finite number"),
+        ("td3", {"normalize": {"clip_obs": "abc"}}, "normalize.clip_obs='abc' must be a finite number"),
+    ],
+)
+def test_settings_of_sb3s_algorithms_are_checked_before_they_run(algo: str, settings: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(message)):
+        resolve(Run(env="Pendulum-v1", algo=algo, demonstrations="none", n_timesteps=100, settings=settings))
 
 
 def test_an_unknown_algorithm_is_named_in_python_too() -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from sb3_actpc.experiments.runs import ALGORITHMS, Run
-from sb3_actpc.experiments.runs.presets import read_yaml
+from sb3_actpc.experiments.runs.presets import CAN_BE_NONE, read_yaml
 from sb3_actpc.experiments.runs.schema import merged
 from sb3_actpc.utils.checks import nearest
 
@@ -59,7 +59,7 @@ def part_of_run(entry: Mapping[str, Any], also: Sequence[str] = (), elsewhere: S
             )
         if key not in known:
             raise ValueError(f"unknown key {key!r}{nearest(key, known)}: expected some of {', '.join(known)}")
-    return Run(**entry)
+    return Run(**{key: value for key, value in entry.items() if value is not None or key in CAN_BE_NONE})
 
 
 def ablation_variants() -> list[Run]:

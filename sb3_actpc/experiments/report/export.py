@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from sb3_actpc.experiments.report.figures import draw_curves
-from sb3_actpc.experiments.report.results import CURVES, SETTINGS, load_results, write_runs
+from sb3_actpc.experiments.report.results import CURVES, SETTINGS, load_results, run_folders, write_runs
 from sb3_actpc.experiments.runs.record import CONFIG, read_config
 from sb3_actpc.experiments.runs.schema import content, content_id
 from sb3_actpc.utils.files import atomic_write, folder_name
@@ -22,8 +22,10 @@ def export(folder: Path, target: Path) -> list[Path]:
     results = load_results(folder)
     kept_settings = folder / SETTINGS  # of an export, which has no folders of runs
     settings: dict[str, Any] = json.loads(kept_settings.read_text(encoding="utf-8")) if kept_settings.is_file() else {}
-    for path in sorted(folder.glob(f"*/*/seed[0-9]*_*/{CONFIG}")):
-        config = read_config(path.parent)
+    for path in run_folders(folder):
+        if not (path / CONFIG).is_file():  # it failed before it wrote it
+            continue
+        config = read_config(path)
         settings[content_id(config)] = content(config)
     curves = results.evaluations[["run", *results.evaluations.columns.drop("run")]]
     with atomic_write(target / CURVES) as binary, gzip.GzipFile("", "wb", fileobj=binary, mtime=0) as packed:

@@ -2,6 +2,7 @@
 
 import io
 import math
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from sb3_actpc.experiments.runs.schema import content_id
 from sb3_actpc.utils.files import atomic_write
 
 RUNS, CURVES, SETTINGS = "results.csv", "curves.csv.gz", "settings.json"  # of an export
+RUN_FOLDER = re.compile(r"seed\d+_[0-9a-f]+")
 SETTLED = 5000  # the worst evaluation is looked for from this step on
 # columns of progress.csv -> of episodes.csv
 MEASURES = {"dense_return": "dense_return", "sparse_return": "sparse_return", "success_rate": "success"}
@@ -68,12 +70,13 @@ def side_by_side(rows: pd.DataFrame, runs: pd.Index, index: str, column: str) ->
 
 def read_rows(path: Path) -> pd.DataFrame:
     """The rows of a CSV file of numbers, NaN where empty; none without a file; a last row that was not written to its end
-    is left out."""
+    and others without steps are left out."""
     text = path.read_text(encoding="utf-8") if path.is_file() else ""
     whole = text[: text.rfind("\n") + 1]
-    if not whole:
+    if not whole.strip():
         return pd.DataFrame()
-    return pd.read_csv(io.StringIO(whole), on_bad_lines="skip").apply(pd.to_numeric, errors="coerce")
+    rows = pd.read_csv(io.StringIO(whole), on_bad_lines="skip").apply(pd.to_numeric, errors="coerce")
+    return rows[rows["timesteps"].notna()] if "timesteps" in rows else rows  # damaged ones
 
 
 def load_results(folder: Path) -> Results:
@@ -82,7 +85,7 @@ def load_results(folder: Path) -> Results:
         runs = pd.read_csv(folder / RUNS, index_col="run", dtype=dict.fromkeys(_TEXTS, str))  # else 12e4567890 is a number
         runs[_TEXTS] = runs[_TEXTS].fillna("")
         return Results(_labelled(runs), pd.read_csv(folder / CURVES), _NO_ROWS, _NO_ROWS)
-    found = sorted({path.parent for name in (CONFIG, ERROR) for path in folder.glob(f"*/*/seed[0-9]*_*/{name}")})
+    found = run_folders(folder)
     if not found:
         raise FileNotFoundError(f"no runs in {folder}: make some with sb3-actpc compare --output {folder}")
     names = [path.relative_to(folder).as_posix() for path in found]
@@ -93,6 +96,12 @@ def load_results(folder: Path) -> Results:
         pd.concat([part for part in parts if len(part)] or [_NO_ROWS], ignore_index=True) for parts in named
     )
     return Results(_labelled(runs), evaluations, episodes, diagnostics)
+
+
+def run_folders(folder: Path) -> list[Path]:
+    """Those of the runs of a comparison, begun and finished; copies that somebody has made under other names are left out."""
+    found = {path.parent for name in (CONFIG, ERROR) for path in folder.glob(f"*/*/seed*/{name}")}
+    return sorted(path for path in found if RUN_FOLDER.fullmatch(path.name))
 
 
 def run_measures(task: str, evaluations: pd.DataFrame, episodes: pd.DataFrame) -> dict[str, float]:

@@ -1,6 +1,7 @@
 """``episodes.csv``: every episode of the training, written as it ends."""
 
 import csv
+import math
 import zlib
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -12,6 +13,17 @@ from stable_baselines3.common.callbacks import BaseCallback
 from sb3_actpc.utils.files import atomic_write
 
 EPISODES = "episodes.csv"
+
+
+def dense_reward(info: Mapping[str, Any], otherwise: Any) -> float:
+    """What an environment reports beside the reward that it pays; ``otherwise`` where it reports nothing.
+
+    :raises ValueError: for NaN and infinity, of which no mean could be made
+    """
+    reported = float(info.get("dense_reward", otherwise))
+    if not math.isfinite(reported):
+        raise ValueError(f"environment: info['dense_reward'] is {reported}: check the environment, or report none")
+    return reported
 
 
 class CsvCallback(BaseCallback):
@@ -84,7 +96,7 @@ class EpisodeLog(CsvCallback):
     def _on_step(self) -> bool:
         self.actions = zlib.crc32(np.ascontiguousarray(self.locals["actions"]).tobytes(), self.actions)
         for index, info in enumerate(self.locals["infos"]):
-            self.dense_returns[index] += float(info.get("dense_reward", 0.0))
+            self.dense_returns[index] += dense_reward(info, 0.0)
             if self.locals["dones"][index]:
                 self._end(info, self.dense_returns[index] if "dense_reward" in info else info["episode"]["r"])
                 self.dense_returns[index] = 0.0

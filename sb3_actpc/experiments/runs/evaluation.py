@@ -12,7 +12,7 @@ import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 
-from sb3_actpc.experiments.runs.episode_log import CsvCallback
+from sb3_actpc.experiments.runs.episode_log import CsvCallback, dense_reward
 from sb3_actpc.utils.files import atomic_write
 
 UNTRAINED_EPISODES = 5
@@ -139,7 +139,7 @@ def _play_side_by_side(
         episode_start = np.zeros(len(envs), dtype=bool)
         for i in np.flatnonzero(playing):
             observations[i], reward, terminated, truncated, info = envs[i].step(actions[i])
-            played.dense_returns[first + i] += float(info.get("dense_reward", reward))
+            played.dense_returns[first + i] += dense_reward(info, reward)
             played.sparse_returns[first + i] += float(reward)
             played.successes[first + i] = info.get("is_success", np.nan)
             played.lengths[first + i] += 1
@@ -197,7 +197,7 @@ class EvaluationCallback(CsvCallback):
         super().__init__(folder / PROGRESS)
         self.envs, self.folder, self.seed, self.report = envs, folder, seed, report
         self.eval_freq, self.eval_episodes, self.keeps_best = eval_freq, eval_episodes, keeps_best
-        self.target_return = np.inf if target_return is None else target_return
+        self.target_return = target_return
         self.best_return = -np.inf
         self.evaluation_seconds = 0.0
         self.last_summary: dict[str, float | None] = {}
@@ -240,7 +240,7 @@ class EvaluationCallback(CsvCallback):
         is_last = self.num_timesteps >= self.model._total_timesteps
         if not is_last and self.num_timesteps - self.last_timesteps >= self.eval_freq:
             self._evaluate()
-        return self.best_return < self.target_return
+        return self.target_return is None or self.best_return < self.target_return
 
     def _on_training_end(self) -> None:
         if self.last_timesteps != self.num_timesteps:

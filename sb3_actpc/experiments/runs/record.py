@@ -84,6 +84,14 @@ def is_finished(folder: Path) -> bool:
     return (folder / RESULT).is_file()
 
 
+def has_evaluations(folder: Path) -> bool:
+    """Whether a run has been evaluated after its first step."""
+    try:
+        return bool(_read_evaluations(folder / PROGRESS)[-1]["timesteps"])
+    except (FileNotFoundError, ValueError):
+        return False
+
+
 def read_result(folder: Path) -> dict[str, Any]:
     """The content of ``result.json``; FileNotFoundError when the run is not finished, ValueError when the file is damaged."""
     if not is_finished(folder):

@@ -31,7 +31,15 @@ from sb3_actpc.experiments.runs.presets import (
     resolve,
 )
 from sb3_actpc.experiments.runs.provenance import git_state, package_versions
-from sb3_actpc.experiments.runs.record import CONFIG, RESULT, read_result, read_run, write_config, write_result
+from sb3_actpc.experiments.runs.record import (
+    CONFIG,
+    RESULT,
+    has_evaluations,
+    read_result,
+    read_run,
+    write_config,
+    write_result,
+)
 from sb3_actpc.experiments.runs.schema import Run, content_id
 from sb3_actpc.experiments.runs.summary import plot_learning_curve
 from sb3_actpc.utils.files import LOCK, folder_lock, folder_name
@@ -40,6 +48,7 @@ from sb3_actpc.utils.files import LOCK, folder_lock, folder_name
 EVALUATION_SEED_OFFSET = 1_000_000
 CHECKPOINTS = "checkpoints"  # folder in the run's folder
 DIAGNOSTICS = "diagnostics.csv"  # what the agent logs about itself
+MAY_CHANGE = ("threads", "device", "checkpoint_freq")  # of a run that is gone on with
 
 
 def train_run(
@@ -89,6 +98,11 @@ def resume_run(
         raise ValueError(
             f"the run in {folder} is finished and kept no checkpoint to go on from: train another with more --steps"
         )
+    if not list_bundles(folder / CHECKPOINTS) and has_evaluations(folder):
+        raise ValueError(
+            f"the run in {folder} has evaluations but no checkpoint to go on from, and would begin anew: train in another "
+            "folder, or remove this one"
+        )
     check_env_id(run.env, run.gym_packages)
     if demonstrations_hash(run) != run.demonstrations_sha256:
         raise ValueError(
@@ -114,28 +128,36 @@ def finish_run(run: Run, report: Report = silent, callbacks: Sequence[BaseCallba
     except ValueError as error:
         report(f"{error}: the run starts again")
         (folder / CONFIG).unlink()
-    if stored is not None and _content(stored) != _content(run):
-        raise ValueError(f"{folder} holds another run, of other settings: choose another folder")
-    for name in ("target_return", "keep") if stored is not None else ():
-        old, new = getattr(stored, name), getattr(run, name)
-        if old != new:
-            raise ValueError(
-                f"{folder} holds another run, with {name}={old} and not {new}: remove it, choose another folder (--output; of "
-                f"`demos collect` --work-dir), or give the old {name}"
-            )
-    more = 0 if stored is None else (run.n_timesteps or 0) - (stored.n_timesteps or 0)
+    more = 0
+    if stored is not None:
+        _check_same(stored, run)
+        more = max((run.n_timesteps or 0) - (stored.n_timesteps or 0), 0)
     if stored is not None and (folder / RESULT).is_file():
         result = read_result(folder)
-        if more <= 0 or (run.target_return is not None and result["dense_return"] >= run.target_return):
+        if not more or (run.target_return is not None and result["dense_return"] >= run.target_return):
             return {**result, "folder": str(folder)}
         return resume_run(folder, report, run.progress, callbacks, more, is_held=True)
     if stored is not None and list_bundles(folder / CHECKPOINTS):
+        write_config(stored.model_copy(update={name: getattr(run, name) for name in MAY_CHANGE}))
         try:
-            return resume_run(folder, report, run.progress, callbacks, max(more, 0), is_held=True)
+            return resume_run(folder, report, run.progress, callbacks, more, is_held=True)
         except DamagedCheckpoint as error:
             report(f"{error}: the run starts again")
     shutil.rmtree(folder / CHECKPOINTS, ignore_errors=True)
     return train_run(run, report, callbacks, is_held=True)
+
+
+def _check_same(stored: Run, run: Run) -> None:
+    """:raises ValueError: where the folder holds another run than this one"""
+    if _content(stored) != _content(run):
+        raise ValueError(f"{run.folder} holds another run, of other settings: choose another folder")
+    for name in ("target_return", "keep"):
+        old, new = getattr(stored, name), getattr(run, name)
+        if old != new:
+            raise ValueError(
+                f"{run.folder} holds another run, with {name}={old} and not {new}: remove it, choose another folder "
+                f"(--output; of `demos collect` --work-dir), or give the old {name}"
+            )
 
 
 def _content(run: Run) -> str:

@@ -29,7 +29,7 @@ from sb3_actpc.experiments.comparison.execution import (
 )
 from sb3_actpc.experiments.comparison.schedule import MAX_LOSSES
 from sb3_actpc.experiments.runs import Run
-from sb3_actpc.experiments.runs.record import read_result
+from sb3_actpc.experiments.runs.record import read_result, read_run
 from sb3_actpc.experiments.runs.run import CHECKPOINTS
 from sb3_actpc.utils.files import FolderBusy, folder_lock
 from tests.checkpoints.runs import log_rows
@@ -80,6 +80,14 @@ def test_an_unfinished_run_goes_on_from_its_checkpoint_and_ends_as_the_one_never
     assert "60 steps from step 33" in engine.lines[0]
     assert measured(run) == measured(straight)
     assert [row["timesteps"] for row in measured(run)[1]] == ["8", "16", "24", "32", "40", "48", "56"]
+
+
+def test_a_run_that_goes_on_takes_what_does_not_decide_its_outcome_from_the_command() -> None:
+    [run] = small_runs(OUT)
+    interrupt_after(run, 33)
+    bring_to_end([run.model_copy(update={"threads": 2, "checkpoint_freq": 7})], OUT)
+    stored = read_run(run.folder)
+    assert (stored.threads, stored.checkpoint_freq) == (2, 7)
 
 
 def test_a_truncated_checkpoint_is_passed_over_for_the_one_before() -> None:

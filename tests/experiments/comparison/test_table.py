@@ -112,6 +112,12 @@ def test_variants_and_tasks_of_a_file_have_settings_of_their_own() -> None:
     assert {key: runs[1].settings[key] for key in ("actor_pressure", "gamma")} == {"actor_pressure": 0.0, "gamma": 0.5}
 
 
+def test_what_an_entry_leaves_empty_is_not_said() -> None:
+    """As at the top of a file."""
+    [run] = plan(envs=[{"env": "SparseReacher-v5", "eval_freq": None}], algos=[{"algo": "actpc", "steps": None}], steps=500)
+    assert (run.n_timesteps, run.eval_freq) == (500, 50)
+
+
 def test_what_a_preset_says_can_be_left_out() -> None:
     """In all runs, those of a task, and those of a variant, which otherwise would be another's twin."""
     plain = {"name": "plain", "algo": "ppo", "normalize": False}

@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -243,6 +244,22 @@ def test_a_row_that_was_not_written_to_its_end_is_left_out(tmp_path: Path) -> No
     assert read_rows(tmp_path / "none.csv").empty
     (tmp_path / "empty.csv").touch()
     assert read_rows(tmp_path / "empty.csv").empty
+    (tmp_path / "line.csv").write_text("\n", encoding="utf-8")
+    assert read_rows(tmp_path / "line.csv").empty
+
+
+def test_a_damaged_row_and_a_copy_of_a_run_are_left_out(tmp_path: Path) -> None:
+    for seed in range(2):
+        write_run(tmp_path, seed=seed, final=100.0 * seed)
+    [first] = (tmp_path / HOPPER / "actpc").glob("seed0_*")
+    shutil.copytree(first, first.with_name(f"{first.name}_backup"))
+    shutil.copytree(first, first.with_name("seed0-old_1"))
+    with open(first / "progress.csv", "a", encoding="utf-8") as file:
+        file.write("garbage\n")
+    write_report(tmp_path)
+    markdown = (tmp_path / "report.md").read_text(encoding="utf-8")
+    row = table_row(markdown, "actpc", f"## {HOPPER}")
+    assert (row["seeds"], row["last evaluation: return"]) == ("2", "50.0 ± 70.7")
 
 
 def test_a_task_with_a_namespace_is_reported_by_its_own_name(tmp_path: Path) -> None:
