@@ -284,8 +284,8 @@ class ActPCPolicy(BasePolicy):
     :param habit: keep the best proven actor beside the one that learns (:mod:`sb3_actpc.actpc.habit`), which then has a
         quarter of the schedule's learning rate, or its own
     :param trust_radius: of the first :class:`~sb3_actpc.actpc.trust_region.TrustRegion` around the habit, in variances of the
-        demonstrated actions around their clone (where the habit teaches, as it does where clones guess, of 0.15, and the
-        smallest radius too; where it does not, and clones guess, of 1), 0.1 to 1000; 0 for none: the pressure is fixed
+        demonstrated actions around their clone (where the habit teaches, as it does where clones guess, of 0.15 at least, and
+        the smallest radius too; where it does not, and clones guess, of 1), 0.1 to 1000; 0 for none: the pressure is fixed
     :param features_extractor_class: fixed features extractor (it is never trained)
     :param features_extractor_kwargs: its keywords
     :param normalize_images: divide image observations by 255

@@ -7,7 +7,7 @@ from torch import nn
 
 # of actions in [-1, 1], where demonstrations hardly spread around their clone: for the noise, and as the trust region's unit
 SMALLEST_SPREAD, SMALLEST_UNIT = 0.02, 0.05
-# where the habit holds a learning actor that guesses: about what clones of an arm's episodes miss by on others
+# the smallest where the habit holds a learning actor that guesses: about what clones of an arm's episodes miss by on others
 HELD_UNIT = 0.15
 SMALLEST_VALUE = 1e-6
 DEVIATION_RATE = 0.02  # of the running deviation, per update
@@ -23,7 +23,6 @@ RADIUS_FACTORS = {"accepted": 1.25, "tied": 2.0, "undecided": 1.0, "rejected": 0
 # of the radius's logarithm, where the habit holds the learning actor: for an episode of that one which is paid twice what the
 # habit is, or nothing. Some 250 episodes of a gain of a fifth are a radius ten times as wide
 FOLLOWING_RATE = 0.05
-LARGEST_HELD = HELD_UNIT**-2  # the radius there: half of the actions' range, beyond which nothing is held
 
 
 def spread_of(residuals: th.Tensor) -> th.Tensor:
@@ -40,14 +39,14 @@ class TrustRegion(nn.Module):
 
     The deviation is the mean squared difference of the learning actor's actions from the habit's, in units of the variance
     that the demonstrated actions have around their clone, dimension by dimension. Where the clone guesses between the
-    demonstrations that says little, and the unit is ``HELD_UNIT``; or 1, half of the actions' range, where the habit does not
-    hold the learning actor there. A state counts by what the critic says it is worth, from the batch's worst up: where all is
-    lost nothing is imitated, and refresh alone lets the actor drift there. The multiplier grows slowly while the deviation is
-    below the radius, and falls quickly while it is above. So a set of demonstrations that holds one action for a state allows
-    little, one that holds many allows much; and the radius follows outcomes: it widens with candidates that hold their own,
-    and shrinks with those that do not. Of the radius the critic has what its calibration leaves it (``trust``,
-    :mod:`sb3_actpc.actpc.calibration`): none where it is surely wrong. Where the unit is unknown the multiplier has a
-    bound of its own (``LARGEST_UNHELD``).
+    demonstrations that says little: the unit is ``HELD_UNIT`` at least, and more where demonstrators do now this and now
+    that; or 1, half of the actions' range, where the habit does not hold the learning actor there. A state counts by what the
+    critic says it is worth, from the batch's worst up: where all is lost nothing is imitated, and refresh alone lets the actor
+    drift there. The multiplier grows slowly while the deviation is below the radius, and falls quickly while it is above. So a
+    set of demonstrations that holds one action for a state allows little, one that holds many allows much; and the radius
+    follows outcomes: it widens with candidates that hold their own, and shrinks with those that do not. Of the radius the
+    critic has what its calibration leaves it (``trust``, :mod:`sb3_actpc.actpc.calibration`): none where it is surely wrong.
+    Where the unit is unknown the multiplier has a bound of its own (``LARGEST_UNHELD``).
 
     Where the habit holds the learning actor the radius begins small, and follows every episode of that one in the place of
     verdicts, which are few where clones guess: it widens with what they are paid more than the habit, and shrinks with what
@@ -97,9 +96,9 @@ class TrustRegion(nn.Module):
         :param holds: whether the habit teaches the learning actor
         """
         self.largest.fill_(LARGEST_UNHELD if guesses and not holds else MULTIPLIERS[1])
-        self.unit.copy_(spread.clamp(SMALLEST_UNIT, 1.0))
-        if guesses:
-            self.unit.fill_(HELD_UNIT if holds else 1.0)
+        self.unit.copy_(spread.clamp(HELD_UNIT if guesses else SMALLEST_UNIT, 1.0))
+        if guesses and not holds:
+            self.unit.fill_(1.0)
         self.holds.fill_(float(holds))
 
     def regulate(self, actions: th.Tensor, habit_actions: th.Tensor, values: th.Tensor) -> th.Tensor:
@@ -135,7 +134,8 @@ class TrustRegion(nn.Module):
         """
         if self.holds:
             factor = self._trusted(math.exp(FOLLOWING_RATE * gain))
-            self.radius.mul_(factor).clamp_(self.first_radius, max(self.first_radius, LARGEST_HELD))
+            largest = 1.0 / float(self.unit.square().mean())  # half of the actions' range: beyond it nothing is held
+            self.radius.mul_(factor).clamp_(self.first_radius, max(self.first_radius, largest))
 
     def _trusted(self, factor: float) -> float:
         """Where the critic has little of the radius, outcomes are not its own, and widen it little."""

@@ -138,26 +138,29 @@ def test_clones_that_imitate_between_demonstrations_have_smaller_synapses(apart,
 
 @pytest.mark.parametrize("noise", [None, 0.0])
 @pytest.mark.parametrize(
-    ("apart", "paid", "unit"),
+    ("apart", "paid", "smallest"),
     [
-        (0.08, (1.0, 1.0), None),
-        (0.08, (1.0, 2.0), None),
+        (0.08, (1.0, 1.0), SMALLEST_UNIT),
+        (0.08, (1.0, 2.0), SMALLEST_UNIT),
         (0.12, (1.0, 1.0), HELD_UNIT),
         (0.12, (1.0, 2.0), HELD_UNIT),
         (0.12, (0.0, 0.0), 1.0),
         (0.12, (0.0, -1.0), HELD_UNIT),
     ],
 )
-def test_the_trust_region_counts_by_the_demonstrations_spread_unless_the_clone_guesses_between_them(apart, paid, unit, noise):
+def test_the_trust_region_counts_by_the_demonstrations_spread_unless_the_clone_guesses_between_them(
+    apart, paid, smallest, noise, monkeypatch
+):
     """Then the habit holds the learner, unless nothing was paid."""
+    spread = th.tensor([0.01, 0.4])
+    monkeypatch.setattr("sb3_actpc.actpc.actpc.spread_of", lambda residuals: spread)
     keywords = {"observation_normalization": "none", "refresh_kwargs": {"noise": noise}}
     model = imitating(demonstrations=parallel_lines(apart, paid=paid), **keywords)
-    region, spread = model.policy.trust_region, model.policy.spread
+    region = model.policy.trust_region
     assert region.unit.tolist() == [1.0] * len(spread)
     model.pretrain()
-    expected = np.clip(spread, SMALLEST_UNIT, 1.0) if unit is None else np.full(len(spread), unit)
-    assert region.unit.tolist() == pytest.approx(expected) and (spread < 1.0).all()
-    assert (float(region.largest) == LARGEST_UNHELD) == (unit == 1.0)
+    assert region.unit.tolist() == pytest.approx(np.clip(spread, smallest, 1.0))
+    assert (float(region.largest) == LARGEST_UNHELD) == (smallest == 1.0)
 
 
 @pytest.mark.parametrize(
@@ -215,6 +218,7 @@ def test_where_the_habit_teaches_the_noise_is_as_wide_as_the_region(asked_for, k
     model = imitating(demonstrations=parallel_lines(0.12), exploration_noise=asked_for, **keywords)
     model.learn(1)
     model.policy.spread.fill_(0.02)
+    model.policy.trust_region.measure_by(model.policy.spread, True, model._is_taught)
     assert model._exploration((20_000, 2)).std(0) == pytest.approx([expected] * 2, rel=0.05)
 
 
@@ -243,7 +247,7 @@ def test_whether_the_habit_teaches_is_decided_once_with_the_region(taught, tmp_p
         loaded = ActPC.load(tmp_path / "agent", env=model.env, **changes)
         loaded.learn(20)
         assert loaded._is_taught == taught
-        assert (float(loaded.policy.trust_region.unit[0]) == pytest.approx(HELD_UNIT)) == taught
+        assert bool(loaded.policy.trust_region.holds) == taught
     loaded.actor_pressure = 0.0  # imitation alone is taught by nobody
     assert not loaded.learn(20)._is_taught
 

@@ -10,7 +10,6 @@ from sb3_actpc.actpc.trust_region import (
     FALL,
     FOLLOWING_RATE,
     HELD_UNIT,
-    LARGEST_HELD,
     LARGEST_UNHELD,
     MULTIPLIERS,
     RADII,
@@ -72,11 +71,15 @@ def test_an_unknown_spread_counts_as_one(region):
     assert float(region.deviation) == pytest.approx(0.25 * DEVIATION_RATE)
 
 
-def test_where_the_habit_holds_a_learner_that_guesses_the_unit_is_small_whatever_its_spread():
-    for spread in (0.01, 0.9):
-        region = measured_by([spread] * 2, guesses=True, holds=True)
-        region.regulate(th.full((4, 2), HELD_UNIT), ZEROS, WORTH)
-        assert float(region.deviation) == pytest.approx(DEVIATION_RATE)
+@pytest.mark.parametrize(("spread", "unit"), [(0.01, HELD_UNIT), (0.14, HELD_UNIT), (0.3, 0.3), (1.7, 1.0)])
+def test_where_the_habit_holds_a_learner_that_guesses_the_unit_is_small_unless_demonstrators_do_this_and_that(spread, unit):
+    """The radius comes to half of the actions' range at most, whatever it is counted in."""
+    region = measured_by([spread] * 2, guesses=True, holds=True)
+    region.regulate(th.full((4, 2), unit), ZEROS, WORTH)
+    assert float(region.deviation) == pytest.approx(DEVIATION_RATE)
+    for _ in range(3000):
+        region.follow(1.0)
+    assert float(region.radius) == pytest.approx(unit**-2)
 
 
 def test_the_multiplier_grows_inside_falls_outside_and_rests_on_the_border():
@@ -117,7 +120,7 @@ def test_multiplier_and_radius_stay_within_bounds(make, largest):
             region.regulate(actions, ZEROS, WORTH)
             region.resize(verdict)
             region.follow(gain)
-        smallest, largest_radius = (1.0, LARGEST_HELD) if region.holds else RADII
+        smallest, largest_radius = (1.0, 1.0) if region.holds else RADII
         assert float(region.radius) == pytest.approx(largest_radius if gain > 0 else smallest)
         assert float(region.multiplier) == pytest.approx(multiplier)
 
