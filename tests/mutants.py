@@ -1012,8 +1012,8 @@ MUTANTS = [
     Mutant(
         "no more steps for a stopped run",
         "experiments/runs/run.py",
-        "callbacks, more, is_held=True)\n        except",
-        "callbacks, 0, is_held=True)\n        except",
+        "callbacks, more, is_held=True, changes=changes)\n        except",
+        "callbacks, 0, is_held=True, changes=changes)\n        except",
         "tests/cli/test_choices.py -k stopped_run",
     ),
     Mutant(
@@ -1322,7 +1322,7 @@ MUTANTS = [
     Mutant("a learner that is held has all the room", REGION, "if guesses and not holds:", "if guesses:", REGIONS),
     Mutant("a learner that guesses has no room", REGION, "HELD_UNIT if guesses else SMALLEST_UNIT", "SMALLEST_UNIT", REGIONS),
     Mutant("demonstrators are sure", REGION, "HELD_UNIT if guesses else SMALLEST_UNIT, 1.0", "HELD_UNIT, HELD_UNIT", REGIONS),
-    Mutant("the radius in any unit", REGION, "1.0 / float(self.unit.square().mean())", "44.44", REGIONS),
+    Mutant("the radius in any unit", REGION, "float(self.unit.pow(-2).mean())", "44.44", REGIONS),
     Mutant(
         "rejections make the region of a learner that is held small",
         REGION,

@@ -3,7 +3,8 @@
 import sys
 import time
 import warnings
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from functools import partial, reduce
 from os import PathLike
 from pathlib import Path
@@ -75,6 +76,7 @@ Weighing = float | th.Tensor  # a weight: a number, or 0-d where an update is on
 # of the mean absolute action-value that ``scale_pressure`` divides by: one paid step. Where nothing was paid yet, the critic's
 # noise must not be blown up to full strength
 SMALLEST_VALUE_SCALE = 1.0
+_OF_ANOTHER_VERSION = "{path} is of another version of sb3_actpc ({why}): load it with that one"
 FROM_DEMONSTRATIONS = ("demonstrations", "episodes")  # normalisations
 NEED_DEMONSTRATIONS = ("demonstration_fraction", "actor_warm_start", "n_demonstrations", "n_demonstration_transitions")
 EXPERT_SIGNALS_INTERVAL = 1000  # updates between two evaluations of the demonstrations' signals
@@ -430,13 +432,7 @@ class ActPC(OffPolicyAlgorithm):
         self.imitation = Imitation(self)
         self._followed = self.demonstrations, self.n_demonstrations, self.n_demonstration_transitions
         if self.demonstrations is None:
-            idle = [name for name in NEED_DEMONSTRATIONS if getattr(self, name)]
-            idle += ["observation_normalization"] if self.observation_normalization in FROM_DEMONSTRATIONS else []
-            if idle and self._is_trained():  # what these did stays in the circuits
-                self.demonstration_fraction, self.actor_warm_start = 0.0, 0
-                self.n_demonstrations = self.n_demonstration_transitions = None
-            elif idle:
-                raise ValueError(f"{' and '.join(idle)} need demonstrations=; pass a file or leave them out")
+            self._do_without_demonstrations()
             return
         if self.env is None and isinstance(self.observation_space, spaces.Dict):
             return  # only a goal task can turn the demonstrations into its own: ``set_env`` tries again
@@ -448,15 +444,26 @@ class ActPC(OffPolicyAlgorithm):
         except (FileNotFoundError, ImportError, ValueError) as error:
             if not self._is_trained():
                 raise
-            if not isinstance(error, FileNotFoundError) and self.env is not None:
-                raise type(error)(f"{error}. A trained agent can do without: demonstrations=None") from error
-            return  # a trained agent acts without them; ``learn`` says what is missing
+            if isinstance(error, FileNotFoundError) or self.env is None:
+                return  # a trained agent acts without them; ``learn`` says what is missing
+            kind = ImportError if isinstance(error, ImportError) else ValueError
+            raise kind(f"{error}. A trained agent can do without: demonstrations=None") from error
         assert isinstance(self.action_space, spaces.Box)
         self.expert = DemonstrationReplay(demonstrations, self.observation_space, self.action_space, self.memory_history)
         if self.observation_normalization in FROM_DEMONSTRATIONS and not (self.pretrained or self._awaits_parameters):
             self.actor.normalizer.begin()
             if not self.inputs.are_normalised:
                 self._fit_to_demonstrations(self.expert.episodes)
+
+    def _do_without_demonstrations(self) -> None:
+        """:raises ValueError: for settings that need them, of an agent that has not learned from any"""
+        idle = [name for name in NEED_DEMONSTRATIONS if getattr(self, name)]
+        idle += ["observation_normalization"] if self.observation_normalization in FROM_DEMONSTRATIONS else []
+        if idle and not self._is_trained():
+            raise ValueError(f"{' and '.join(idle)} need demonstrations=; pass a file or leave them out")
+        if idle:  # what these did stays in the circuits
+            self.demonstration_fraction, self.actor_warm_start = 0.0, 0
+            self.n_demonstrations = self.n_demonstration_transitions = None
 
     def _is_trained(self) -> bool:
         return bool(self.pretrained or self.num_timesteps or self.n_cloning_updates)
@@ -584,9 +591,15 @@ class ActPC(OffPolicyAlgorithm):
         return result
 
     def _steps_of_envs(self) -> list[int] | None:
-        """How many steps each environment has made, whoever acted; None without SB3's Monitor, which counts them."""
+        """How many steps each environment has made, whoever acted, and of these in the running episode; None without SB3's
+        Monitor, which counts them, or where nobody can be asked for it."""
         assert self.env is not None
-        return self.env.get_attr("total_steps") if all(self.env.env_is_wrapped(Monitor)) else None
+        try:
+            if not all(self.env.env_is_wrapped(Monitor)):
+                return None
+            return [*self.env.get_attr("total_steps"), *map(len, self.env.get_attr("rewards"))]
+        except (AttributeError, NotImplementedError, TypeError):
+            return None
 
     def _check_together(self) -> None:
         """
@@ -1208,29 +1221,20 @@ class ActPC(OffPolicyAlgorithm):
 
         :raises ValueError: for a file of a version whose classes are not here, or of another algorithm
         """
-        of_another_version = f"{path} is of another version of sb3_actpc ({{}}): load it with that one"
         own = kwargs.get("policy_kwargs")
-        try:
-            model = super().load(path, *args, **kwargs)  # type: ignore[arg-type]
-        except ModuleNotFoundError as error:
-            if not (error.name or "").startswith("sb3_actpc"):
-                raise
-            raise ValueError(of_another_version.format(error)) from error
-        except ValueError as error:
-            if "policy kwargs do not equal" in str(error) and isinstance(own, Mapping) and "habit" not in own:
-                return cls.load(
-                    path, *args, **{**kwargs, "policy_kwargs": {"habit": True, **own}}
-                )  # as demonstrations have it
-            if not str(error).startswith("policy="):
-                raise
-            raise ValueError(f"{path} holds no ActPC: load it with the class that saved it ({error})") from error
-        except RuntimeError as error:
-            if "in state_dict" not in str(error):
-                raise
-            raise ValueError(of_another_version.format("its policy has other parts")) from error
-        for name, later in (("signal_normalizer", "signal_kwargs"), ("refresh_noise", "refresh_kwargs")):
+        with _named_errors(path):
+            try:
+                model = super().load(path, *args, **kwargs)  # type: ignore[arg-type]
+            except ValueError as error:
+                if "policy kwargs do not equal" not in str(error) or not isinstance(own, Mapping) or "habit" in own:
+                    raise
+                try:  # demonstrations had added it
+                    model = super().load(path, *args, **{**kwargs, "policy_kwargs": {"habit": True, **own}})  # type: ignore[arg-type]
+                except ValueError:
+                    raise error from None
+        for name in ("signal_normalizer", "refresh_noise"):  # keywords until signal_kwargs and refresh_kwargs came
             if hasattr(model, name):
-                raise ValueError(of_another_version.format(f"before {later}"))
+                raise ValueError(_OF_ANOTHER_VERSION.format(path=path, why=f"with a keyword {name}"))
         return model
 
     def set_parameters(self, *args: Any, **kwargs: Any) -> None:
@@ -1358,6 +1362,25 @@ class ActPC(OffPolicyAlgorithm):
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         names = [name if name != "actor" else "actor.circuit" for name, _ in self.policy.named_circuits()]
         return ["policy", *(f"policy.{name}.optimizer" for name in names)], []
+
+
+@contextmanager
+def _named_errors(path: str | PathLike[str]) -> Iterator[None]:
+    """What SB3 stumbles over in a file of another version, or of another algorithm, as a ValueError that says so."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        if not (error.name or "").startswith("sb3_actpc"):
+            raise
+        raise ValueError(_OF_ANOTHER_VERSION.format(path=path, why=error)) from error
+    except ValueError as error:
+        if not str(error).startswith("policy="):
+            raise
+        raise ValueError(f"{path} holds no ActPC: load it with the class that saved it ({error})") from error
+    except RuntimeError as error:
+        if "in state_dict" not in str(error):
+            raise
+        raise ValueError(_OF_ANOTHER_VERSION.format(path=path, why="its policy has other parts")) from error
 
 
 def _follow(targets: list[NGCCircuit], circuits: list[NGCCircuit], tau: float) -> None:

@@ -84,11 +84,12 @@ def _plain(value: Any) -> Any:
 def check_settings(kind: type, settings: Mapping[str, Any]) -> None:
     """ValueError for the first of the settings that a :func:`checked` constructor of a class would refuse, or that SB3's own,
     which check little, cannot work with."""
-    annotations: dict[str, Any] = dict(OF_SB3)
+    annotations: dict[str, Any] = {}
     for init in constructors(kind):
         if hasattr(init, "__wrapped__"):
             own = inspect.signature(init, eval_str=True).parameters.values()
             annotations = {**{one.name: one.annotation for one in own}, **annotations}
+    annotations = {**OF_SB3, **annotations}
     for name in filter(annotations.__contains__, settings):
         _check(name, settings[name], annotations[name])
 
@@ -199,7 +200,7 @@ OF_SB3: dict[str, Any] = {
     **dict.fromkeys(("buffer_size", "batch_size", "n_steps", "n_epochs", "stats_window_size"), Size),
     **dict.fromkeys(("policy_delay", "target_update_interval"), Positive),
     **dict.fromkeys(("gamma", "tau", "gae_lambda"), Share),
-    **dict.fromkeys(("learning_starts", "vf_coef", "max_grad_norm", "target_policy_noise", "target_noise_clip"), Weight),
+    **dict.fromkeys(("learning_starts", "vf_coef", "target_policy_noise"), Weight),
     "train_freq": Annotated[Any, check_train_freq],
     "gradient_steps": Annotated[int, Between(-1)],
     "target_kl": Annotated[float | None, Between(0)],

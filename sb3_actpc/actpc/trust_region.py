@@ -134,7 +134,7 @@ class TrustRegion(nn.Module):
         """
         if self.holds:
             factor = self._trusted(math.exp(FOLLOWING_RATE * gain))
-            largest = 1.0 / float(self.unit.square().mean())  # half of the actions' range: beyond it nothing is held
+            largest = float(self.unit.pow(-2).mean())  # half of the actions' range: beyond it nothing is held
             self.radius.mul_(factor).clamp_(self.first_radius, max(self.first_radius, largest))
 
     def _trusted(self, factor: float) -> float:

@@ -129,8 +129,6 @@ class Demonstrations:
         ``env_id``; ``metadata`` are JSON values, ``source`` is for error messages. An episode of n actions may have n + 1
         observations in the place of ``next_observations``; without ``terminations`` none has ended by itself; dense rewards
         count where all have them. ValueError when there are none, or they do not fit together."""
-        if not len(episodes):
-            raise field_error(source, "observations", "at least one episode", "none")
         if metadata is not None and not isinstance(metadata, Mapping):
             raise field_error(source, "metadata", "a dictionary", repr(metadata))
         if isinstance(episodes, Mapping):
@@ -138,6 +136,8 @@ class Demonstrations:
                 source, "episodes", "a sequence of dictionaries, one of each episode", "a dictionary: put it in a list"
             )
         episodes = [whole_columns(episode, COLUMNS, source) for episode in episodes]
+        if not episodes:
+            raise field_error(source, "episodes", "at least one episode", "none")
         columns = {}
         for name in COLUMNS:
             if name == "dense_rewards" and not all(episode.get(name) is not None for episode in episodes):

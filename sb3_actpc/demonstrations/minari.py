@@ -1,6 +1,7 @@
 """Exchange with Minari, the Farama Foundation's format of offline data sets; episodes as arrays, in and out."""
 
 from collections.abc import Sequence
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -55,10 +56,11 @@ def write_minari(
 ) -> Any:
     """The ``minari.MinariDataset`` of the columns of each episode, with further metadata; for the rest see
     ``Demonstrations.to_minari``."""
-    images = [space for space in _boxes(observation_space) if space.dtype == np.uint8 and len(space.shape) == 3]
+    minari = import_extra("minari", "minari")
+    images = list(filter(import_module("minari.dataset.minari_storage").is_image_space, _boxes(observation_space)))
     if images:
         raise ValueError(f"Minari stores images such as {images[0]} as JPEG, which changes them: keep them with save(path)")
-    dataset = import_extra("minari", "minari").create_dataset_from_buffers(
+    dataset = minari.create_dataset_from_buffers(
         dataset_id,
         [episode_buffer(episode, observation_space, action_space) for episode in episodes],
         env=env if _has_json_spec(env) else None,

@@ -82,9 +82,9 @@ def whole_columns(episode: Mapping[str, Any], known: Sequence[str], source: str)
     if not isinstance(episode, Mapping):
         found = f"a {type(episode).__name__}"
         raise field_error(source, "episodes", "a sequence of dictionaries, one of each episode", found)
-    columns = {name: _array(column, name, source) for name, column in episode.items() if column is not None}
-    for name in columns.keys() - set(known):
+    for name in episode.keys() - set(known):
         raise field_error(source, name, f"one of {', '.join(known)}", "a column of this name")
+    columns = {name: _array(column, name, source) for name, column in episode.items() if column is not None}
     for name in ("observations", "actions", "rewards"):
         if name not in columns:
             raise field_error(source, name, "a column of every episode", f"only {', '.join(sorted(columns)) or 'none'}")
@@ -103,9 +103,9 @@ def whole_columns(episode: Mapping[str, Any], known: Sequence[str], source: str)
 def _array(column: Any, name: str, source: str) -> np.ndarray:
     """A column as an array with a row for each step."""
     wanted = "an array with a row for each step"
-    if isinstance(column, Mapping):
+    if isinstance(column, Mapping) or (isinstance(column, list | tuple) and column and isinstance(column[0], Mapping)):
         flatten = "np.array([gymnasium.spaces.flatten(space, one) for one in ...])"
-        raise field_error(source, name, wanted, f"a dictionary: flatten it, as {flatten}")
+        raise field_error(source, name, wanted, f"dictionaries: flatten them, as {flatten}")
     if isinstance(column, np.ma.MaskedArray):
         raise field_error(source, name, wanted, "a masked array, of which nobody knows what the masked rows are: fill them")
     try:

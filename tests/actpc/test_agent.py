@@ -1373,13 +1373,16 @@ def test_an_interrupt_cuts_the_episode_too():
     assert np.array_equal(followed, steps + 1) and set(buffer.self_imitation.lengths) == {5}
 
 
-@pytest.mark.parametrize("more_steps", [0, 2])
+@pytest.mark.parametrize("more_steps", [None, 0, 2])
 def test_who_plays_in_the_training_environment_between_two_runs_cuts_the_episode(more_steps):
-    """It is another episode that would go on, even where it is as long by then: of two steps."""
+    """Or resets it. It is another episode that would go on, even where it is as long by then: of two steps."""
     model = make(make_vec_env(Paying), learning_starts=0, policy_kwargs={"habit": True})
     model.learn(7)
-    evaluate_policy(model, model.get_env(), 1)
-    for _ in range(more_steps):
+    if more_steps is None:
+        model.get_env().reset()
+    else:
+        evaluate_policy(model, model.get_env(), 1)
+    for _ in range(more_steps or 0):
         model.get_env().step(np.zeros((1, 2), np.float32))
     model.learn(20, reset_num_timesteps=False)
     buffer, trials = model.replay_buffer, model.trials

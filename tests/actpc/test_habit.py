@@ -1181,7 +1181,7 @@ def test_a_file_of_0_2_says_so(tmp_path):
     model = imitating()
     model.signal_normalizer = "max"
     model.save(tmp_path / "agent")
-    with pytest.raises(ValueError, match=r"agent is of another version of sb3_actpc \(before signal_kwargs\)"):
+    with pytest.raises(ValueError, match=r"agent is of another version of sb3_actpc \(with a keyword signal_normalizer\)"):
         ActPC.load(tmp_path / "agent")
     model = imitating()
     del model.policy._buffers["spread"]

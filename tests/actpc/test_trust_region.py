@@ -82,6 +82,15 @@ def test_where_the_habit_holds_a_learner_that_guesses_the_unit_is_small_unless_d
     assert float(region.radius) == pytest.approx(unit**-2)
 
 
+def test_the_widest_radius_is_half_of_the_actions_range_in_every_dimension():
+    region = measured_by([0.2, 0.8], guesses=True, holds=True)
+    for _ in range(3000):
+        region.follow(1.0)
+    for _ in range(2000):
+        region.regulate(th.ones(4, 2), ZEROS, WORTH)
+    assert float(region.radius) == pytest.approx(float(region.deviation), rel=1e-4)
+
+
 def test_the_multiplier_grows_inside_falls_outside_and_rests_on_the_border():
     rates = []
     for deviation in (0.0, 0.5, 1.0, 1.5, 2.0, 9.0):

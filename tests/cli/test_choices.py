@@ -19,6 +19,7 @@ from sb3_actpc.checkpoints import TrainingStopped
 from sb3_actpc.cli import main
 from sb3_actpc.demonstrations import Demonstrations
 from sb3_actpc.experiments.runs import Run, finish_run
+from sb3_actpc.experiments.runs.episode_log import dense_reward
 from tests.cli.line import ENV_ID, RUN, rows_of, train
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -197,6 +198,8 @@ def test_a_stopped_run_without_a_checkpoint_is_not_begun_anew_in_its_place(capsy
     assert "has evaluations but no checkpoint to go on from, and would begin anew" in capsys.readouterr().err
     assert {name: Path("mine", name).read_bytes() for name in kept} == kept
     rows = Path("mine/progress.csv").read_text(encoding="utf-8").splitlines(keepends=True)
+    Path("mine/progress.csv").write_text("".join(rows[:2]) + "2", encoding="utf-8")  # the rest was not written
+    assert main(["train", "--resume", "mine", "--no-progress"]) == 2
     Path("mine/progress.csv").write_text("".join(rows[:2]), encoding="utf-8")
     assert main(["train", "--resume", "mine", "--no-progress"]) == 0
 
@@ -205,6 +208,12 @@ def test_a_stopped_run_without_a_checkpoint_is_not_begun_anew_in_its_place(capsy
 def test_a_dense_reward_that_is_no_number_is_the_environments(reward: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert train("--demonstrations", "none", "--steps", "20", "--env-kwarg", f"gain=.{reward}", "--output", "mine") == 2
     assert f"environment: info['dense_reward'] is {reward}: check the environment" in capsys.readouterr().err
+
+
+def test_a_reward_that_is_no_number_is_named_as_such() -> None:
+    assert dense_reward({}, 2) == 2.0 and dense_reward({"dense_reward": 1}, float("nan")) == 1.0
+    with pytest.raises(ValueError, match="environment: reward is nan: check the environment"):
+        dense_reward({}, float("nan"))
 
 
 def test_a_finished_run_whose_checkpoint_is_damaged_stays_finished(capsys: pytest.CaptureFixture[str]) -> None:

@@ -601,15 +601,20 @@ class TestMinari:
         assert dataset.recover_environment().spec.id == "Pendulum-v1"
         assert Demonstrations.from_minari(dataset).env_id == "Pendulum-v1"
 
-    def test_images_which_it_would_change_are_refused(self) -> None:
-        images = spaces.Box(0, 255, (4, 4, 3), np.uint8)
+    @pytest.mark.parametrize(("shape", "is_image"), [((4, 4, 3), False), ((36, 36), True)])
+    def test_images_which_it_would_change_are_refused(self, shape: tuple[int, ...], is_image: bool) -> None:
+        """It keeps none as JPEG that is smaller than 32 by 32."""
         env: Any = gym.Env()
-        env.observation_space = spaces.Dict({"camera": images, "joints": spaces.Box(-1, 1, (2,))})
+        images, joints = spaces.Box(0, 255, shape, np.uint8), spaces.Box(-1e4, 1e4, (2,))
+        env.observation_space = spaces.Dict({"camera": images, "joints": joints})
         env.action_space = spaces.Box(-9, 9, (ACTION_DIM,))
-        seen = np.zeros((N, 50), dtype=np.float32)
-        shown = make_demonstrations(observations=seen, next_observations=seen)
-        with pytest.raises(ValueError, match=r"Minari stores images such as Box\(0, 255, .*: keep them with save"):
-            shown.to_minari("tiny/images-v0", env)
+        seen = np.arange(N + 1)[:, None] + np.arange(spaces.utils.flatdim(env.observation_space))
+        shown = make_demonstrations(observations=seen[:-1] % 256, next_observations=seen[1:] % 256)
+        if is_image:
+            with pytest.raises(ValueError, match=r"Minari stores images such as Box\(0, 255, .*: keep them with save"):
+                shown.to_minari("tiny/images-v0", env)
+        else:
+            assert_equal(Demonstrations.from_minari(shown.to_minari("tiny/images-v0", env)), shown)
 
     def test_truncation_and_termination_are_told_apart(self) -> None:
         dataset = make_demonstrations().to_minari("tiny/ends-v0")
@@ -768,7 +773,15 @@ def test_an_episode_of_ones_own_arrays() -> None:
         ({"terminations": np.zeros(4)}, "'terminations': expected 3 rows, as the episode has actions, found 4"),
         ({"observations": np.zeros((1, 2)), "actions": np.zeros((0, 1)), "rewards": np.ones(0)}, "found an episode of none"),
         ({"rewards": 1.0}, "'rewards': expected an array with a row for each step, found 1.0"),
-        ({"observations": {"a": np.zeros((4, 2))}}, r"'observations': .* found a dictionary: flatten it, as .*spaces.flatten"),
+        (
+            {"observations": {"a": np.zeros((4, 2))}},
+            r"'observations': .* found dictionaries: flatten them, as .*spaces.flatten",
+        ),
+        (
+            {"observations": [{"a": np.zeros(2)}] * 4},
+            r"'observations': .* found dictionaries: flatten them, as .*spaces.flatten",
+        ),
+        ({"infos": {"a": np.zeros(3)}}, "'infos': expected one of observations, .*, found a column of this name"),
         ({"rewards": np.ma.array(np.ones(3), mask=[0, 1, 0])}, "'rewards': .* found a masked array"),
         ({"observations": [[0.0, 1.0], [0.0]]}, "'observations': expected rows of one size"),
     ],
@@ -781,7 +794,12 @@ def test_columns_that_are_missing_or_do_not_fit_are_named(change: dict[str, Any]
 
 def test_what_is_no_sequence_of_episodes_says_so() -> None:
     one: Any = {"observations": np.zeros((4, 2)), "actions": np.zeros((3, 1)), "rewards": np.ones(3)}
-    for given, named in ((one, "found a dictionary: put it in a list"), ([[1.0]], "found a list"), ([], "found none")):
+    for given, named in (
+        (one, "found a dictionary: put it in a list"),
+        ([[1.0]], "found a list"),
+        ([], "found none"),
+        (iter([]), "found none"),
+    ):
         with pytest.raises(ValueError, match=named):
             Demonstrations.from_episodes(given, "Mine-v0")
     with pytest.raises(ValueError, match=r"'metadata': expected a dictionary, found \[1\]"):

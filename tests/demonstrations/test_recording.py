@@ -196,6 +196,7 @@ def test_sampled_actions_differ_and_deterministic_ones_do_not() -> None:
     [
         ({"demonstrator": 3}, "3 must have SB3's predict, or be a function"),
         ({"n_episodes": 0}, "n_episodes=0 must be at least 1"),
+        ({"demonstrator": []}, r"demonstrator=\[\] must be at least one"),
         ({"env": "CartPole-v1"}, "Box action space, found Discrete"),
         ({"env": 3}, "env must be a Gymnasium environment or the id of one, found 3"),
     ],

@@ -1,5 +1,6 @@
 """What a run is, from text to JSON: the same numbers whoever reads them, and mistakes that are named."""
 
+import inspect
 import json
 import re
 from pathlib import Path
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 
 from sb3_actpc import ActPC, preset
+from sb3_actpc.actpc.arguments import check_settings
 from sb3_actpc.experiments.comparison import plan_runs, read_comparison
 from sb3_actpc.experiments.comparison.plan import read_comparison_file
 from sb3_actpc.experiments.runs import Run, resolve
@@ -18,6 +20,7 @@ from sb3_actpc.experiments.runs.presets import read_yaml, with_changes
 from sb3_actpc.experiments.runs.provenance import git_state
 from sb3_actpc.experiments.runs.record import read_run, write_config
 from sb3_actpc.experiments.runs.schema import merged
+from sb3_actpc.utils.constructors import constructors
 
 
 @pytest.fixture(autouse=True)
@@ -48,6 +51,7 @@ def test_a_key_that_is_given_twice_is_named_and_one_that_is_merged_is_not() -> N
     with pytest.raises(ValueError, match=r"mine\.yml: .*'steps' is given twice"):
         read_yaml("{envs: [{env: SparseReacher-v5, steps: 10, steps: 20}]}", "mine.yml")
     assert read_yaml("a: &a {b: 1, c: 2}\nd: {<<: *a, b: 3}", "")["d"] == {"b": 3, "c": 2}
+    assert read_yaml("{a: {<<: &x {<<: {b: 1}, b: 3}, e: 1}, f: *x, 1: 2, '1': 3}", "")["f"] == {"b": 3}
 
 
 @pytest.mark.parametrize(
@@ -92,6 +96,19 @@ def test_mistakes_are_named_in_one_line(given: dict[str, Any], message: str) -> 
 def test_settings_of_sb3s_algorithms_are_checked_before_they_run(algo: str, settings: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=re.escape(message)):
         resolve(Run(env="Pendulum-v1", algo=algo, demonstrations="none", n_timesteps=100, settings=settings))
+
+
+@pytest.mark.parametrize("algo", ["actpc", "td3", "ppo", "sac_rlpd", "trpo"])
+def test_an_algorithms_own_defaults_are_allowed(algo: str) -> None:
+    kind = load_algorithm(algo)
+    keywords = [one for init in constructors(kind) for one in inspect.signature(init).parameters.values()]
+    check_settings(kind, {one.name: one.default for one in reversed(keywords) if one.default is not one.empty})
+
+
+def test_no_limit_is_a_limit() -> None:
+    check_settings(load_algorithm("ppo"), {"max_grad_norm": float("inf")})
+    run = Run(env="Pendulum-v1", algo="ppo", demonstrations="none", normalize={"clip_reward": float("inf")}, n_timesteps=100)
+    assert resolve(run).normalize["clip_reward"] == float("inf")  # type: ignore[index]
 
 
 def test_an_unknown_algorithm_is_named_in_python_too() -> None:

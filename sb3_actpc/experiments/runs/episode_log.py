@@ -20,10 +20,10 @@ def dense_reward(info: Mapping[str, Any], otherwise: Any) -> float:
 
     :raises ValueError: for NaN and infinity, of which no mean could be made
     """
-    reported = float(info.get("dense_reward", otherwise))
-    if not math.isfinite(reported):
-        raise ValueError(f"environment: info['dense_reward'] is {reported}: check the environment, or report none")
-    return reported
+    name, reward = ("info['dense_reward']", info["dense_reward"]) if "dense_reward" in info else ("reward", otherwise)
+    if not math.isfinite(reward):
+        raise ValueError(f"environment: {name} is {float(reward)}: check the environment")
+    return float(reward)
 
 
 class CsvCallback(BaseCallback):

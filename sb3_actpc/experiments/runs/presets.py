@@ -35,17 +35,17 @@ _ACTIVATIONS: dict[str, type[nn.Module]] = {"relu": nn.ReLU, "tanh": nn.Tanh, "e
 
 
 class _PlainLoader(yaml.SafeLoader):
-    """YAML 1.1 of plain values, in which ``1e-3`` is a number, as it is in YAML 1.2."""
+    """YAML 1.1 of plain values, in which ``1e-3`` is a number and no key is given twice, as in YAML 1.2."""
+
+    def compose_mapping_node(self, anchor: Any) -> yaml.MappingNode:
+        node = super().compose_mapping_node(anchor)
+        keys = [(key.tag, key.value) for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
+        for tag, name in keys:
+            if keys.count((tag, name)) > 1:
+                raise ValueError(f"{name!r} is given twice: leave one out")
+        return node
 
 
-def _mapping(loader: _PlainLoader, node: yaml.MappingNode) -> dict[Any, Any]:
-    keys = [key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
-    if twice := next((key for key in keys if keys.count(key) > 1), None):
-        raise ValueError(f"{twice!r} is given twice: leave one out")
-    return loader.construct_mapping(node, deep=True)
-
-
-_PlainLoader.add_constructor("tag:yaml.org,2002:map", _mapping)
 _PlainLoader.add_implicit_resolver(
     "tag:yaml.org,2002:float", re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$"), list("-+.0123456789")
 )
@@ -108,8 +108,9 @@ def resolve(run: Run) -> Run:
     if wrong := sorted(set(normalize or ()) - set(known)):
         hint = f"{nearest(wrong[0], known)}: choose from {', '.join(known)}"
         raise ValueError(f"normalize={normalize!r}: VecNormalize has no keyword {wrong[0]!r}{hint}")
-    for name in {"clip_obs", "clip_reward", "gamma", "epsilon"} & set(normalize or ()):
-        check_kind(f"normalize.{name}", (normalize or {})[name], float)
+    for name, value in (normalize or {}).items():
+        if name in ("clip_obs", "clip_reward", "gamma", "epsilon") and value != float("inf"):
+            check_kind(f"normalize.{name}", value, float)
     if normalize is not None and "gamma" in settings:
         normalize = {"gamma": settings["gamma"], **normalize}
     filled = {

@@ -85,11 +85,10 @@ def is_finished(folder: Path) -> bool:
 
 
 def has_evaluations(folder: Path) -> bool:
-    """Whether a run has been evaluated after its first step."""
-    try:
-        return bool(_read_evaluations(folder / PROGRESS)[-1]["timesteps"])
-    except (FileNotFoundError, ValueError):
-        return False
+    """Whether a run has been evaluated after its first step, or has a damaged row that may be of such an evaluation."""
+    path = folder / PROGRESS
+    rows = path.read_text(encoding="utf-8", errors="replace").splitlines()[1:] if path.is_file() else []
+    return any(row.partition(",")[0] != "0" for row in rows)
 
 
 def read_result(folder: Path) -> dict[str, Any]:

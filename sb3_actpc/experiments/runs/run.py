@@ -1,7 +1,7 @@
 """One training run and its folder, and the replay of a finished one."""
 
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from itertools import count
 from pathlib import Path
@@ -80,11 +80,13 @@ def resume_run(
     callbacks: Sequence[BaseCallback] = (),
     more_steps: int = 0,
     is_held: bool = False,
+    changes: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Go on with a run from its newest whole checkpoint, with the settings in its ``config.json``, for the steps that it was
     to have and ``more_steps``, of which a finished run needs some. ``report`` is given a line of text when the run goes on,
-    after each evaluation and for each damaged checkpoint; see :func:`train_run`. FileNotFoundError when the folder is not that
-    of a run, ValueError when the run is finished and gets no more steps, or its checkpoints do not fit or are all damaged."""
+    after each evaluation and for each damaged checkpoint; ``changes`` are of fields in ``MAY_CHANGE``;
+    see :func:`train_run`. FileNotFoundError when the folder is not that of a run, ValueError when the run is finished and gets
+    no more steps, or has no checkpoint but evaluations, or its checkpoints do not fit or are all damaged."""
     run = read_run(folder).model_copy(update={"progress": progress})
     without = why_no_checkpoints(load_algorithm(run.algo))
     if without:
@@ -111,6 +113,7 @@ def resume_run(
         )
     if more_steps:
         run = run.model_copy(update={"n_timesteps": (run.n_timesteps or 0) + more_steps})
+    run = run.model_copy(update=dict(changes or {}))
     return _run(run, report, callbacks, resumes=True, is_held=is_held)
 
 
@@ -128,7 +131,7 @@ def finish_run(run: Run, report: Report = silent, callbacks: Sequence[BaseCallba
     except ValueError as error:
         report(f"{error}: the run starts again")
         (folder / CONFIG).unlink()
-    more = 0
+    more, changes = 0, {name: getattr(run, name) for name in MAY_CHANGE}
     if stored is not None:
         _check_same(stored, run)
         more = max((run.n_timesteps or 0) - (stored.n_timesteps or 0), 0)
@@ -136,11 +139,10 @@ def finish_run(run: Run, report: Report = silent, callbacks: Sequence[BaseCallba
         result = read_result(folder)
         if not more or (run.target_return is not None and result["dense_return"] >= run.target_return):
             return {**result, "folder": str(folder)}
-        return resume_run(folder, report, run.progress, callbacks, more, is_held=True)
+        return resume_run(folder, report, run.progress, callbacks, more, is_held=True, changes=changes)
     if stored is not None and list_bundles(folder / CHECKPOINTS):
-        write_config(stored.model_copy(update={name: getattr(run, name) for name in MAY_CHANGE}))
         try:
-            return resume_run(folder, report, run.progress, callbacks, more, is_held=True)
+            return resume_run(folder, report, run.progress, callbacks, more, is_held=True, changes=changes)
         except DamagedCheckpoint as error:
             report(f"{error}: the run starts again")
     shutil.rmtree(folder / CHECKPOINTS, ignore_errors=True)
