@@ -30,13 +30,13 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-import yaml
 
 from sb3_actpc.experiments.report.figures import reference_lines
 from sb3_actpc.experiments.report.page import UNDEFINED, markdown, number
 from sb3_actpc.experiments.report.references import measure_of, paper_results
 from sb3_actpc.experiments.report.results import load_results
 from sb3_actpc.experiments.report.statistics import mean_interval
+from sb3_actpc.experiments.runs.presets import read_yaml
 from sb3_actpc.utils.files import atomic_write
 
 _MARKER = re.compile(r"(<!-- table: (\S+) (\S+) -->\n).*?(<!-- /table -->)", re.DOTALL)
@@ -66,11 +66,11 @@ def fill_tables(text: str, folder: Path) -> str:
 
     def filled(match: re.Match[str]) -> str:
         try:
-            specs = yaml.safe_load((folder / match[2]).read_text(encoding="utf-8"))
+            specs = _mapping("tables", read_yaml((folder / match[2]).read_bytes(), match[2]))
             if match[3] not in specs:
                 raise ValueError(f"not in {match[2]}: there are {', '.join(specs)}")
-            return f"{match[1]}{_table(specs[match[3]], (folder / match[2]).parent)}\n{match[4]}"
-        except (ValueError, KeyError, yaml.YAMLError) as error:
+            return f"{match[1]}{_table(_mapping('a table', specs[match[3]]), (folder / match[2]).parent)}\n{match[4]}"
+        except (ValueError, KeyError) as error:
             raise ValueError(f"table {match[3]}: {error}") from error
 
     return _MARKER.sub(filled, text)
@@ -98,16 +98,25 @@ class _OverSeeds:
 
 
 def _table(spec: dict[str, Any], folder: Path) -> str:
-    rows, columns = spec.pop("rows"), spec.pop("columns")
+    rows, columns = (_mapping(name, spec.pop(name)) for name in ("rows", "columns"))
     by_column = [column if isinstance(column, dict) else {"task": column} for column in columns.values()]
     by_row = {name: row if isinstance(row, dict) else {"variant": row} for name, row in rows.items()}
     cells = [[name, *(_cell({**spec, **column, **row}, folder) for column in by_column)] for name, row in by_row.items()]
     return markdown(pd.DataFrame(cells, columns=["", *columns]))
 
 
+def _mapping(what: str, given: Any) -> dict[str, Any]:
+    if not isinstance(given, dict):
+        raise ValueError(f"{what} must be a mapping, found {given!r}")
+    return given
+
+
 def _cell(spec: dict[str, Any], folder: Path) -> str:
     if unknown := sorted(set(spec) - _KEYS):
         raise ValueError(f"unknown {', '.join(unknown)}; known are {', '.join(sorted(_KEYS))}")
+    for key in ("cell", "score"):
+        if not isinstance(spec.get(key, ""), str):
+            raise ValueError(f"{key}={spec[key]!r} must be a text: put it into quotes")
     source = spec["from"]
     if isinstance(source, dict):
         source = source.get(spec.get("task"), source.get("others", []))

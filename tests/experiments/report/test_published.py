@@ -1,5 +1,6 @@
 """The tables of Markdown files: made from exports worked by hand, and in this repository equal to its data."""
 
+import re
 from pathlib import Path
 
 import pytest
@@ -120,13 +121,28 @@ def test_the_command_writes_what_has_changed(folder: Path, capsys: pytest.Captur
         ("A: {variant: actpc, cel: x}", "{score}", "unknown cel; known are cell, columns, from"),
         ("A: actpc", "{dense}", "table one: 'dense'"),
         ("A: actpc", "{dense_return:median .0f}", "unknown 'median' in a format"),
-        ("A: [", "{score}", "table one: while parsing"),
+        ("A: [", "{score}", "table one: tables.yml: not YAML of plain values (while parsing"),
     ],
 )
 def test_mistakes_are_named(folder: Path, rows: str, cell: str, message: str) -> None:
     with pytest.raises(ValueError) as error:
         lines(folder, rows, cell)
     assert message in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "tables must be a mapping, found None"),
+        ("one: [1]", "a table must be a mapping, found [1]"),
+        ("one: {rows: [fast], columns: {}}", "rows must be a mapping, found ['fast']"),
+        ("one: {from: kept, rows: {A: actpc}, columns: {B: SparseHopper-v5}, cell: 3}", "cell=3 must be a text"),
+    ],
+)
+def test_what_is_no_table_is_named(folder: Path, text: str, message: str) -> None:
+    (folder / "tables.yml").write_text(text, encoding="utf-8")
+    with pytest.raises(ValueError, match=re.escape(f"table one: {message}")):
+        fill_tables(PAGE, folder)
 
 
 def test_runs_with_several_settings_are_not_mixed(folder: Path) -> None:
