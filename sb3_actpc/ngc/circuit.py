@@ -12,9 +12,10 @@ from sb3_actpc.ngc.activations import ACTIVATIONS, get_activation
 from sb3_actpc.ngc.dynamics import DYNAMICS, ChainSettings, Rates, SettledState, SettlingChain
 from sb3_actpc.ngc.krylov import settle_krylov
 from sb3_actpc.ngc.plasticity import SYNAPTIC_SCALINGS, HebbianChanges, bound_columns_, hebbian_changes, mirrored, soft_bound_
-from sb3_actpc.ngc.products import MATMUL_PRECISIONS, check_matmul_precision
-from sb3_actpc.ngc.stability import power_iteration_, settling_rates
-from sb3_actpc.ngc.synapses import Synapses, predict
+from sb3_actpc.ngc.normalization import EPSILON, NORMALIZATIONS, jacobian_product, normalize
+from sb3_actpc.ngc.products import affine
+from sb3_actpc.ngc.stability import largest_norm_, settling_rates
+from sb3_actpc.ngc.synapses import Synapses
 
 SETTLINGS = ("iterative", "scheduled")
 FEEDBACKS = ("learned", "tied")
@@ -59,9 +60,10 @@ class NGCCircuit(nn.Module):
     :param weight_decay: λ: before every change W, M and E shrink by 1 - ηλ (η the learning rate, as in AdamW); biases do not.
         E and W^T get changes in the same direction, so that what they were born with is what parts them; the decay forgets
         it in some 1/(ηλ) updates (Kolen & Pollack, 1994), and learned error synapses align
-    :param matmul_precision: "float32", or "bfloat16": wide products (no side below 64) but the output's prediction multiply
-        and give numbers rounded to 8 bits, summed in float32; synapses, optimiser and all else stay float32. Half the time
-        of a product, on processors with avx512_bf16 or AMX
+    :param normalization: "layer" normalizes the hidden latents of a layer before φ (:mod:`~sb3_actpc.ngc.normalization`), in
+        projection, sweep and settling alike; "none" for the paper's circuits
+    :param n_members: M members of an ensemble, each with synapses of its own, which settle and change in the same products;
+        0 for one circuit without a leading dimension
     :param n_memory: size of the working memory fed to every layer; 0 for none
     :param memory_weight: α_m
     :param n_feedback_inputs: error synapses also reach the last this-many inputs (the critic's action columns)
@@ -93,7 +95,8 @@ class NGCCircuit(nn.Module):
         synaptic_scaling: str = "none",
         weight_bound: float = 1.0,
         weight_decay: float = 0.0,
-        matmul_precision: str = "float32",
+        normalization: str = "none",
+        n_members: int = 0,
         n_memory: int = 0,
         memory_weight: float = 1.0,
         n_feedback_inputs: int = 0,
@@ -106,13 +109,14 @@ class NGCCircuit(nn.Module):
         _check_choice("feedback_start", feedback_start, FEEDBACK_STARTS)
         _check_choice("activation", activation, tuple(ACTIVATIONS))
         _check_choice("output_activation", output_activation, tuple(ACTIVATIONS))
-        _check_choice("matmul_precision", matmul_precision, MATMUL_PRECISIONS)
-        check_matmul_precision(matmul_precision)
+        _check_choice("normalization", normalization, NORMALIZATIONS)
         if not isinstance(hidden, Sequence) or isinstance(hidden, str):
             raise ValueError(f"hidden={hidden!r} must be a list of layer sizes")
         _check_sizes(1, n_inputs=n_inputs, n_outputs=n_outputs, n_settling_steps=n_settling_steps)
         _check_sizes(1, **{f"hidden[{layer}]": size for layer, size in enumerate(hidden)})
-        _check_sizes(0, n_memory=n_memory, n_feedback_inputs=n_feedback_inputs)
+        _check_sizes(0, n_memory=n_memory, n_feedback_inputs=n_feedback_inputs, n_members=n_members)
+        if n_members and n_memory:
+            raise ValueError(f"n_members={n_members} and n_memory={n_memory} do not go together: an ensemble has no memory")
         if n_feedback_inputs > n_inputs:
             raise ValueError(f"n_feedback_inputs={n_feedback_inputs} must lie between 0 and n_inputs={n_inputs}")
         _check_not_negative(
@@ -146,7 +150,7 @@ class NGCCircuit(nn.Module):
         self.settling_rate, self.leak, self.derivative_free = settling_rate, leak, derivative_free
         self.feedback, self.feedback_scale, self.feedback_rate = feedback, feedback_scale, feedback_rate
         self.synaptic_scaling, self.weight_bound, self.weight_decay = synaptic_scaling, weight_bound, weight_decay
-        self.in_bfloat16 = matmul_precision == "bfloat16"
+        self.normalization, self.n_members = normalization, n_members
         self.n_memory, self.memory_weight = n_memory, memory_weight
         self.n_feedback_inputs = n_feedback_inputs
         self._create_synapses()
@@ -158,15 +162,17 @@ class NGCCircuit(nn.Module):
 
     def _create_synapses(self) -> None:
         pairs = list(zip(self.sizes[:-1], self.sizes[1:], strict=True))
-        self.weights = nn.ParameterList([_uniform(n_out, n_in, n_in) for n_in, n_out in pairs])
-        self.biases = nn.ParameterList([_uniform(n_out, 1, n_in).squeeze(1) for n_in, n_out in pairs])
+        members = (self.n_members,) if self.n_members else ()
+        self.weights = nn.ParameterList([_uniform((*members, n_out, n_in), n_in) for n_in, n_out in pairs])
+        flat = (*members, 1) if self.n_members else ()
+        self.biases = nn.ParameterList([_uniform((*flat, n_out), n_in) for n_in, n_out in pairs])
         self.memory_weights = nn.ParameterList(
-            [_uniform(n_out, self.n_memory, self.n_memory) for _, n_out in pairs] if self.n_memory else []
+            [_uniform((n_out, self.n_memory), self.n_memory) for _, n_out in pairs] if self.n_memory else []
         )
         # E^T in the layout of W: (n_out, n_in), so that errors @ E^T is one product without a transposition
         sources = [self.n_feedback_inputs, *self.sizes[1:-1]]
         self.feedback_weights = nn.ParameterList(
-            [_uniform(n_out, source, n_in) for source, (n_in, n_out) in zip(sources, pairs, strict=True) if source]
+            [_uniform((*members, n_out, source), n_in) for source, (n_in, n_out) in zip(sources, pairs, strict=True) if source]
             if self.feedback == "learned"
             else []
         )
@@ -187,7 +193,8 @@ class NGCCircuit(nn.Module):
         self.register_buffer("rates", th.zeros(max(1, self.n_hidden)), persistent=self._keep_rates)
         if self._keep_rates:
             for name, matrix in self._coupling_matrices():
-                self.register_buffer(name, th.nn.functional.normalize(th.ones(matrix.shape[1]), dim=0))
+                start = th.ones(*matrix.shape[:-2], matrix.shape[-1])
+                self.register_buffer(name, th.nn.functional.normalize(start, dim=-1))
             self.update_settling_rates(n_iterations=30)
         elif self.settling_rate != "auto":
             self.rates.fill_(float(self.settling_rate))
@@ -212,7 +219,11 @@ class NGCCircuit(nn.Module):
         """
         above = self.synapses.weights[len(self.synapses.weights) - len(self.synapses.feedback) :]
         for feedback, weights in zip(self.synapses.feedback, above, strict=True):
-            feedback.copy_(mirrored(weights[:, weights.shape[1] - feedback.shape[1] :]))
+            source = weights[..., weights.shape[-1] - feedback.shape[-1] :]
+            if self.n_members:
+                feedback.copy_(th.stack([mirrored(member) for member in source]))
+            else:
+                feedback.copy_(mirrored(source))
 
     @property
     def n_hidden(self) -> int:
@@ -226,7 +237,7 @@ class NGCCircuit(nn.Module):
         :param tied: the weights themselves, whatever the circuit uses
         """
         matrix = self.synapses.feedback_matrix(0, self.feedback_scale, tied)
-        return matrix[:, matrix.shape[1] - self.n_feedback_inputs :]
+        return matrix[..., matrix.shape[-1] - self.n_feedback_inputs :]
 
     # ------------------------------------------------------------------ inference
 
@@ -236,15 +247,17 @@ class NGCCircuit(nn.Module):
 
         :param x: (B, n_inputs)
         :param memory: m_t, (B, n_memory), for a circuit with a working memory
-        :return: (B, n_outputs)
+        :return: (B, n_outputs), of an ensemble (M, B, n_outputs)
         :raises ValueError: for an input that is no such tensor, for a memory that is missing, not wanted or of the wrong size
         """
-        self._check_inputs(x)
+        x = self._as_input(x)
         biases = self.synapses.layer_biases(memory, self.memory_weight)
         for weights, bias in zip(self.synapses.weights[:-1], biases[:-1], strict=True):
-            latents = predict(x, weights, bias, self.in_bfloat16)
+            latents = affine(bias, x, weights)
+            if self.normalization == "layer":
+                latents = th.layer_norm(latents, latents.shape[-1:], None, None, EPSILON)
             x = self.activation.apply(latents, latents)
-        output = predict(x, self.synapses.weights[-1], biases[-1])
+        output = affine(biases[-1], x, self.synapses.weights[-1])
         return self.output_activation.apply(output, output)
 
     def settle(self, x: th.Tensor, target: th.Tensor, memory: th.Tensor | None = None) -> SettledState:
@@ -252,12 +265,14 @@ class NGCCircuit(nn.Module):
         Clamp input and output and let the hidden layers settle from the projected state (f_inf). No synapse changes.
 
         :param x: (B, n_inputs)
-        :param target: (B, n_outputs)
+        :param target: (B, n_outputs); of an ensemble, for all members or (M, B, n_outputs)
         :param memory: m_t, (B, n_memory), for a circuit with a working memory
         :return: latents, activations and errors of every layer
         :raises ValueError: as :meth:`project`, and for a target of another shape than the outputs'
         """
         chain = self.chain(x, memory)
+        if self.n_members and target.dim() == 2:
+            target = target.expand(self.n_members, -1, -1)
         chain.clamp_output(target)
         if self.settling == "scheduled":
             chain.sweep()
@@ -286,7 +301,7 @@ class NGCCircuit(nn.Module):
 
     def chain(self, x: th.Tensor, memory: th.Tensor | None = None) -> SettlingChain:
         """The projected chain of this circuit's layers, to be clamped and settled; see :meth:`settle` for the shapes."""
-        self._check_inputs(x)
+        x = self._as_input(x)
         settings = ChainSettings(
             self.activation,
             self.output_activation,
@@ -295,9 +310,14 @@ class NGCCircuit(nn.Module):
             self.derivative_free,
             self.feedback_scale,
             self.memory_weight,
-            self.in_bfloat16,
+            self.normalization == "layer",
         )
         return SettlingChain(self.synapses, settings, x, memory)
+
+    def _as_input(self, x: th.Tensor) -> th.Tensor:
+        """``x``, checked; of an ensemble the same for every member, (M, B, n_inputs)."""
+        self._check_inputs(x)
+        return x.expand(self.n_members, -1, -1) if self.n_members else x
 
     def _check_inputs(self, x: th.Tensor) -> None:
         n, dtype = self.sizes[0], self.synapses.weights[0].dtype
@@ -315,12 +335,18 @@ class NGCCircuit(nn.Module):
         for layer in range(1, self.n_hidden + 1):
             signal = state.postsynaptic[layer] @ self.synapses.feedback_matrix(layer, self.feedback_scale)
             if not self.derivative_free:
-                signal = self.activation.damp(signal, state.latents[layer], state.activations[layer])
+                signal = self._damped(signal, state.latents[layer], state.activations[layer])
             drives.append(signal.square().sum())
             moves.append((signal - state.errors[layer - 1] - self.leak * state.latents[layer]).square().sum())
         if not moves:
             return th.zeros(())
         return (th.stack(moves).sum() / th.stack(drives).sum().clamp_min(1e-30)).sqrt()
+
+    def _damped(self, signal: th.Tensor, latents: th.Tensor, activations: th.Tensor) -> th.Tensor:
+        if self.normalization == "none":
+            return self.activation.damp(signal, latents, activations)
+        normalized = normalize(latents)
+        return jacobian_product(self.activation.damp(signal, normalized.values, activations), latents, normalized)
 
     # ------------------------------------------------------------------ learning
 
@@ -330,7 +356,7 @@ class NGCCircuit(nn.Module):
 
         Nothing is changed yet: :meth:`apply_changes` does that, and gives the error synapses those of the weights.
         """
-        return hebbian_changes(state.postsynaptic, state.activations, state.memory, self.memory_weight, self.in_bfloat16)
+        return hebbian_changes(state.postsynaptic, state.activations, state.memory, self.memory_weight)
 
     def parameter_groups(self, learning_rate: float) -> list[dict[str, Any]]:
         """
@@ -372,7 +398,7 @@ class NGCCircuit(nn.Module):
         # E^T is stored in the layout of W, so that its change is ΔW itself
         for parameter, weights in zip(self.synapses.feedback, above, strict=self.feedback == "learned"):
             assert weights.grad is not None
-            parameter.grad = weights.grad[:, weights.shape[1] - parameter.shape[1] :].contiguous()
+            parameter.grad = weights.grad[..., weights.shape[-1] - parameter.shape[-1] :].contiguous()
         self.optimizer.step()
         self._scale_synapses(old)
         if self._keep_rates:
@@ -380,7 +406,9 @@ class NGCCircuit(nn.Module):
 
     def _decay_synapses(self, weight_decay: float) -> None:
         for group in self.optimizer.param_groups if weight_decay else ():
-            matrices = [parameter for parameter in group["params"] if parameter.dim() > 1]
+            matrices = [
+                parameter for parameter in group["params"] if not any(parameter is bias for bias in self.synapses.biases)
+            ]
             if matrices:
                 kept = 1.0 - group["lr"] * weight_decay  # a tensor where a CUDA graph reads the rate
                 th._foreach_mul_(matrices, kept.clamp_min(0.0) if isinstance(kept, th.Tensor) else max(0.0, kept))
@@ -417,7 +445,7 @@ class NGCCircuit(nn.Module):
         """
         if not self._keep_rates:
             raise ValueError("rates follow synapses only with settling='iterative', dynamics='state', settling_rate='auto'")
-        norms = th.stack([power_iteration_(m, getattr(self, name), n_iterations) for name, m in self._coupling_matrices()])
+        norms = th.stack([largest_norm_(m, getattr(self, name), n_iterations) for name, m in self._coupling_matrices()])
         forward = norms[: self.n_hidden].tolist()
         feedback = norms[self.n_hidden :].tolist() or [self.feedback_scale * norm for norm in forward]
         self.rates.copy_(th.tensor(settling_rates(forward, feedback)))
@@ -429,10 +457,10 @@ def _follow_loaded(circuit: NGCCircuit, _: Any) -> None:
         circuit.update_settling_rates(n_iterations=30)
 
 
-def _uniform(n_out: int, n_in: int, fan_in: int) -> nn.Parameter:
-    """U(-1/sqrt(fan_in), 1/sqrt(fan_in)), as ``torch.nn.Linear`` starts; (n_out, n_in), without a gradient."""
+def _uniform(shape: tuple[int, ...], fan_in: int) -> nn.Parameter:
+    """U(-1/sqrt(fan_in), 1/sqrt(fan_in)), as ``torch.nn.Linear`` starts, without a gradient."""
     bound = fan_in**-0.5
-    return nn.Parameter(th.empty(n_out, n_in).uniform_(-bound, bound), requires_grad=False)
+    return nn.Parameter(th.empty(shape).uniform_(-bound, bound), requires_grad=False)
 
 
 def _check_choice(name: str, value: Any, allowed: Sequence[str]) -> None:

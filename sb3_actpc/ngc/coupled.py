@@ -14,7 +14,7 @@ class CoupledState:
     """
     :param actor: the actor's settled state; its output error is the perturbation d_a the critic asked for
     :param actions: the actor's projected actions, (B, A), that were held while settling
-    :param action_values: the critic's projected values of them, (B, n_outputs)
+    :param action_values: the critic's projected values of them, (B, n_outputs), of an ensemble (M, B, n_outputs)
     """
 
     actor: SettledState
@@ -48,7 +48,8 @@ def settle_coupled(
     ``dynamics="state"`` cannot be, as a small nudge drowns in the rounding of z - z̄.
 
     :param actor: observation (and memory) -> action
-    :param critic: [observation, action] -> action-values; its last A inputs are the action
+    :param critic: [observation, action] -> action-values; its last A inputs are the action. The actor follows the mean of an
+        ensemble's members
     :param x: observations, (B, n_observation)
     :param memory: the actor's m_t, (B, n_memory), or None
     :param nudge: scale of the perturbation, in (0, 1]; None for an infinitesimal one, or 1 with ``dynamics="state"``
@@ -65,7 +66,7 @@ def settle_coupled(
     motor = actor.chain(x, memory)
     value = critic.chain(th.cat([x, motor.output], dim=1))
     scale = 1.0 if nudge is None or actor.settling == "scheduled" else nudge
-    value.clamp_output_drive(_damped(value, th.full_like(value.output, scale / value.output.shape[1])))
+    value.clamp_output_drive(_mean_value_drive(value, scale))
     if actor.settling == "scheduled" or (actor.dynamics == "krylov" and nudge is None):
         _sweep_both(motor, value, critic.input_feedback())
     else:
@@ -86,7 +87,7 @@ def policy_gradient(actor: NGCCircuit, critic: NGCCircuit, x: th.Tensor, memory:
     """
     motor = actor.chain(x, memory)
     value = critic.chain(th.cat([x, motor.output], dim=1))
-    value.clamp_output_drive(_damped(value, th.full_like(value.output, 1.0 / value.output.shape[1])))
+    value.clamp_output_drive(_mean_value_drive(value))
     _sweep_both(motor, value, critic.input_feedback(tied=True), exact=True)
     return actor.hebbian_update(motor.state())
 
@@ -128,9 +129,17 @@ def _sweep_repeatedly(actor: NGCCircuit, critic: NGCCircuit, motor: SettlingChai
             chain.predict(output=False)
 
 
+def _mean_value_drive(value: SettlingChain, scale: float = 1.0) -> th.Tensor:
+    """The output error ``scale`` / A that raises the mean action-value, of an ensemble the mean over its members."""
+    n_members = value.output.shape[0] if value.output.dim() == 3 else 1
+    return _damped(value, th.full_like(value.output, scale / (value.output.shape[-1] * n_members)))
+
+
 def _clamp_actor(motor: SettlingChain, value: SettlingChain, to_action: th.Tensor) -> None:
     """The actor's output error becomes d_a = E_a e of the critic's first layer (of its output, without hidden layers)."""
     perturbation = (value.errors[0] if value.n_hidden else value.drive) @ to_action
+    if perturbation.dim() == 3:  # every member adds its share of the mean
+        perturbation = perturbation.sum(0)
     motor.output_error = perturbation
     motor.drive = _damped(motor, perturbation)
 

@@ -7,8 +7,9 @@ from typing import NamedTuple
 import torch as th
 
 from sb3_actpc.ngc.activations import Activation
-from sb3_actpc.ngc.products import add_product, multiply
-from sb3_actpc.ngc.synapses import Synapses, predict
+from sb3_actpc.ngc.normalization import Normalized, jacobian_product, normalize
+from sb3_actpc.ngc.products import add_product, affine
+from sb3_actpc.ngc.synapses import Synapses
 
 DYNAMICS = ("krylov", "state")
 
@@ -20,6 +21,8 @@ Rates = Sequence[float] | Sequence[th.Tensor]
 class SettledState:
     """
     Where a circuit came to rest; all lists in forward order (first layer first).
+
+    Tensors of an ensemble have a leading dimension M of members.
 
     :param latents: z, L + 1 tensors (B, n): the clamped input, every hidden layer, the clamped (or, when the output's error
         was clamped instead, the predicted) output. The paper counts from the other end: its z^L is ``latents[0]``
@@ -43,8 +46,8 @@ class SettledState:
         return [*self.errors[:-1], self.output_drive]
 
     def total_discrepancy(self) -> th.Tensor:
-        """The energy 1/2 Σ_l ||e_l||^2 of every sample (paper: total discrepancy), (B,)."""
-        return 0.5 * th.stack([error.square().sum(1) for error in self.errors]).sum(0)
+        """The energy 1/2 Σ_l ||e_l||^2 of every sample (paper: total discrepancy), (B,), of an ensemble (M, B)."""
+        return 0.5 * th.stack([error.square().sum(-1) for error in self.errors]).sum(0)
 
 
 class ChainSettings(NamedTuple):
@@ -57,7 +60,7 @@ class ChainSettings(NamedTuple):
     derivative_free: bool = False
     feedback_scale: float = 1.0
     memory_weight: float = 1.0
-    bfloat16: bool = False
+    normalizes: bool = False
 
 
 class SettlingChain:
@@ -83,11 +86,14 @@ class SettlingChain:
         self.biases = synapses.layer_biases(memory, settings.memory_weight)
         self.latents: list[th.Tensor] = [x]
         self.activations: list[th.Tensor] = [x]
+        self.normalized: list[Normalized | None] = [None]
         for weights, bias in zip(synapses.weights[:-1], self.biases[:-1], strict=True):
-            latents = predict(self.activations[-1], weights, bias, settings.bfloat16)
+            latents = affine(bias, self.activations[-1], weights)
             self.latents.append(latents)
-            self.activations.append(settings.activation.apply(latents, th.empty_like(latents)))
-        self.output_prediction = predict(self.activations[-1], synapses.weights[-1], self.biases[-1])
+            self.normalized.append(None)
+            self.activations.append(th.empty_like(latents))
+            self._activate(len(self.latents) - 1)
+        self.output_prediction = affine(self.biases[-1], self.activations[-1], synapses.weights[-1])
         self.output = settings.output_activation.apply(self.output_prediction, th.empty_like(self.output_prediction))
         self.n_hidden = len(self.latents) - 1
         self.lowest_reached = self.n_hidden + 1
@@ -95,6 +101,33 @@ class SettlingChain:
         self.n_steps = 0
         self.drive = self.output_prediction  # replaced as soon as the output is clamped
         self.errors: list[th.Tensor] = []
+
+    def _activate(self, layer: int) -> None:
+        """Bring φ(z), or φ of the normalized z, of a hidden layer up to date."""
+        latents = self.latents[layer]
+        if self.settings.normalizes:
+            normalized = normalize(latents)
+            self.normalized[layer] = normalized
+            latents = normalized.values
+        self.activations[layer] = self.settings.activation.apply(latents, self.activations[layer])
+
+    def damp(self, layer: int, signal: th.Tensor) -> th.Tensor:
+        """Multiply ``signal``, (B, n), in place by the transposed derivative of a hidden layer's activation."""
+        activation = self.settings.activation
+        normalized = self.normalized[layer]
+        if normalized is None:
+            return activation.damp(signal, self.latents[layer], self.activations[layer])
+        activation.damp(signal, normalized.values, self.activations[layer])
+        return signal.copy_(jacobian_product(signal, self.latents[layer], normalized))
+
+    def slope(self, layer: int, move: th.Tensor) -> th.Tensor:
+        """How much a hidden layer's activation changes, to first order, when its latents move by ``move``, (B, n)."""
+        activation = self.settings.activation
+        normalized = self.normalized[layer]
+        if normalized is None:
+            return activation.damp(move.clone(), self.latents[layer], self.activations[layer])
+        change = jacobian_product(move, self.latents[layer], normalized)
+        return activation.damp(change, normalized.values, self.activations[layer])
 
     def start_settling(self) -> None:
         """Give every hidden layer its error neurons (at rest: 0) and its buffers."""
@@ -144,9 +177,9 @@ class SettlingChain:
         """:meth:`feedback_to` from any error ``below`` of the layer that ``layer`` predicts, (B, n_below)."""
         settings = self.settings
         matrix = self.synapses.feedback_matrix(layer, settings.feedback_scale, tied=exact)
-        signal = multiply(below, matrix, settings.bfloat16, out)
+        signal = th.matmul(below, matrix, out=out)
         if exact or not settings.derivative_free:
-            settings.activation.damp(signal, self.latents[layer], self.activations[layer])
+            self.damp(layer, signal)
         return signal
 
     def integrate(self, rates: Rates) -> None:
@@ -177,23 +210,23 @@ class SettlingChain:
                 th.add(self.first_prediction, error, out=latents)
             elif settings.dynamics != "state":
                 th.add(error, self.biases[layer - 1], out=latents)
-                add_product(latents, self.activations[layer - 1], self.synapses.weights[layer - 1].t(), settings.bfloat16)
+                add_product(latents, self.activations[layer - 1], self.synapses.weights[layer - 1].mT)
             else:
                 th.sub(latents, self.biases[layer - 1], out=error)
                 below, weights = self.activations[layer - 1], self.synapses.weights[layer - 1]
-                add_product(error, below, weights.t(), settings.bfloat16, sign=-1.0)
-            self.activations[layer] = settings.activation.apply(latents, self.activations[layer])
+                add_product(error, below, weights.mT, sign=-1.0)
+            self._activate(layer)
         if output:
             self._predict_output()
 
     def activate(self) -> None:
         """Bring activations and output up to date after the hidden latents were set."""
         for layer in range(1, self.n_hidden + 1):
-            self.activations[layer] = self.settings.activation.apply(self.latents[layer], self.activations[layer])
+            self._activate(layer)
         self._predict_output()
 
     def _predict_output(self) -> None:
-        th.addmm(self.biases[-1], self.activations[-1], self.synapses.weights[-1].t(), out=self.output_prediction)
+        self.output_prediction = affine(self.biases[-1], self.activations[-1], self.synapses.weights[-1])
         self.output = self.settings.output_activation.apply(self.output_prediction, self.output)
         if self.target is not None:
             self._refresh_output_error()

@@ -10,7 +10,6 @@ Elman & Schultz, 1983) needs few steps. Every sample takes steps of its own size
 
 import torch as th
 
-from sb3_actpc.ngc.activations import Activation
 from sb3_actpc.ngc.dynamics import SettlingChain
 from sb3_actpc.ngc.products import add_product
 
@@ -61,18 +60,13 @@ def _respond(chain: SettlingChain, drive: th.Tensor) -> tuple[th.Tensor, list[th
     for layer, error in enumerate(errors[:-1], start=1):
         move = error.clone()
         if layer > 1:
-            below = _slope(settings.activation, moves[-1], chain.latents[layer - 1], chain.activations[layer - 1])
-            add_product(move, below, weights[layer - 1].t(), settings.bfloat16)
+            add_product(move, chain.slope(layer - 1, moves[-1]), weights[layer - 1].mT)
         moves.append(move)
-    answer = _slope(settings.activation, moves[-1], chain.latents[n_hidden], chain.activations[n_hidden]) @ weights[-1].t()
+    answer = chain.slope(n_hidden, moves[-1]) @ weights[-1].mT
     for _ in range(2):  # g' once in the prediction, once in the error that reaches the synapses
         answer = settings.output_activation.damp(answer, chain.output_prediction, chain.output)
     return answer.add_(drive), [*errors[:-1], *moves]
 
 
-def _slope(activation: Activation, move: th.Tensor, latents: th.Tensor, activations: th.Tensor) -> th.Tensor:
-    return activation.damp(move.clone(), latents, activations)
-
-
 def _dot(a: th.Tensor, b: th.Tensor) -> th.Tensor:
-    return (a * b).sum(1, keepdim=True)
+    return (a * b).sum(-1, keepdim=True)

@@ -16,6 +16,8 @@ class HebbianChanges:
     """
     Changes *to be added* to the synapses of one circuit, in forward order (first layer first).
 
+    Those of an ensemble have a leading dimension M of members; its biases are (M, 1, n_out).
+
     :param weights: ΔW, each (n_out, n_in)
     :param biases: Δb, each (n_out,)
     :param memory: ΔM, each (n_out, n_memory); empty without a working memory
@@ -45,7 +47,6 @@ def hebbian_changes(
     activations: list[th.Tensor],
     memory: th.Tensor | None,
     memory_weight: float,
-    bfloat16: bool = False,
 ) -> HebbianChanges:
     """
     ΔW = e φ(z)^T, Δb = e, ΔM = α_m e m^T, each the mean over the batch (paper: eq. for ΔW and the appendix).
@@ -54,14 +55,13 @@ def hebbian_changes(
     :param activations: presynaptic activity, each (B, n_in)
     :param memory: (B, n_memory) or None
     :param memory_weight: α_m
-    :param bfloat16: see :func:`~sb3_actpc.ngc.products.multiply`
     :return: the changes to be added
     """
-    inverse_batch = 1.0 / len(errors[0])
+    inverse_batch = 1.0 / errors[0].shape[-2]
     scaled = th._foreach_mul(errors, inverse_batch)
     return HebbianChanges(
-        weights=[sum_outer(error, activity, bfloat16) for error, activity in zip(scaled, activations, strict=True)],
-        biases=[error.sum(0) for error in scaled],
+        weights=[sum_outer(error, activity) for error, activity in zip(scaled, activations, strict=True)],
+        biases=[error.sum(-2, keepdim=error.dim() > 2) for error in scaled],
         memory=[] if memory is None else [_memory_change(error, memory, memory_weight) for error in scaled],
     )
 
@@ -106,5 +106,5 @@ def soft_bound_(new: th.Tensor, old: th.Tensor, bound: float) -> None:
 
 def bound_columns_(weights: th.Tensor, bound: float) -> None:
     """Shrink, in place, every column of ``weights`` (n_out, n_in) whose Euclidean norm passes ``bound`` to that norm."""
-    norms = th.linalg.vector_norm(weights, dim=0, keepdim=True)
+    norms = th.linalg.vector_norm(weights, dim=-2, keepdim=True)
     weights.mul_(bound / norms.clamp_min(bound))

@@ -20,6 +20,19 @@ def power_iteration_(matrix: th.Tensor, vector: th.Tensor, n_iterations: int = 1
     return th.linalg.vector_norm(matrix @ vector)
 
 
+def largest_norm_(matrix: th.Tensor, vector: th.Tensor, n_iterations: int = 1) -> th.Tensor:
+    """
+    :func:`power_iteration_` of one matrix, or of every member of an ensemble.
+
+    :param matrix: (n_out, n_in) or (M, n_out, n_in)
+    :param vector: (n_in,) or (M, n_in); overwritten
+    :return: the largest norm, 0-d
+    """
+    if matrix.dim() == 2:
+        return power_iteration_(matrix, vector, n_iterations)
+    return th.stack([power_iteration_(*member, n_iterations) for member in zip(matrix, vector, strict=True)]).max()
+
+
 def settling_rates(forward_norms: list[float], feedback_norms: list[float]) -> list[float]:
     """
     The rates β that ``settling_rate="auto"`` uses, one per hidden layer (first to last).

@@ -4,15 +4,15 @@ from typing import NamedTuple
 
 import torch as th
 
-from sb3_actpc.ngc.products import multiply
-
 
 class Synapses(NamedTuple):
     """
     The parameters of a circuit as plain lists, in forward order: indexing a ``ParameterList`` is slow.
 
+    An ensemble of M members has a leading dimension M everywhere.
+
     :param weights: W, each (n_out, n_in)
-    :param biases: b, each (n_out,)
+    :param biases: b, each (n_out,), of an ensemble (M, 1, n_out)
     :param memory: M, each (n_out, n_memory); empty without a working memory
     :param feedback: E^T in the layout of W, so that ``errors @ E^T`` is one product without a transposition; empty where the
         feedback is tied, and else without the input's (or with that of its last columns, where errors reach them)
@@ -53,10 +53,3 @@ class Synapses(NamedTuple):
         if self.feedback and not tied:
             return self.feedback[layer - (len(self.weights) - len(self.feedback))]
         return self.weights[layer] if tied or scale == 1.0 else scale * self.weights[layer]
-
-
-def predict(activations: th.Tensor, weights: th.Tensor, bias: th.Tensor, bfloat16: bool = False) -> th.Tensor:
-    """z̄ = W φ(z) + b, with ``bias`` (n_out,) or, memory included, (B, n_out); see :func:`multiply` for ``bfloat16``."""
-    if bfloat16:
-        return multiply(activations, weights.t(), bfloat16).add_(bias)
-    return th.addmm(bias, activations, weights.t())
