@@ -5,10 +5,8 @@ import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from functools import partial, reduce
 from os import PathLike
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
 import numpy as np
@@ -18,7 +16,6 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback, ProgressBarCallback
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.noise import ActionNoise, VectorizedActionNoise
-from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.preprocessing import get_action_dim, get_obs_shape
 from stable_baselines3.common.type_aliases import (
@@ -26,7 +23,6 @@ from stable_baselines3.common.type_aliases import (
     MaybeCallback,
     RolloutReturn,
     Schedule,
-    TrainFreq,
     TrainFrequencyUnit,
 )
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
@@ -40,7 +36,6 @@ from sb3_actpc.actpc.arguments import (
     Size,
     Weight,
     check_actions,
-    check_compile,
     check_computes,
     check_env,
     check_learning_rate,
@@ -49,45 +44,37 @@ from sb3_actpc.actpc.arguments import (
     checked,
 )
 from sb3_actpc.actpc.buffers import CombinedHerReplayBuffer, SignalReplay, combined_buffer_class, relabels
-from sb3_actpc.actpc.calibration import Calibration
-from sb3_actpc.actpc.cloning import Cloning, Imitated
-from sb3_actpc.actpc.compiled import CompiledUpdate, compiled_update, updates_per_step
 from sb3_actpc.actpc.demonstration_replay import DemonstrationReplay
 from sb3_actpc.actpc.diagnostics import Diagnostics
 from sb3_actpc.actpc.features import Batch, CircuitInputs
-from sb3_actpc.actpc.habit import Trials
-from sb3_actpc.actpc.imitation import Imitation
-from sb3_actpc.actpc.policies import POLICIES, ActPCActor, ActPCPolicy, Critics, check_policy, check_policy_kwargs
+from sb3_actpc.actpc.policies import POLICIES, ActPCActor, ActPCPolicy, check_policy, check_policy_kwargs
 from sb3_actpc.actpc.reward_signals import InternalSignals, summed_squared_errors
-from sb3_actpc.actpc.self_imitation import Episodes, Observations, Refresh, is_by_return, map_observations
-from sb3_actpc.actpc.trust_region import spread_of
-from sb3_actpc.actpc.within_episodes import feature_weights
+from sb3_actpc.actpc.self_imitation import Episodes, Observations, map_observations, sample_union
+from sb3_actpc.actpc.transfer import to_device
 from sb3_actpc.checkpoints import Restored, between_updates, load_checkpoint, load_weights, save_weights
 from sb3_actpc.demonstrations import fit_demonstrations
 from sb3_actpc.demonstrations.dataset import Demonstrations
 from sb3_actpc.demonstrations.recording import ENDLESS
-from sb3_actpc.ngc import CoupledState, HebbianChanges, NGCCircuit, settle_coupled
+from sb3_actpc.guidance import ActorGuidance, BehaviorGuidance, GuidanceConfig, GuidanceContext
+from sb3_actpc.guidance.base import ImitationBatch
+from sb3_actpc.ngc import NGCCircuit, settle_coupled
 from sb3_actpc.utils.checks import Settings, check_finite, check_kind, named_in_errors, nearest
 from sb3_actpc.utils.constructors import constructor_keywords
+from sb3_actpc.utils.rollouts import StoresLastTransition
 
 SelfActPC = TypeVar("SelfActPC", bound="ActPC")
-Weighing = float | th.Tensor  # a weight: a number, or 0-d where an update is one graph, whose numbers are constants
-
-# of the mean absolute action-value that ``scale_pressure`` divides by: one paid step. Where nothing was paid yet, the critic's
-# noise must not be blown up to full strength
+# of the mean absolute action-value that the critic term is divided by: where no reward was seen yet, the critic's noise must not
+# be scaled up to full strength
 SMALLEST_VALUE_SCALE = 1.0
 _OF_ANOTHER_VERSION = "{path} is of another version of sb3_actpc ({why}): load it with that one"
-FROM_DEMONSTRATIONS = ("demonstrations", "episodes")  # normalisations
-NEED_DEMONSTRATIONS = ("demonstration_fraction", "actor_warm_start", "n_demonstrations", "n_demonstration_transitions")
+NEED_DEMONSTRATIONS = ("demonstration_fraction", "n_demonstrations", "n_demonstration_transitions")
 EXPERT_SIGNALS_INTERVAL = 1000  # updates between two evaluations of the demonstrations' signals
 PRETRAINING_INTERVAL = 5000  # updates between two lines about pre-training
 TARGET_NOISE_CLIP = 2.5  # standard deviations, as TD3's 0.5 for 0.2
-AVERAGING_RATE = 0.001  # per update, of the average of the actor that becomes the habit
 LARGEST_BOUND = 1e6  # of an observation; larger ones stand for none
-CANDIDATE_AGE = 2000  # updates of a pressing critic before that average is a candidate: one that begins is wrong
 
 
-class ActPC(OffPolicyAlgorithm):
+class ActPC(StoresLastTransition):
     """
     Active predictive coding: four NGC circuits that learn by settling and Hebbian changes, never by backprop.
 
@@ -100,18 +87,12 @@ class ActPC(OffPolicyAlgorithm):
     ====================================== ============== =======
     keyword                                demonstrations without
     ====================================== ============== =======
-    ``learning_starts``                    0              100
-    ``tau``                                0.02           0.005
-    ``n_steps``                            5              1
-    ``actor_warm_start``                   7500           0
-    ``critic_warmup``                      3000           0
+    ``learning_starts``                    0              1000
+    ``n_steps``                            3              1
     ``demonstration_fraction``             0.5            0
-    ``observation_normalization``          episodes       none
-    ``policy_kwargs["habit"]``             True           False
-    the actor's learning rate, of others'  1/4 [#]_       1
+    ``observation_normalization``          demonstrations none
+    ``guidance``                           default        none
     ====================================== ============== =======
-
-    .. [#] with a habit
 
     :param policy: "MlpPolicy", "MultiInputPolicy", "CnnPolicy" (fixed random convolutions) or a class
     :param env: the environment, or its id
@@ -135,48 +116,37 @@ class ActPC(OffPolicyAlgorithm):
     :param settling: "scheduled" (one ordered sweep of the errors, the zero-divergence schedule or Z-IL of the
         predictive-coding literature) or "iterative" (settle, then change; the paper's K steps
         of eq. 1 with ``circuit_kwargs=dict(dynamics="state")``)
-    :param exploration_noise: standard deviation of the Gaussian noise on the actions in [-1, 1]; with demonstrations at most
-        their spread around the warm-started actor (0.02 at least), dimension by dimension, or, where the habit teaches the
-        learning actor, the trust region's unit. With a habit a noisy episode is followed by as many steps without. 0 for none
-        (the paper)
-    :param policy_delay: updates of the critic for each of the actor, as in TD3; the paper's is 1
+    :param exploration_noise: standard deviation of the Gaussian noise on the actions in [-1, 1]; with guidance at most the
+        residual standard deviation of the demonstrated actions. 0 for none (the paper)
+    :param policy_delay: updates of the critic for each of the actor; the paper's is 1
     :param demonstrations: a path, a Minari id, or a :class:`~sb3_actpc.demonstrations.dataset.Demonstrations`. A path is saved
         as it was given; others can be set later (``agent.demonstrations = ...``), which a trained prior outlasts
     :param n_demonstrations: use only the first so many episodes of them
     :param n_demonstration_transitions: use only the first so many transitions (the paper's "300 samples")
     :param prior_updates: updates of the prior on the demonstrations before learning starts, where ``alpha_in`` gives it a
         role; then it is frozen
-    :param actor_warm_start: updates on the demonstrations before learning starts, of the actor and of each member of the
-        ensemble that teaches it (:mod:`sb3_actpc.actpc.cloning`); the learning rate falls meanwhile
     :param refresh_weight: weight of the actor's refresh from the demonstrations and its own good episodes
-    :param refresh_kwargs: keywords of :class:`~sb3_actpc.actpc.self_imitation.Refresh`, for refresh and warm start:
-        ``weighting`` (by "returns"; the paper's is "uniform"), ``own_episodes``, ``noise``, ``weight_decay``,
-        ``ensemble_size``, ``n_clones`` and ``habit``
     :param demonstration_fraction: share of the batch, which all circuits share, that comes from the demonstrations
     :param alpha_ep: weight of the epistemic signal
     :param alpha_in: weight of the instrumental signal
     :param alpha_ext: weight of the task's reward (the paper's is 0 with demonstrations)
     :param signal_kwargs: keywords of :class:`~sb3_actpc.actpc.reward_signals.InternalSignals`: ``normalizer``,
         ``normalization`` (which by default keep the signals alive), ``instrumental_form``, ``errors``
-    :param actor_pressure: weight of the critic's pressure on the actor; with a habit a trust region multiplies it
-        (:mod:`sb3_actpc.actpc.trust_region`; ``pressure`` is the present product). 0 leaves refresh alone (cloning)
-    :param scale_pressure: divide the pressure by the batch's mean absolute action-value (at least 1: one paid step)
-    :param critic_warmup: updates before the critic's pressure reaches the actor
+    :param critic_weight: weight of the critic term in the actor's update. 0 leaves imitation alone
+    :param normalize_critic_term: divide that term by the batch's mean absolute action-value (at least 1)
     :param bootstrap: "joint" (target critic at the target actor's next action, the appendix) or "literal" (at the action
         taken, the main text's equation)
     :param target_policy_noise: standard deviation of the noise on the target actor's action; 0 for none
     :param target_update_interval: the targets move after every update (1), or every so many environment steps; hard copies
         as in DQN are ``tau=1, target_update_interval=C``
-    :param observation_normalization: "none" (the paper), "demonstrations" (their mean and standard deviation, fixed),
-        "episodes" (the same, and what varies less within episodes than between them is taken smaller where the demonstrations
-        then tell better what is done, but for what never changes within one: :mod:`sb3_actpc.actpc.within_episodes`) or
-        "bounds" (those of the observation space, which must be finite, become -1 and 1)
-    :param compile: run the updates of circuits that sweep, or settle by eq. 1, as one graph of ``torch.compile`` (see
-        :mod:`~sb3_actpc.actpc.compiled`): True, False or "auto", where the run is long enough to earn it. On a GPU, sweeps
-        are a CUDA graph in its place (:mod:`~sb3_actpc.actpc.captured`), which takes no time to make: True and "auto" alike
-    :param policy_kwargs: keywords of :class:`~sb3_actpc.actpc.policies.ActPCPolicy`: ``net_arch``, ``n_critics``, ``habit``,
-        ``trust_radius``, ``nudge``, ``memory_history`` (the working memory), ``circuit_kwargs`` (of every
-        :class:`~sb3_actpc.ngc.NGCCircuit`: ``n_settling_steps``, ``feedback``, ``dynamics``, ``matmul_precision``,
+    :param observation_normalization: "none" (the paper), "demonstrations" (their mean and standard deviation, fixed)
+        or "bounds" (those of the observation space, which must be finite, become -1 and 1)
+    :param guidance: what is added to the paper (:mod:`sb3_actpc.guidance`): None for the default guidance with demonstrations
+        and none without, "default", "none" for the paper's agent, or an
+        :class:`~sb3_actpc.guidance.base.ActorGuidance`
+    :param guidance_kwargs: keywords of :class:`~sb3_actpc.guidance.guidance.GuidanceConfig`
+    :param policy_kwargs: keywords of :class:`~sb3_actpc.actpc.policies.ActPCPolicy`: ``net_arch``, ``n_critics``, ``nudge``, ``memory_history`` (the working memory), ``circuit_kwargs`` (of every
+        :class:`~sb3_actpc.ngc.NGCCircuit`: ``n_settling_steps``, ``feedback``, ``dynamics``, ``normalization``,
         ``synaptic_scaling``, ...), ``actor_kwargs``, ``critic_kwargs``, ``generator_kwargs`` and ``prior_kwargs`` (of one, and
         its ``net_arch``, ``learning_rate`` and ``batch_size``)
     :param stats_window_size: as in SB3
@@ -194,8 +164,8 @@ class ActPC(OffPolicyAlgorithm):
     policy: ActPCPolicy
     replay_buffer: SignalReplay | None
     actor: ActPCActor
-    critic: Critics
-    critic_target: Critics
+    critic: NGCCircuit
+    critic_target: NGCCircuit
     generator: NGCCircuit
     prior: NGCCircuit
     actor_target: NGCCircuit
@@ -205,14 +175,14 @@ class ActPC(OffPolicyAlgorithm):
         self,
         policy: Annotated[str | type[ActPCPolicy], check_policy],
         env: Annotated[GymEnv | str, check_env],
-        learning_rate: Annotated[float | Schedule, check_learning_rate] = 4e-4,
+        learning_rate: Annotated[float | Schedule, check_learning_rate] = 3e-4,
         buffer_size: Size = 1_000_000,
         learning_starts: Annotated[float | None, Between(0)] = None,
         batch_size: Size = 128,
-        tau: Annotated[float | None, Between(0, 1)] = None,
+        tau: Share = 0.005,
         gamma: Share = 0.99,
         train_freq: Annotated[int | tuple[int, str], check_train_freq] = 1,
-        gradient_steps: Annotated[int, Between(-1)] = 1,
+        gradient_steps: Annotated[int, Between(-1)] = 4,
         action_noise: Annotated[ActionNoise | None, check_noise] = None,
         replay_buffer_class: type[ReplayBuffer] | str | None = None,
         replay_buffer_kwargs: Settings | None = None,
@@ -224,24 +194,22 @@ class ActPC(OffPolicyAlgorithm):
         n_demonstrations: Annotated[int | None, Between(1)] = None,
         n_demonstration_transitions: Annotated[int | None, Between(1)] = None,
         prior_updates: Count = 2000,
-        actor_warm_start: Annotated[int | None, Between(0)] = None,
         refresh_weight: Weight = 1.0,
-        refresh_kwargs: Settings | None = None,
         demonstration_fraction: Annotated[float | None, Between(0, 1)] = None,
         exploration_noise: Weight = 0.1,
         alpha_ep: Weight = 0.0,
         alpha_in: Weight = 0.0,
         alpha_ext: float = 1.0,
         signal_kwargs: Settings | None = None,
-        actor_pressure: Weight = 1.0,
-        scale_pressure: bool = True,
-        critic_warmup: Annotated[int | None, Between(0)] = None,
-        policy_delay: Size = 2,
+        critic_weight: Weight = 1.0,
+        normalize_critic_term: bool = True,
+        policy_delay: Size = 4,
         bootstrap: Literal["joint", "literal"] = "joint",
         target_policy_noise: Weight = 0.2,
         target_update_interval: Annotated[int, Between(1)] = 1,
-        observation_normalization: Literal["none", "demonstrations", "episodes", "bounds"] | None = None,
-        compile: Annotated[bool | str, check_compile] = "auto",
+        observation_normalization: Literal["none", "demonstrations", "bounds"] | None = None,
+        guidance: ActorGuidance | str | None = None,
+        guidance_kwargs: Settings | None = None,
         policy_kwargs: Settings | None = None,
         stats_window_size: Size = 100,
         tensorboard_log: str | None = None,
@@ -250,30 +218,35 @@ class ActPC(OffPolicyAlgorithm):
         seed: Annotated[int | None, Between(0, MAX_SEED)] = None,
         _init_setup_model: bool = True,
     ) -> None:
-        shown = demonstrations is not None
+        has_demonstrations = demonstrations is not None
 
         def default(given: Any, with_demonstrations: Any, without: Any) -> Any:
-            return given if given is not None else with_demonstrations if shown else without
+            if given is not None:
+                return given
+            return with_demonstrations if has_demonstrations else without
 
-        of_one_step = relabels(replay_buffer_class) or optimize_memory_usage or bootstrap == "literal"
-        n_steps = default(n_steps, 1 if of_one_step else 5, 1)
+        is_one_step = relabels(replay_buffer_class) or optimize_memory_usage or bootstrap == "literal"
+        n_steps = default(n_steps, 1 if is_one_step else 3, 1)
+        self.guidance = _make_guidance(guidance, guidance_kwargs, has_demonstrations)
+        if self.guidance.has_gate:
+            policy_kwargs = {"is_gated": True, **(policy_kwargs or {})}
         super().__init__(
             policy,
             env,
             learning_rate,
             buffer_size,
-            default(learning_starts, 0, 100),
+            default(learning_starts, 0, 1000),
             batch_size,
-            default(tau, 0.02, 0.005),
+            tau,
             gamma,
             train_freq,
             gradient_steps,
             action_noise=action_noise,
             replay_buffer_class=replay_buffer_class,  # type: ignore[arg-type]
-            replay_buffer_kwargs=replay_buffer_kwargs,
+            replay_buffer_kwargs=dict(replay_buffer_kwargs or {}),
             optimize_memory_usage=optimize_memory_usage,
             n_steps=n_steps,
-            policy_kwargs={"habit": True, **(policy_kwargs or {})} if shown else policy_kwargs,
+            policy_kwargs=dict(policy_kwargs or {}),
             stats_window_size=stats_window_size,
             tensorboard_log=tensorboard_log,
             verbose=verbose,
@@ -288,32 +261,23 @@ class ActPC(OffPolicyAlgorithm):
         self.n_demonstrations = n_demonstrations
         self.n_demonstration_transitions = n_demonstration_transitions
         self.prior_updates = prior_updates
-        self.actor_warm_start: int = default(actor_warm_start, 7500, 0)
         self.refresh_weight = refresh_weight
-        self.refresh_kwargs = refresh_kwargs
         self.demonstration_fraction: float = default(demonstration_fraction, 0.5, 0.0)
         self.exploration_noise = exploration_noise
         self.alpha_ep = alpha_ep
         self.alpha_in = alpha_in
         self.alpha_ext = alpha_ext
-        self.actor_pressure = actor_pressure
-        self.scale_pressure = scale_pressure
-        self.critic_warmup: int = default(critic_warmup, 3000, 0)
+        self.critic_weight = critic_weight
+        self.normalize_critic_term = normalize_critic_term
         self.policy_delay = policy_delay
         self.bootstrap = bootstrap
         self.target_policy_noise = target_policy_noise
         self.target_update_interval = target_update_interval
-        self.observation_normalization: str = default(observation_normalization, "episodes", "none")
-        self.compile = compile
+        self.observation_normalization: str = default(observation_normalization, "demonstrations", "none")
         self.signal_kwargs = signal_kwargs
         self.signals = InternalSignals()
-        self.n_cloning_updates = 0
-        self.cloning: Cloning | None = None  # while the actor becomes a clone
-        self.trials: Trials | None = None
-        self.calibration: Calibration | None = None  # of the critic, where a trust region regulates its pressure
-        self._meant: np.ndarray | None = None  # what the last actions were before their noise
-        self._has_bar = False  # whether learning shows its progress
-        self._is_taught = False  # whether the habit teaches the learning actor
+        self.guidance_kwargs = guidance_kwargs
+        self._is_stepping = False  # between a choice of actions and the storage of what followed
         self._awaits_parameters = not _init_setup_model  # ``load`` sets them
         self._steps_at_pause: list[int] | None = None  # that the environments had made when ``learn`` ended
         if _init_setup_model:
@@ -328,9 +292,7 @@ class ActPC(OffPolicyAlgorithm):
         assert isinstance(self.action_space, spaces.Box)
         check_actions(self.action_space, self.action_noise)
         self._check_together()
-        # both here, as a loaded agent may be given others; of the same signals it keeps what their normalisers have seen
-        with named_in_errors(f"refresh_kwargs={self.refresh_kwargs!r}"):
-            self.refresh = Refresh(**(self.refresh_kwargs or {}))
+        # here, as a loaded agent may be given others; of the same signals it keeps what their normalizers have seen
         with named_in_errors(f"signal_kwargs={self.signal_kwargs!r}"):
             signals = InternalSignals(**(self.signal_kwargs or {}))
             self.signals = self.signals if self.signals.settings == signals.settings else signals
@@ -341,18 +303,9 @@ class ActPC(OffPolicyAlgorithm):
             self.replay_buffer = self._make_replay_buffer()
         self._convert_train_freq()
         self._create_aliases()
-        if self.policy.habit:
-            clones = self.refresh.n_clones - 1 if self.demonstrations is not None and self.actor_warm_start else 0
-            # of a loaded agent, whose environment may be another: what it paid is forgotten
-            goes_on = self.trials is not None and self._last_obs is not None
-            self.trials = (self.trials or Trials(1, n_clones=clones)).forgotten(self.n_envs, goes_on)
-            self.trials.n_clones = min(self.trials.n_clones, clones)
-        if self.policy.habit and self.policy.trust_region is not None:
-            self.calibration = (self.calibration or Calibration(1)).forgotten(self.n_envs)
         self._setup_demonstrations()
         self._fit_to_bounds()
         self.diagnostics = Diagnostics(self.policy)
-        self._compiled: CompiledUpdate | None = None
 
     def _make_policy(self) -> ActPCPolicy:
         given = self.policy_kwargs.get("circuit_kwargs") or {}
@@ -429,7 +382,6 @@ class ActPC(OffPolicyAlgorithm):
     def _setup_demonstrations(self) -> None:
         """Check the demonstrations against the environment, cut them, and derive what follows from having them."""
         self.expert: DemonstrationReplay | None = None
-        self.imitation = Imitation(self)
         self._followed = self.demonstrations, self.n_demonstrations, self.n_demonstration_transitions
         if self.demonstrations is None:
             self._do_without_demonstrations()
@@ -450,30 +402,29 @@ class ActPC(OffPolicyAlgorithm):
             raise kind(f"{error}. A trained agent can do without: demonstrations=None") from error
         assert isinstance(self.action_space, spaces.Box)
         self.expert = DemonstrationReplay(demonstrations, self.observation_space, self.action_space, self.memory_history)
-        if self.observation_normalization in FROM_DEMONSTRATIONS and not (self.pretrained or self._awaits_parameters):
+        if self.observation_normalization == "demonstrations" and not (self.pretrained or self._awaits_parameters):
             self.actor.normalizer.begin()
             if not self.inputs.are_normalised:
-                self._fit_to_demonstrations(self.expert.episodes)
+                self.actor.normalizer.fit(self._features_of(self.expert.episodes))
 
     def _do_without_demonstrations(self) -> None:
         """:raises ValueError: for settings that need them, of an agent that has not learned from any"""
         idle = [name for name in NEED_DEMONSTRATIONS if getattr(self, name)]
-        idle += ["observation_normalization"] if self.observation_normalization in FROM_DEMONSTRATIONS else []
+        idle += ["observation_normalization"] if self.observation_normalization == "demonstrations" else []
         if idle and not self._is_trained():
             raise ValueError(f"{' and '.join(idle)} need demonstrations=; pass a file or leave them out")
         if idle:  # what these did stays in the circuits
-            self.demonstration_fraction, self.actor_warm_start = 0.0, 0
+            self.demonstration_fraction = 0.0
             self.n_demonstrations = self.n_demonstration_transitions = None
 
     def _is_trained(self) -> bool:
-        return bool(self.pretrained or self.num_timesteps or self.n_cloning_updates)
+        return bool(self.pretrained or self.num_timesteps)
 
-    def _fit_to_demonstrations(self, shown: Episodes) -> None:
-        normalizer, rows = self.actor.normalizer, np.arange(len(shown))
-        normalizer.fit(self.imitation.features_of(shown, rows))
-        if self.observation_normalization == "episodes":
-            features, actions = self.imitation.features_of(shown, rows), self.inputs.tensor(shown.actions)
-            normalizer.weigh(feature_weights(features, actions, shown.starts))
+    def _features_of(self, episodes: Episodes) -> th.Tensor:
+        """(N, n_features), some at a time: there can be many images."""
+        rows = np.array_split(np.arange(len(episodes)), 1 + len(episodes) // 1024)
+        parts = [self.inputs.observations(episodes.take(some).observations) for some in rows]
+        return th.cat([self.inputs.features(part) for part in parts])
 
     def _fit_to_bounds(self) -> None:
         """The mean and standard deviation of the lowest and the highest observation map them to -1 and 1."""
@@ -506,18 +457,12 @@ class ActPC(OffPolicyAlgorithm):
                 f"no demonstrations file at {self.demonstrations}, and learning needs it: put it back, or set "
                 "agent.demonstrations"
             )
-        if self.trials is not None and (self.expert is None or not self.actor_warm_start):
-            self.trials.n_clones = 0  # of nothing, or that learn nothing
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
-        """As in SB3. What was paid in another environment, the habit's and the own episodes', is forgotten; ValueError where
-        demonstrations do not fit."""
+        """As in SB3. Returns of another environment are forgotten; ValueError where demonstrations do not fit."""
         super().set_env(env, force_reset)
         self._steps_at_pause = None
-        if self.trials is not None:  # another environment may pay for other steps
-            self.trials = self.trials.forgotten(self.n_envs, goes_on=not force_reset)
-        if self.calibration is not None:
-            self.calibration = self.calibration.forgotten(self.n_envs)
+        self.guidance.load_state_dict({"selection": None})
         if self.replay_buffer is not None:
             self.replay_buffer.forget_own_episodes()
         if isinstance(self.replay_buffer, HerReplayBuffer):  # SB3 goes on paying by the old one
@@ -563,10 +508,7 @@ class ActPC(OffPolicyAlgorithm):
             self._rollout_starts = np.ones(self.n_envs, dtype=bool)
             if self.replay_buffer is not None:
                 self.replay_buffer.cut_running_episodes()
-            if self.trials is not None:
-                self.trials.begin_all()
-            if self.calibration is not None:
-                self.calibration.begin_all()
+            self.guidance.on_reset()
         result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
         self._check_observations(self._last_obs)
         self._follow_demonstrations()
@@ -575,19 +517,12 @@ class ActPC(OffPolicyAlgorithm):
         self.replay_buffer.set_returns(self.n_steps, self.gamma)
         memory = self.replay_buffer.self_imitation
         if memory is not None:
-            is_weighted = self.expert is not None and is_by_return([self.expert.episodes], self.refresh.weighting)
-            memory.takes_all = is_weighted and self.refresh.own_episodes == "paid"
-            if memory.episodes is not None:
-                memory.episodes.neighbours = None  # the demonstrations may be others by now
+            memory.takes_all = self.guidance.stores == "positive" and self.expert is not None
         self._warn_of_idle_settings()
         if self.verbose:
             print(self.describe(), flush=True)
-        self._has_bar = _shows_progress(result[1])
-        self.pretrain(between_updates(result[1]), self._has_bar)
-        self._is_taught = self.imitation.is_taught
-        self._follow_calibration()
+        self.pretrain(between_updates(result[1]), _shows_progress(result[1]))
         self.start_time = time.time_ns()  # of the frames per second: pre-training has none
-        self._compiled = self._compiled or compiled_update(self, self._total_timesteps)  # resumed, as straight
         return result
 
     def _steps_of_envs(self) -> list[int] | None:
@@ -623,8 +558,7 @@ class ActPC(OffPolicyAlgorithm):
             )
 
     def _warn_of_idle_settings(self) -> None:
-        """Warns of a run with too few updates for a learner to prove itself, of a signal that nobody makes, and of an agent
-        that was taught by demonstrations and has none."""
+        """Warns of a signal that nobody makes, and of an agent that was taught by demonstrations and has none."""
         if self.pretrained and self.demonstrations is None and self.refresh_weight:
             warnings.warn(
                 "the agent was taught by demonstrations and goes on without them, so that nothing of them is imitated: pass "
@@ -637,16 +571,6 @@ class ActPC(OffPolicyAlgorithm):
                 f"alpha_ext={self.alpha_ext:g} times the task's and alpha_ep={self.alpha_ep:g} times the epistemic signal",
                 stacklevel=5,
             )
-        n_steps, needed = self._total_timesteps - self.num_timesteps, self.critic_warmup + CANDIDATE_AGE
-        n_updates = self._n_updates + round(n_steps * updates_per_step(self))
-        if updates_per_step(self) < 1.0 and self.trials is not None and self.actor_pressure and n_updates <= needed:
-            every = self.train_freq.frequency if isinstance(self.train_freq, TrainFreq) else self.train_freq
-            warnings.warn(
-                f"{self._total_timesteps} steps of n_envs={self.n_envs} with gradient_steps={self.gradient_steps} and "
-                f"train_freq={every} make {n_updates} updates in all, and nothing but clones can become the habit before "
-                f"update {needed}: gradient_steps=-1 makes as many updates as there are steps",
-                stacklevel=5,
-            )
 
     def describe(self) -> str:
         """What the reward is made of, from which demonstrations, and what is off; ``learn`` prints it with ``verbose=1``."""
@@ -656,7 +580,7 @@ class ActPC(OffPolicyAlgorithm):
             "the task's reward": ext,
             "generator": ep,
             "prior": inst,
-            "critic's pressure": self.actor_pressure,
+            "critic term": self.critic_weight,
             "refresh": self.refresh_weight,
             "self-imitation": self.replay_buffer.self_imitation is not None,
             "demonstrations in the critic's batch": self.demonstration_fraction,
@@ -665,50 +589,62 @@ class ActPC(OffPolicyAlgorithm):
         return (
             f"reward: {ext:g} x task (alpha_ext) + {ep:g} x epistemic (alpha_ep) + {inst:g} x instrumental signal (alpha_in)\n"
             f"demonstrations: {'none' if self.expert is None else self.expert.demonstrations!r}\n"
-            f"{self.imitation.describe()}\n"
+            f"{self.guidance.describe()}\n"
             f"off: {', '.join(name for name, value in parts.items() if not value) or 'nothing'}"
         )
 
     def pretrain(self, before_update: Callable[[], None] = lambda: None, progress_bar: bool = False) -> None:
         """
-        Train the prior (and, if asked for, the actor's teachers and the actor) on the demonstrations, once; ``learn`` calls
-        this. It goes on where a checkpoint was taken.
+        Train the prior on the demonstrations and let guidance start, once; ``learn`` calls this.
 
         :param before_update: called before each update
         :param progress_bar: show one
         """
         # without a weight the prior has no role
         n_prior = self.prior_updates - int(self.policy.n_prior_updates) if self.alpha_in else 0
-        if self.expert is None or (self.pretrained and n_prior <= 0):
-            return
-        if self.inputs.are_normalised:
-            warnings.warn(
-                "VecNormalize's observation statistics drift under what is learned now, and those of the demonstrations "
-                "(observation_normalization) are not used: use VecNormalize(norm_obs=False)",
-                stacklevel=2,
-            )
-        if self.cloning is None and not self.pretrained:
-            self.n_cloning_updates = 0  # an agent that was saved meanwhile begins again: its teachers are not in the file
+        if self.expert is not None and not self.pretrained:
+            if self.inputs.are_normalised:
+                warnings.warn(
+                    "VecNormalize's observation statistics drift under what is learned now, and those of the demonstrations "
+                    "(observation_normalization) are not used: use VecNormalize(norm_obs=False)",
+                    stacklevel=2,
+                )
             self._show_to_vec_normalize()
-            self.cloning = self.imitation.clone_into(self.actor.circuit)
-        n_updates = max(n_prior, 0) + (0 if self.cloning is None else len(self.cloning) - self.n_cloning_updates)
-        for update in _counted(n_updates, "pre-training", progress_bar):
+        for update in _counted(max(n_prior, 0) if self.expert is not None else 0, "prior", progress_bar):
             if self.verbose and not progress_bar and update % PRETRAINING_INTERVAL == 0:
-                print(f"pre-training: update {update} of {n_updates}", flush=True)
+                print(f"pre-training: update {update} of {n_prior}", flush=True)
             before_update()
-            if update < n_prior:
-                self._update_prior(self.policy.batch_size_of("prior", self.batch_size))
-                self.policy.n_prior_updates.add_(1)
-            elif self.cloning is not None:
-                self.cloning.update(self.n_cloning_updates)
-                self.n_cloning_updates += 1
-        if self.pretrained:
-            return
-        self.cloning = None
-        self._start_from(self.actor.circuit)
-        if self.actor_warm_start and self.trials is not None:
-            self.trials.n_clones = self.refresh.n_clones - 1
-        self.policy.has_imitated.fill_(1.0)
+            self._update_prior(self.policy.batch_size_of("prior", self.batch_size))
+            self.policy.n_prior_updates.add_(1)
+        self.guidance.on_training_start(self._context(), self.pretrained)
+        if self.expert is not None:
+            self.policy.has_imitated.fill_(1.0)
+
+    def _context(self) -> GuidanceContext:
+        """What guidance may use of this agent."""
+        return GuidanceContext(
+            actor=self.actor.circuit,
+            targets=[self.actor_target],
+            n_envs=self.n_envs,
+            sample=self.sample_imitated if self._imitated_parts() else None,
+            residual_std=self.policy.residual_std,
+            selection_circuits=self.policy.selection_circuits(),
+        )
+
+    def _imitated_parts(self) -> list[Episodes]:
+        """What refresh draws from: the demonstrations and the self-imitation memory."""
+        assert self.replay_buffer is not None
+        memory = self.replay_buffer.self_imitation
+        own = [] if memory is None or memory.episodes is None else [memory.episodes]
+        return own if self.expert is None else [self.expert.episodes, *own]
+
+    def sample_imitated(self, n: int) -> ImitationBatch:
+        """Features (n, n_features), actions (n, A) and working memory of ``n`` imitated steps."""
+        samples = sample_union(self._imitated_parts(), n, self.memory_history, self.guidance.weighting)
+        arrays = self.inputs.normalized(samples.observations), samples.actions.astype(np.float32, copy=False)
+        observed, actions = to_device(arrays, self.inputs.device)
+        memory = self.inputs.memory(*self.inputs.past(samples.history, samples.history_mask))
+        return self.inputs.features(observed), actions, memory
 
     def _show_to_vec_normalize(self) -> None:
         """Its statistics are of the demonstrations before anything learns from these: they have seen one observation else."""
@@ -727,17 +663,6 @@ class ActPC(OffPolicyAlgorithm):
         if self._last_original_obs is not None:
             self._last_obs = normalize.normalize_obs(self._last_original_obs)
 
-    def _start_from(self, clone: NGCCircuit) -> None:
-        """Learning begins with this actor."""
-        if clone is not self.actor.circuit:
-            _copy(clone, self.actor.circuit)
-        _copy(self.actor.circuit, self.actor_target, self.actor.habit, self.policy.actor_average)
-        if self.actor_warm_start:
-            self.actor.circuit.optimizer.state.clear()  # its moments are those of other learning rates
-            self.policy.spread.copy_(spread_of(self._imitation_residuals()))
-            if self.policy.trust_region is not None:
-                self.policy.trust_region.measure_by(self.policy.spread, self.imitation.guesses, self.imitation.is_held)
-
     def _update_prior(self, batch_size: int) -> None:
         assert self.expert is not None
         for group in self.prior.optimizer.param_groups:  # a run before may have ended at another rate
@@ -749,60 +674,40 @@ class ActPC(OffPolicyAlgorithm):
     # ------------------------------------------------------------------ collecting
 
     def collect_rollouts(self, *args: Any, **kwargs: Any) -> RolloutReturn:
-        """As in SB3. A callback that stops, or Ctrl-C, leaves a step that was made and is not stored: the next ``learn`` must
-        not go on from the observation before it, but reset the environments."""
+        """As in SB3. An exception between the environment's step and its storage loses a transition: the next ``learn`` resets
+        the environments."""
         try:
-            rollout = super().collect_rollouts(*args, **kwargs)
+            return super().collect_rollouts(*args, **kwargs)
         except BaseException:
-            self._last_obs = None
+            if self._is_stepping:
+                self._last_obs = None
             raise
-        if not rollout.continue_training:
-            self._last_obs = None
-        return rollout
 
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
     ) -> tuple[np.ndarray, np.ndarray]:
         assert self._last_obs is not None
-        warming_up, roles = self.num_timesteps < learning_starts, ["actor"] * n_envs
-        if self.trials is not None:
-            roles = list(self.trials.roles)
+        self._is_stepping = True
+        warming_up = self.num_timesteps < learning_starts
+        context = self._context()
         if self.memory_history or not warming_up:  # the working memory follows random actions too
-            players = {"actor": self.actor.circuit, "candidate": self.policy.candidate, "habit": self.actor.habit}
-            circuits = [players[role] for role in roles]
+            circuits = self.guidance.acting_circuits(context)
             scaled, self._rollout_state = self.actor.roll_out(
-                self._last_obs,
-                self._rollout_state,
-                self._rollout_starts,
-                circuits,  # type: ignore[arg-type]
+                self._last_obs, self._rollout_state, self._rollout_starts, circuits
             )
         if warming_up:
             scaled = self.policy.scale_action(np.array([self.action_space.sample() for _ in range(n_envs)]))
         check_finite("actor", "actions", scaled, self.num_timesteps)
-        self._meant = None if warming_up else scaled
         if action_noise is not None or self.exploration_noise:
-            noise = self._exploration(scaled.shape) if action_noise is None else action_noise()
-            noisy = np.array([role == "actor" for role in roles]).reshape(-1, *[1] * (scaled.ndim - 1))
-            scaled = np.clip(scaled + noisy * noise, -1.0, 1.0).astype(np.float32)
+            noise = self._exploration_noise(context, scaled.shape) if action_noise is None else action_noise()
+            explores = np.array([self.guidance.explores(env) for env in range(n_envs)])
+            scaled = np.clip(scaled + explores.reshape(-1, *[1] * (scaled.ndim - 1)) * noise, -1.0, 1.0).astype(np.float32)
         return self.policy.unscale_action(scaled), scaled
 
-    def _exploration(self, shape: tuple[int, ...]) -> np.ndarray:
-        """
-        Gaussian noise, in any dimension no wider than the demonstrations spread around the warm-started actor or, where the
-        habit teaches the learning actor, than the trust region's unit: where that may go the critic must have seen what
-        actions do.
-        """
-        region = self.policy.trust_region
-        widest = region.unit if region is not None and self._is_taught else self.policy.spread
-        scale = widest.clamp_max(float(self.exploration_noise)).cpu().numpy().reshape(shape[1:])
+    def _exploration_noise(self, context: GuidanceContext, shape: tuple[int, ...]) -> np.ndarray:
+        """Gaussian noise in ``shape``, (n_envs, *action_shape)."""
+        scale = self.guidance.exploration_scale(context, float(self.exploration_noise)).reshape(shape[1:])
         return np.random.normal(size=shape).astype(np.float32) * scale
-
-    def _imitation_residuals(self) -> th.Tensor:
-        """Demonstrated actions minus the actor's, (N, A), of 4096 at most."""
-        assert self.expert is not None
-        rows = np.random.randint(0, len(self.expert), size=min(len(self.expert), 4096))
-        batch = self.expert.batch(rows, self.inputs, self.reward_weights, self.gamma)
-        return batch.actions - self.actor.circuit.project(batch.features, batch.memory)
 
     def _store_transition(
         self,
@@ -820,61 +725,53 @@ class ActPC(OffPolicyAlgorithm):
         check_finite("environment", "rewards", reward, self.num_timesteps)
         score = self._score if any(self.reward_weights[1:]) else None
         assert isinstance(replay_buffer, SignalReplay)
-        self._calibrate(buffer_action, reward, dones, infos)
-        scored: Any = SimpleNamespace(add=partial(replay_buffer.add, score=score))  # SB3 calls ``add`` and nothing else
-        super()._store_transition(scored, buffer_action, new_obs, reward, dones, infos)
+        next_obs, rewards = self._before_auto_reset(new_obs, reward, dones, infos)
+        replay_buffer.add(
+            self._last_original_obs,  # type: ignore[arg-type]
+            next_obs,  # type: ignore[arg-type]
+            buffer_action,
+            rewards,
+            dones,
+            infos,
+            score=score,
+        )
+        self._last_obs = new_obs
+        if self._vec_normalize_env is not None:
+            self._last_original_obs = self._vec_normalize_env.get_original_obs()
+        self._is_stepping = False
         self._rollout_starts = np.array(dones, dtype=bool)
-        # a running normaliser pays the same episode differently from day to day
-        paid = reward if self._vec_normalize_env is None else self._vec_normalize_env.get_original_reward()
         if self.expert is not None and np.any(dones):
             self.expert.check_scale(replay_buffer.rewards[: replay_buffer.size()])
-        self._prove(paid, dones)
+        if self.num_timesteps >= self.learning_starts + self.n_envs:  # the step that was just made was no random one
+            self.guidance.on_step(self._context(), rewards, dones, self._n_updates)
         if ENDLESS in replay_buffer.running_lengths:
             self._warn_of_endless_episodes()
 
-    def _calibrate(self, actions: np.ndarray, rewards: np.ndarray, dones: np.ndarray, infos: list[dict[str, Any]]) -> None:
-        """Whether the critic knows what the learning actor's noise gains: see :mod:`sb3_actpc.actpc.calibration`. Not where it
-        is paid by internal signals too, which are not those that a step had when it is learned."""
-        is_noisy = self.action_noise is not None or self.exploration_noise
-        is_asked = is_noisy and self.actor_pressure and not any(self.reward_weights[1:])
-        if self.calibration is None or self.trials is None or self._meant is None or not is_asked:
-            return
-        noisy = [env for env, role in enumerate(self.trials.roles) if role == "actor" and env not in self.trials.skipped]
-        if not noisy:
-            return
-        with th.no_grad():
-            features = self.actor.features(self.actor.obs_to_tensor(self._last_obs)[0]).repeat(3, 1)  # type: ignore[arg-type]
-            opposite = np.clip(2.0 * self._meant - actions, -1.0, 1.0)
-            tried = self.inputs.tensor(np.concatenate([self._meant, actions, opposite]).reshape(len(features), -1))
-            values = self.critic.first().project(th.cat([features, tried], dim=1)).mean(1)
-            meant, noisy_value, opposite_value = values.view(3, -1).tolist()
-        for env in noisy:
-            paid = self.alpha_ext * float(rewards[env])
-            said = (noisy_value[env] - opposite_value[env]) / 2.0
-            self.calibration.step(env, said, meant[env], paid, self.gamma)
-            if dones[env]:
-                self.calibration.end(env, self.gamma, terminated=not infos[env].get("TimeLimit.truncated", False))
-                self._follow_calibration()
-
-    def _follow_calibration(self) -> None:
-        if self.policy.trust_region is not None and self.calibration is not None:
-            self.policy.trust_region.trust.fill_(self.calibration.trust)
-
-    def _prove(self, rewards: np.ndarray, dones: np.ndarray) -> None:
-        """The habit follows from what whole episodes were paid: see :mod:`sb3_actpc.actpc.habit`."""
-        if self.trials is None:
-            return
-        is_random = self.num_timesteps < self.learning_starts + self.n_envs  # the step that was just made
-        for env, (reward, done) in enumerate(zip(rewards, dones, strict=True)):
-            if is_random or env in self.trials.skipped:
-                self.trials.skip(env, bool(done))
+    def _before_auto_reset(
+        self, new_obs: Any, reward: np.ndarray, dones: np.ndarray, infos: list[dict[str, Any]]
+    ) -> tuple[Any, np.ndarray]:
+        """Next observations and rewards as the environment gave them, before VecNormalize and before its reset; copies."""
+        normalize = self._vec_normalize_env
+        if normalize is None:
+            self._last_original_obs, new_original, rewards = self._last_obs, new_obs, reward
+        else:
+            new_original, rewards = normalize.get_original_obs(), normalize.get_original_reward()
+        next_obs = map_observations(np.array, new_original)
+        for env in np.flatnonzero(dones):
+            terminal = infos[env].get("terminal_observation")
+            if terminal is None:
                 continue
-            self.trials.step(env, float(reward))
-            if done:
-                self._end_episode(self.trials, env)
+            if normalize is not None:
+                terminal = normalize.unnormalize_obs(terminal)
+            if isinstance(next_obs, dict):
+                for key in next_obs:
+                    next_obs[key][env] = terminal[key]
+            else:
+                next_obs[env] = terminal
+        return next_obs, rewards
 
     def _warn_of_endless_episodes(self) -> None:
-        waits = ["the habit is replaced by what whole episodes are paid"] if self.trials is not None else []
+        waits = ["the deployed policy changes with whole episodes"] if self.guidance.has_gate else []
         waits += ["hindsight learns from episodes that have ended"] if isinstance(self.replay_buffer, HerReplayBuffer) else []
         if waits:
             warnings.warn(
@@ -882,63 +779,6 @@ class ActPC(OffPolicyAlgorithm):
                 "gymnasium.wrappers.TimeLimit",
                 stacklevel=2,
             )
-
-    def _end_episode(self, trials: Trials, env: int) -> None:
-        """What follows from the episode of ``env``, and who plays the next one."""
-        if trials.n_clones:
-            trials.imitated_return = self.imitation.mean_return()
-        region, pressed_since = self.policy.trust_region, max(self.critic_warmup, trials.begun_at)
-        if region is not None and self._n_updates > self.critic_warmup:
-            region.follow(trials.noisy_gain(env))
-        verdict = trials.end(env, has_learned=self._n_updates > pressed_since + CANDIDATE_AGE)
-        is_of_clone = trials.is_by_clone if verdict == "recalled" else trials.is_clone
-        # nothing is proven where nothing is paid, and a clone proves nothing about the pressure
-        if region is not None and verdict is not None and trials.habit_return != 0.0 and not is_of_clone:
-            region.resize(verdict)
-        if verdict == "accepted":
-            _copy(self.actor.habit, self.policy.former_habit)
-            self._replace_habit(self.policy.candidate, is_of_clone)
-        elif verdict == "recalled":
-            self._replace_habit(self.policy.former_habit, is_of_clone)
-        if trials.begin(env):
-            self._make_candidate()
-
-    def _replace_habit(self, circuit: NGCCircuit | None, is_beginning: bool) -> None:
-        """
-        :param circuit: the habit from now on
-        :param is_beginning: whether learning begins with it
-        """
-        assert self.trials is not None and circuit is not None
-        if not is_beginning:
-            _copy(circuit, self.actor.habit)
-            return
-        self._start_from(circuit)
-        self.trials.begun_at = self._n_updates
-        if self.calibration is not None:
-            self.calibration.begin_all()
-        if self.policy.trust_region is not None:
-            self.policy.trust_region.begin()
-
-    def _make_candidate(self) -> None:
-        """The learning actor's average, or another clone of whatever is imitated: trained here and now, as in a warm start."""
-        assert self.trials is not None
-        if not self.trials.is_clone:
-            _copy(self.policy.actor_average, self.policy.candidate)
-            return
-        try:
-            cloning = self.imitation.clone_into(self.policy.make_actor(), self.trials.n_tried)
-            if self.verbose:
-                paid, imitated = self.trials.habit_return, self.trials.imitated_return
-                noise = self.imitation.noise_of(self.trials.n_tried)
-                why = f"the habit is paid {paid:.4g}, what it imitates {imitated:.4g}"
-                print(f"another clone is tried (noise of {noise:g} of a step's length): {why}", flush=True)
-            for update in _counted(len(cloning), "another clone", self._has_bar, leave=False):
-                cloning.update(update)
-        except BaseException:  # Ctrl-C: nobody is on trial then, nor was, and every environment begins anew
-            self.trials.n_clones, self.trials.n_tried = self.trials.n_clones + 1, self.trials.n_tried - 1
-            self.trials, self._last_obs = self.trials.forgotten(self.n_envs), None
-            raise
-        _copy(cloning.clone, self.policy.candidate)
 
     def _check_observations(self, observations: Any) -> None:
         with np.errstate(over="ignore"):  # circuits see float32
@@ -993,19 +833,22 @@ class ActPC(OffPolicyAlgorithm):
         self.policy.set_training_mode(True)
         self._update_learning_rate([circuit.optimizer for _, circuit in self.policy.named_circuits()])
         n_actor, n_critic, n_generator = self._batch_sizes(batch_size)
-        for _ in range(gradient_steps):
+        # Sample the minibatches of all updates together (line 17)
+        for batch in self._sample_batches(gradient_steps, batch_size):
             self._n_updates += 1
             self.diagnostics.begin_update(self._n_updates, self.num_timesteps, self.policy_delay)
-            self._rescore_demonstrations()
-            batch = self._sample_batch(batch_size)  # line 17
-            due = self._n_updates % self.policy_delay == 0
-            parts = batch.first(n_actor) if due else None, batch.first(n_critic), batch.first(n_generator)
-            if self._compiled is None or not self._compiled.ready() or not self._compiled(*parts):
-                if parts[0] is not None:
-                    self._update_actor(parts[0])  # lines 19 and 26
-                self._update_critic(parts[1])  # lines 21 and 22
-                self._update_generator(parts[2])  # line 24
-                self._follow_circuits()
+            # Motor-action circuit: the critic term plus imitation (lines 19 and 26)
+            if self._n_updates % self.policy_delay == 0:
+                self._update_actor(batch.first(n_actor))
+            # Policy circuit: settle on the bootstrapped targets (lines 21 and 22)
+            if self.critic_weight:
+                self._update_critic(batch.first(n_critic))
+            # World model: settle on the next observation (line 24). Without weight in the reward it has no role
+            if self.alpha_ep:
+                self._update_generator(batch.first(n_generator))
+            # Target circuits follow
+            if self.target_update_interval == 1:
+                self._update_targets(self.tau)
         self._log_training()
 
     def _batch_sizes(self, batch_size: int) -> tuple[int, int, int]:
@@ -1027,153 +870,99 @@ class ActPC(OffPolicyAlgorithm):
         if self._n_updates % EXPERT_SIGNALS_INTERVAL == 1 or not self.expert.has_signals:
             self.expert.refresh_signals(self._raw_signals, self.inputs, *self.signals.rescored)
 
-    def _sample_batch(self, batch_size: int) -> Batch:
-        """Replayed transitions, the newest among them, then the share that comes from the demonstrations."""
+    def _sample_batches(self, n_batches: int, batch_size: int) -> Iterator[Batch]:
+        """Minibatches of replayed transitions, the newest in each, then the share that comes from the demonstrations."""
         assert self.replay_buffer is not None
+        if n_batches < 1:
+            return
+        self._rescore_demonstrations()
         sizes = self._batch_sizes(batch_size)
         largest, inputs, weights = max(sizes), self.inputs, self.reward_weights
         n_expert = round(self.demonstration_fraction * largest) if self.expert is not None else 0
+        n_replayed = largest - n_expert
+        n_newest = self.replay_buffer.n_newest(n_replayed)
         signals = self.signals.replayed if any(weights[1:]) else None
-        replayed = self.replay_buffer.sample(largest - n_expert, self._vec_normalize_env, signals)
-        batch = inputs.replayed(replayed, weights, self.gamma)
-        internal = batch.rewards - weights[0] * replayed.rewards
+        n_drawn = n_newest + n_batches * (n_replayed - n_newest)
+        samples = self.replay_buffer.sample(n_drawn, self._vec_normalize_env, signals, n_newest)
+        replayed = inputs.replayed(samples, weights, self.gamma)
+        internal = replayed.rewards - weights[0] * samples.rewards
         if len(internal):
-            self.diagnostics.follow(internal_reward=internal.mean, task_reward=replayed.rewards.mean)
+            self.diagnostics.follow(internal_reward=internal.mean, task_reward=samples.rewards.mean)
+        demonstrated = None
         if n_expert and self.expert is not None:
-            batch = batch.join(self.expert.sample(n_expert, inputs, weights, self.gamma, self.n_steps, signals))
-        if min(sizes) == largest:
-            return batch
-        # circuits with a smaller batch take its first rows: the newest, then a fair mixture of the rest
-        return batch.shuffled(keep=self.replay_buffer.n_newest(largest - n_expert))
+            demonstrated = self.expert.sample(n_expert * n_batches, inputs, weights, self.gamma, self.n_steps, signals)
+        for index in range(n_batches):
+            batch = replayed.minibatch(index, n_replayed, n_newest)
+            if demonstrated is not None:
+                batch = batch.join(demonstrated.minibatch(index, n_expert))
+            # circuits with a smaller batch take its first rows: the newest, then a fair mixture of the rest
+            yield batch if min(sizes) == largest else batch.shuffled(keep=n_newest)
 
     def _update_actor(self, batch: Batch) -> None:
-        """Motor-action circuit: pressure of the critic (line 19) plus refresh (line 26), in one step of the optimiser."""
-        imitated = self._imitated(batch)
-        pressure = self.actor_pressure if self.is_pressing else None
-        changes = self._actor_changes(batch, imitated, self.refresh_weight, pressure)
-        if changes is not None:
-            self.actor.circuit.apply_changes(changes)
-        if self.trials is not None:
-            self.diagnostics.follow(pressure=lambda: self.pressure)
-        region = self.policy.trust_region
-        if self.trials is not None and region is not None:
-            self.diagnostics.follow(trust_radius=lambda: float(region.radius), critic_trust=lambda: float(region.trust))
-
-    def _imitated(self, batch: Batch) -> Imitated | None:
-        """
-        What refresh imitates, if anything: as many steps as the batch has that are worth it and, where the habit holds the
-        learning actor, what that does in the batch's states. A region that is small enough for an arm's grip is otherwise soon
-        used up by what refresh alone does where nothing was shown, so that no pressure is left.
-        """
-        if not self.refresh_weight or not self.imitation.parts():
-            return None
-        imitated = self.imitation.sample(len(batch.features))
-        if not self._is_taught:
-            return imitated
-        assert self.actor.habit is not None
-        features, actions, memory = imitated
-        taught = self.actor.habit.project(batch.features, batch.memory)
-        both = None if memory is None or batch.memory is None else th.cat([memory, batch.memory])
-        return th.cat([features, batch.features]), th.cat([actions, taught]), both
-
-    def _actor_changes(
-        self, batch: Batch, imitated: Imitated | None, refresh_weight: Weighing, actor_pressure: Weighing | None
-    ) -> HebbianChanges | None:
-        """Refresh of the ``imitated`` steps plus, where it weighs something, the critic's pressure; None without either."""
+        """Critic term (line 19) and imitation term (line 26), added up for one step of the optimizer."""
+        actor = self.actor.circuit
         changes = None
-        if imitated is not None:
-            changes = self._refresh_changes(imitated)
-            self.diagnostics.change_norms("refresh", changes.scale_(refresh_weight))
-        if actor_pressure is not None:
-            coupled = settle_coupled(self.actor.circuit, self.critic.first(), batch.features, batch.memory, self.policy.nudge)
-            pressure = self.actor.circuit.hebbian_update(coupled.actor)
-            weight = self._pressure_weight(coupled, batch, actor_pressure)
-            self.diagnostics.coupled(coupled, pressure, batch.features, batch.memory)
+        # Imitation: settle on demonstrated actions and those of good episodes, ΔW_i = e φ(z)ᵀ
+        imitation_weight = self.refresh_weight * self.guidance.imitation_weight(self._n_updates)
+        if imitation_weight and self._imitated_parts():
+            state = actor.settle(*self.sample_imitated(len(batch.features)))
+            changes = actor.hebbian_update(state).scale_(imitation_weight)
+            self.diagnostics.settled("actor", state)
+            self.diagnostics.change_norms("imitation", changes)
+        # Critic term: actor and critic settle as one under the critic's output error +1/A, ΔW_c = e φ(z)ᵀ
+        critic_weight = self.critic_weight * self.guidance.critic_weight(self._n_updates)
+        if critic_weight:
+            coupled = settle_coupled(actor, self.critic, batch.features, batch.memory, self.policy.nudge)
+            improvement = actor.hebbian_update(coupled.actor)
+            self.diagnostics.coupled(coupled, improvement, batch.features, batch.memory)
+            scale = coupled.action_values.abs().mean().clamp_min(SMALLEST_VALUE_SCALE) if self.normalize_critic_term else 1.0
+            improvement.scale_(critic_weight / scale)
+            self.diagnostics.change_norms("critic_term", improvement)
             if changes is None:
                 self.diagnostics.settled("actor", coupled.actor)
-            self.diagnostics.change_norms("pressure", pressure.scale_(weight))
-            changes = pressure if changes is None else changes.add_(pressure)
-        return changes
-
-    def _refresh_changes(self, imitated: Imitated) -> HebbianChanges:
-        """Settle the actor on imitated actions."""
-        state = self.actor.circuit.settle(*imitated)
-        self.diagnostics.settled("actor", state)
-        return self.actor.circuit.hebbian_update(state)
-
-    @property
-    def is_pressing(self) -> bool:
-        """Whether the critic's pressure reaches the actor by now."""
-        return bool(self.actor_pressure) and self._n_updates > self.critic_warmup
-
-    @property
-    def pressure(self) -> float:
-        """The present weight of the critic's pressure."""
-        region = self.policy.trust_region
-        return self.actor_pressure * (1.0 if region is None else float(region.multiplier))
-
-    def _pressure_weight(self, coupled: CoupledState, batch: Batch, weight: Weighing) -> Weighing:
-        """As the trust region has it, and by option over the batch's mean absolute action-value."""
-        if self.policy.trust_region is not None and self.actor.habit is not None:
-            habit_actions = self.actor.habit.project(batch.features, batch.memory)
-            values = coupled.action_values.mean(1)
-            weight = weight * self.policy.trust_region.regulate(coupled.actions, habit_actions, values)
-        return weight / coupled.action_values.abs().mean().clamp_min(SMALLEST_VALUE_SCALE) if self.scale_pressure else weight
+            changes = improvement if changes is None else changes.add_(improvement)
+        if changes is not None:
+            actor.apply_changes(changes)
+            self.guidance.after_update(self._context())
 
     def _update_critic(self, batch: Batch) -> None:
-        """Policy circuit(s): settle on the bootstrapped targets (lines 21 and 22). Without pressure nobody asks them."""
-        if not self.actor_pressure:
-            return
-        for critic, changes in zip(self.critic, self._critic_changes(batch, self._target_noise(batch)), strict=True):
-            critic.apply_changes(changes)
+        """All members settle on the same targets."""
+        inputs = th.cat([batch.features, batch.actions], dim=1)
+        state = self.critic.settle(inputs, self._critic_targets(batch))
+        self.diagnostics.settled("critic", state)
+        self.critic.apply_changes(self.critic.hebbian_update(state))
 
-    def _critic_changes(self, batch: Batch, noise: th.Tensor | None) -> list[HebbianChanges]:
-        inputs, targets = th.cat([batch.features, batch.actions], dim=1), self._critic_targets(batch, noise)
-        states = [critic.settle(inputs, targets) for critic in self.critic]
-        for index, state in enumerate(states):
-            self.diagnostics.settled(f"critic.{index}" if index else "critic", state)
-        return [critic.hebbian_update(state) for critic, state in zip(self.critic, states, strict=True)]
+    def _update_generator(self, batch: Batch) -> None:
+        """The generator settles on the next observation."""
+        inputs = th.cat([batch.features, batch.actions], dim=1)
+        state = self.generator.settle(inputs, batch.next_features, batch.memory)
+        self.diagnostics.settled("generator", state)
+        self.generator.apply_changes(self.generator.hebbian_update(state))
 
-    def _target_noise(self, batch: Batch) -> th.Tensor | None:
-        """What is added to the target actor's actions, (B, A)."""
-        if not self.target_policy_noise or self.bootstrap == "literal":
-            return None
+    def _target_noise(self, actions: th.Tensor) -> th.Tensor:
+        """Clipped Gaussian noise on the target actor's actions, (B, A), as in TD3."""
         bound = TARGET_NOISE_CLIP * self.target_policy_noise
-        return (th.randn_like(batch.actions) * self.target_policy_noise).clamp(-bound, bound)
+        return (th.randn_like(actions) * self.target_policy_noise).clamp(-bound, bound)
 
-    def _critic_targets(self, batch: Batch, noise: th.Tensor | None) -> th.Tensor:
+    def _critic_targets(self, batch: Batch) -> th.Tensor:
         """t = r + γ c, or r alone when terminal; one and the same reward for every action output, (B, A)."""
         if self.bootstrap == "literal":
             next_actions = batch.actions
         else:
             next_actions = self.actor_target.project(batch.bootstrap_features, batch.next_memory)
-            if noise is not None:
-                next_actions = (next_actions + noise).clamp(-1.0, 1.0)
+            if self.target_policy_noise:
+                next_actions = (next_actions + self._target_noise(next_actions)).clamp(-1.0, 1.0)
         inputs = th.cat([batch.bootstrap_features, next_actions], dim=1)
-        first, *others = (critic.project(inputs) for critic in self.critic_target)
-        values = reduce(th.minimum, others, first)
+        pair = th.randperm(self.n_critics)[:2] if self.n_critics > 2 else None
+        values = self.critic_target.project(inputs, members=pair)
+        if self.n_critics > 1:
+            values = values.amin(0)
         return batch.rewards + (1.0 - batch.dones) * batch.discounts * values
-
-    def _update_generator(self, batch: Batch) -> None:
-        """World model: settle on the next observation (line 24). Without weight in the reward it has no role."""
-        if self.alpha_ep:
-            self.generator.apply_changes(self._generator_changes(batch))
-
-    def _generator_changes(self, batch: Batch) -> HebbianChanges:
-        state = self.generator.settle(th.cat([batch.features, batch.actions], dim=1), batch.next_features, batch.memory)
-        self.diagnostics.settled("generator", state)
-        return self.generator.hebbian_update(state)
 
     def _update_targets(self, tau: float) -> None:
         """Move the target circuits by ``tau`` (1 copies)."""
-        _follow([self.actor_target, *self.critic_target], [self.actor.circuit, *self.critic], tau)
-
-    def _follow_circuits(self) -> None:
-        """After an update: the targets, where they move with every one, and the actor's average."""
-        if self.target_update_interval == 1:
-            self._update_targets(self.tau)
-        if self.policy.actor_average is not None:
-            _follow([self.policy.actor_average], [self.actor.circuit], AVERAGING_RATE)
+        self.actor_target.move_towards(self.actor.circuit, tau)
+        self.critic_target.move_towards(self.critic, tau)
 
     def _on_step(self) -> None:
         """Moves the targets where that goes by environment steps."""
@@ -1192,10 +981,8 @@ class ActPC(OffPolicyAlgorithm):
         if memory is not None:
             self.logger.record("train/self_imitation_size", len(memory))
             self.logger.record("train/self_imitation_best_return", memory.best_return)
-        if self.trials is not None:
-            if self.trials.habit_returns:  # it has played
-                self.logger.record("train/habit_return", self.trials.habit_return)
-            self.logger.record("train/habit_generation", self.trials.generation)
+        for key, value in self.guidance.logs().items():
+            self.logger.record(f"train/{key}", value)
 
     def learn(
         self: SelfActPC,
@@ -1206,7 +993,7 @@ class ActPC(OffPolicyAlgorithm):
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
     ) -> SelfActPC:
-        """As in SB3, after a warm start (:meth:`pretrain`) where there are demonstrations; ValueError for a bad number of
+        """As in SB3, after BC pre-training (:meth:`pretrain`) where there are demonstrations; ValueError for a bad number of
         environment steps, and where something that was set since does not fit."""
         check_kind("total_timesteps", total_timesteps, float)
         Between(0)("total_timesteps", total_timesteps)
@@ -1226,20 +1013,17 @@ class ActPC(OffPolicyAlgorithm):
             try:
                 model = super().load(path, *args, **kwargs)  # type: ignore[arg-type]
             except ValueError as error:
-                if "policy kwargs do not equal" not in str(error) or not isinstance(own, Mapping) or "habit" in own:
+                if "policy kwargs do not equal" not in str(error) or not isinstance(own, Mapping) or "is_gated" in own:
                     raise
                 try:  # demonstrations had added it
-                    model = super().load(path, *args, **{**kwargs, "policy_kwargs": {"habit": True, **own}})  # type: ignore[arg-type]
+                    model = super().load(path, *args, **{**kwargs, "policy_kwargs": {"is_gated": True, **own}})  # type: ignore[arg-type]
                 except ValueError:
                     raise error from None
-        for name in ("signal_normalizer", "refresh_noise"):  # keywords until signal_kwargs and refresh_kwargs came
-            if hasattr(model, name):
-                raise ValueError(_OF_ANOTHER_VERSION.format(path=path, why=f"with a keyword {name}"))
         return model
 
     def set_parameters(self, *args: Any, **kwargs: Any) -> None:
-        """As in SB3. What a habit was paid says nothing of one that is given in its place, and how a circuit's learning rate
-        goes with the agent's is a setting, not a parameter."""
+        """As in SB3. Returns of the deployed policy say nothing of another one, and how a circuit's learning rate goes with the
+        agent's is a setting, not a parameter."""
         groups = [group for _, circuit in self.policy.named_circuits() for group in circuit.optimizer.param_groups]
         scales = [group["lr_scale"] for group in groups]
         super().set_parameters(*args, **kwargs)
@@ -1251,25 +1035,18 @@ class ActPC(OffPolicyAlgorithm):
             if self.demonstrations is not None and not self.pretrained:
                 self._setup_demonstrations()
             return
-        if self.trials is not None:
-            self.trials = self.trials.forgotten(self.n_envs, goes_on=True)
-        if self.calibration is not None:  # this is another critic
-            self.calibration = Calibration(self.n_envs)
+        self.guidance.load_state_dict({"selection": None})
 
     def checkpoint_state(self) -> dict[str, Any]:
         """What a checkpoint (:mod:`sb3_actpc.checkpoints`) keeps beside SB3's state: plain values and arrays."""
         expert = self.expert
         return {
-            "n_cloning_updates": self.n_cloning_updates,
-            "cloning": None if self.cloning is None else self.cloning.checkpoint_state(),
             "rollout_state": self._rollout_state,
             "rollout_starts": self._rollout_starts,
             "signals": self.signals.checkpoint_state(),
             "expert_signals": None if expert is None else [expert.epistemic, expert.instrumental, expert.has_signals],
             "diagnostics": dict(self.diagnostics.values),
-            "trials": None if self.trials is None else self.trials.checkpoint_state(),
-            "calibration": None if self.calibration is None else self.calibration.checkpoint_state(),
-            "imitation": self.imitation.checkpoint_state(),
+            "guidance": self.guidance.state_dict(),
         }
 
     def restore_checkpoint_state(self, state: dict[str, Any]) -> None:
@@ -1286,17 +1063,10 @@ class ActPC(OffPolicyAlgorithm):
             )
         if self.expert is not None:
             self.expert.epistemic, self.expert.instrumental, self.expert.has_signals = signals
-        self.n_cloning_updates = state["n_cloning_updates"]
-        self.cloning = None
-        if state["cloning"] is not None:
-            self.cloning = self.imitation.clone_into(self.actor.circuit)
-            self.cloning.restore_checkpoint_state(state["cloning"])
         self._rollout_state, self._rollout_starts = state["rollout_state"], state["rollout_starts"]
         self.signals.restore_checkpoint_state(state["signals"])
         self.diagnostics.values = dict(state["diagnostics"])
-        self.trials = None if state["trials"] is None else Trials(**state["trials"])
-        self.calibration = None if state["calibration"] is None else Calibration(**state["calibration"])
-        self.imitation.restore_checkpoint_state(state["imitation"])
+        self.guidance.load_state_dict(state["guidance"])
 
     @classmethod
     def load_checkpoint(cls: type[SelfActPC], path: str | PathLike[str], env: GymEnv | str, **keywords: Any) -> Restored:
@@ -1355,8 +1125,8 @@ class ActPC(OffPolicyAlgorithm):
 
     def _excluded_save_params(self) -> list[str]:
         aliases = ["actor", "critic", "generator", "prior", "actor_target", "critic_target"]
-        derived = ["expert", "imitation", "_followed", "diagnostics", "_compiled", "refresh", "cloning"]
-        derived += ["_awaits_parameters", "_steps_at_pause"]
+        derived = ["expert", "_followed", "diagnostics"]
+        derived += ["_awaits_parameters", "_steps_at_pause", "_is_stepping"]
         return [*super()._excluded_save_params(), *aliases, *derived]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
@@ -1383,10 +1153,21 @@ def _named_errors(path: str | PathLike[str]) -> Iterator[None]:
         raise ValueError(_OF_ANOTHER_VERSION.format(path=path, why="its policy has other parts")) from error
 
 
-def _follow(targets: list[NGCCircuit], circuits: list[NGCCircuit], tau: float) -> None:
-    """Move all synapses of the ``targets`` by the share ``tau`` of the way towards those of the ``circuits``."""
-    mine, theirs = ([p for circuit in part for kind in circuit.synapses for p in kind] for part in (targets, circuits))
-    th._foreach_lerp_(mine, theirs, tau)
+def _make_guidance(given: ActorGuidance | str | None, settings: Settings | None, has_demonstrations: bool) -> ActorGuidance:
+    """:raises ValueError: for another name, or keywords that the guidance has not"""
+    if isinstance(given, ActorGuidance):
+        return given
+    if given is None:
+        given = "default" if has_demonstrations else "none"
+    if given not in ("default", "none"):
+        raise ValueError(f"guidance={given!r} must be None, 'default', 'none' or an ActorGuidance")
+    if given == "none":
+        return ActorGuidance()
+    known = GuidanceConfig.names()
+    for name in settings or {}:
+        if name not in known:
+            raise ValueError(f"guidance_kwargs has {name!r}{nearest(name, known)}; choose from {known}")
+    return BehaviorGuidance(GuidanceConfig(**(settings or {})))
 
 
 def _shows_progress(callback: BaseCallback) -> bool:
@@ -1398,10 +1179,3 @@ def _counted(n: int, what: str, is_shown: bool, **keywords: Any) -> Iterable[int
     """0 to n - 1, with a bar where it is shown; into a file, or a notebook, it is drawn now and then."""
     seldom = is_shown and not sys.stderr.isatty()
     return tqdm(range(n), what, disable=not is_shown, mininterval=5.0 if seldom else 0.1, **keywords)
-
-
-def _copy(source: NGCCircuit | None, *targets: NGCCircuit | None) -> None:
-    """The state of one circuit into others; without a habit there are none."""
-    for target in targets:
-        if source is not None and target is not None:
-            target.load_state_dict(source.state_dict())

@@ -199,15 +199,20 @@ class SignalReplay(ReplayBuffer):
         return min(self.n_envs, -(-batch_size // 2)) if self.combined else 0
 
     def sample(  # type: ignore[override]
-        self, batch_size: int, env: VecNormalize | None = None, rewards_of: tuple[Normalize, Normalize] | None = STORED
+        self,
+        batch_size: int,
+        env: VecNormalize | None = None,
+        rewards_of: tuple[Normalize, Normalize] | None = STORED,
+        n_newest: int | None = None,
     ) -> SignalReplaySamples:
         """:param batch_size: B
         :param env: VecNormalize whose statistics normalise observations and the task's rewards
         :param rewards_of: what stored epistemic and instrumental signals pay, element by element; themselves by default. None
             where nobody asks: the signals are 0, and with n-step returns nothing is gathered one step on
+        :param n_newest: how many of the last step; None for :meth:`n_newest` of the batch size
         :return: B transitions; with ``combined``, ``n_newest`` of the last step come first
         """
-        newest = np.arange(self.n_newest(batch_size))
+        newest = np.arange(self.n_newest(batch_size) if n_newest is None else n_newest)
         if 0 < len(newest) < self.n_envs:
             newest = np.random.permutation(self.n_envs)[: len(newest)]
         rows, envs = self._draw(batch_size - len(newest))

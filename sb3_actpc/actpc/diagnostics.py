@@ -51,7 +51,7 @@ class Diagnostics:
         if self.active:
             self.values[f"{name}_energy"] = float(state.total_discrepancy().mean())
             self.values[f"{name}_settling_steps"] = state.n_steps
-            self.values[f"{name}_residual"] = float(self.circuits[_key(name)].residual(state))
+            self.values[f"{name}_residual"] = float(self.circuits[name].residual(state))
 
     def coupled(self, state: CoupledState, changes: HebbianChanges, features: th.Tensor, memory: th.Tensor | None) -> None:
         """
@@ -62,7 +62,7 @@ class Diagnostics:
             return
         self.values["action_value"] = float(state.action_values.mean())
         self.values["action_saturation"] = float((state.actions.abs() > 0.97).float().mean())
-        gradient = policy_gradient(self.circuits["actor"], self.circuits["critic.0"], features, memory)
+        gradient = policy_gradient(self.circuits["actor"], self.circuits["critic"], features, memory)
         for layer, (mine, exact) in enumerate(zip(changes.weights, gradient.weights, strict=True)):
             cosine = th.nn.functional.cosine_similarity(mine.flatten(), exact.flatten(), dim=0)
             self.values[f"actor_cosine_{layer}"] = float(cosine)
@@ -77,7 +77,3 @@ class Diagnostics:
     def summary(self) -> dict[str, float]:
         """Everything measured last."""
         return self.values
-
-
-def _key(name: str) -> str:
-    return "critic.0" if name == "critic" else name

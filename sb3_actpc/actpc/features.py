@@ -42,6 +42,24 @@ class Batch(NamedTuple):
         """The first ``n`` rows, for a circuit with a batch size of its own."""
         return self if n >= len(self.features) else Batch(*(None if column is None else column[:n] for column in self))  # type: ignore[arg-type]
 
+    def minibatch(self, index: int, size: int, n_newest: int = 0) -> "Batch":
+        """
+        One of several minibatches that were sampled together.
+
+        :param index: which, from 0 on
+        :param size: its rows
+        :param n_newest: the first rows, which all minibatches share
+        :return: the newest rows, then ``size - n_newest`` rows of its own
+        """
+        start = n_newest + index * (size - n_newest)
+        stop = start + size - n_newest
+        if not index:
+            return self.first(stop)
+        rows: list[Any] = [None if column is None else column[start:stop] for column in self]
+        if n_newest:
+            return self.first(n_newest).join(Batch(*rows))
+        return Batch(*rows)
+
     def join(self, other: "Batch") -> "Batch":
         """These rows, then those of ``other``."""
         pairs: Any = zip(self, other, strict=True)

@@ -3,7 +3,7 @@
 import copy
 import inspect
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Annotated, Any
 
 import numpy as np
@@ -19,7 +19,6 @@ from sb3_actpc.actpc.arguments import (
     CIRCUITS,
     MAX_CRITICS,
     Between,
-    Weight,
     check_circuit,
     check_extractor,
     check_net_arch,
@@ -27,7 +26,6 @@ from sb3_actpc.actpc.arguments import (
     check_optimizer,
     checked,
 )
-from sb3_actpc.actpc.trust_region import TrustRegion
 from sb3_actpc.ngc import NGCCircuit, WorkingMemory, check_agreement
 from sb3_actpc.ngc.activations import ACTIVATIONS
 from sb3_actpc.utils.checks import LARGEST_SIZE, Settings, named_in_errors
@@ -40,7 +38,6 @@ OBSERVATION_CLIP = 10.0
 # standard deviations at least, of a feature that has changed: of its largest size, and at all; a smaller one may be rounding
 SMALLEST_CHANGE, SMALLEST_DEVIATION = 1e-4, 1e-7
 PRIOR_NET_ARCH = (512, 256)  # paper: prior of all MuJoCo tasks
-ACTOR_SLOWNESS = 4.0  # how much slower than the others the actor learns beside a habit
 
 
 class ObservationNormalizer(nn.Module):
@@ -70,25 +67,10 @@ class ObservationNormalizer(nn.Module):
         self.scale.copy_(th.where(has_changed, 1.0 / std, 1.0))  # a feature that never changed says nothing of its scale
         self.clip.fill_(OBSERVATION_CLIP)
 
-    def weigh(self, weights: th.Tensor) -> None:
-        """:param weights: (n_features,), that normalised features are multiplied by from now on"""
-        self.scale.mul_(weights)
-
     def forward(self, features: th.Tensor) -> th.Tensor:
         """:param features: (..., n_features)
         :return: the same shape, normalised"""
         return th.clamp((features - self.mean) * self.scale, -self.clip, self.clip)
-
-
-class Critics(nn.ModuleList):
-    """One or more critic circuits."""
-
-    def __iter__(self) -> Iterator[NGCCircuit]:
-        return super().__iter__()  # type: ignore[return-value]
-
-    def first(self) -> NGCCircuit:
-        """The one the actor is coupled to."""
-        return next(iter(self))
 
 
 class ActPCActor(BasePolicy):
@@ -101,7 +83,7 @@ class ActPCActor(BasePolicy):
     :param circuit_kwargs: keywords of :class:`~sb3_actpc.ngc.NGCCircuit`
     :param net_arch: hidden sizes
     :param memory_history: H observations in the working memory; 0 for none
-    :param with_habit: keep a second circuit, the habit, which then is the one that acts
+    :param is_gated: keep a second circuit, the deployed one, which acts
     :param normalize_images: divide image observations by 255
     """
 
@@ -115,7 +97,7 @@ class ActPCActor(BasePolicy):
         net_arch: list[int],
         circuit_kwargs: dict[str, Any],
         memory_history: int = 0,
-        with_habit: bool = False,
+        is_gated: bool = False,
         normalize_images: bool = True,
     ) -> None:
         super().__init__(
@@ -131,7 +113,7 @@ class ActPCActor(BasePolicy):
         self.normalizer = ObservationNormalizer(n_features)
         self.memory = WorkingMemory(n_features, memory_history) if memory_history else None
         self.circuit = self.make_circuit()
-        self.habit = copy.deepcopy(self.circuit) if with_habit else None
+        self.deployed = copy.deepcopy(self.circuit) if is_gated else None
         self._warned_of_empty_memory = False
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
@@ -141,7 +123,7 @@ class ActPCActor(BasePolicy):
             net_arch=self.net_arch,
             circuit_kwargs=self.circuit_kwargs,
             memory_history=self.memory_history,
-            with_habit=self.habit is not None,
+            is_gated=self.deployed is not None,
         )
         return data
 
@@ -158,8 +140,8 @@ class ActPCActor(BasePolicy):
 
     @property
     def acting(self) -> NGCCircuit:
-        """The circuit that acts: the habit where there is one."""
-        return self.circuit if self.habit is None else self.habit
+        """The circuit that acts: the deployed one where there is a deployment gate."""
+        return self.circuit if self.deployed is None else self.deployed
 
     def train(self, mode: bool = True) -> "ActPCActor":
         """Nothing can tell training from acting: circuits have no such mode, and the extractor, which nobody trains, acts."""
@@ -272,7 +254,8 @@ class ActPCPolicy(BasePolicy):
         keep its ratio to the schedule's start
     :param net_arch: hidden sizes of all circuits, or a dict with the keys ``pi``, ``qf``, ``generator`` and ``prior`` (sizes
         left out stay at their defaults: 256 and 256, the prior's 512 and 256)
-    :param n_critics: critic circuits; with two or more the smallest value bootstraps
+    :param n_critics: members of the critic ensemble; the smaller value of two, drawn anew for every update, bootstraps, and the
+        actor follows the mean of all. 1 for the paper's single critic
     :param circuit_kwargs: keywords of every :class:`~sb3_actpc.ngc.NGCCircuit`
     :param actor_kwargs: the same for the actor alone, and ``net_arch``, ``learning_rate``, ``batch_size``
     :param critic_kwargs: the same for the critic
@@ -281,11 +264,8 @@ class ActPCPolicy(BasePolicy):
     :param memory_history: H observations in the working memory of actor, generator and prior; 0 for none
     :param nudge: scale of the critic's clamped error while actor and critic settle as one (the paper's is 1); None for an
         infinitesimal one, or 1 with ``dynamics="state"``. A sweep ("scheduled") is always infinitesimal
-    :param habit: keep the best proven actor beside the one that learns (:mod:`sb3_actpc.actpc.habit`), which then has a
-        quarter of the schedule's learning rate, or its own
-    :param trust_radius: of the first :class:`~sb3_actpc.actpc.trust_region.TrustRegion` around the habit, in variances of the
-        demonstrated actions around their clone (where the habit teaches, as it does where clones guess, of 0.15 at least, and
-        the smallest radius too; where it does not, and clones guess, of 1), 0.1 to 1000; 0 for none: the pressure is fixed
+    :param is_gated: keep a deployed circuit, and those that the deployment gate evaluates (:mod:`sb3_actpc.guidance`); the
+        agent sets it
     :param features_extractor_class: fixed features extractor (it is never trained)
     :param features_extractor_kwargs: its keywords
     :param normalize_images: divide image observations by 255
@@ -296,7 +276,7 @@ class ActPCPolicy(BasePolicy):
 
     actor: ActPCActor
     action_space: spaces.Box
-    spread: th.Tensor
+    residual_std: th.Tensor
     has_imitated: th.Tensor
     n_prior_updates: th.Tensor
 
@@ -307,15 +287,14 @@ class ActPCPolicy(BasePolicy):
         action_space: spaces.Box,
         lr_schedule: Schedule,
         net_arch: Annotated[list[int] | dict[str, list[int]] | None, check_net_arch] = None,
-        n_critics: Annotated[int, Between(1, MAX_CRITICS)] = 2,
+        n_critics: Annotated[int, Between(1, MAX_CRITICS)] = 5,
         circuit_kwargs: Settings | None = None,
         actor_kwargs: Annotated[Settings | None, check_circuit] = None,
         critic_kwargs: Annotated[Settings | None, check_circuit] = None,
         generator_kwargs: Annotated[Settings | None, check_circuit] = None,
         prior_kwargs: Annotated[Settings | None, check_circuit] = None,
         memory_history: Annotated[int, Between(0, LARGEST_SIZE)] = 0,
-        habit: bool = False,
-        trust_radius: Weight = 0.25,
+        is_gated: bool = False,
         nudge: Annotated[float | None, check_nudge] = None,
         features_extractor_class: Annotated[type[BaseFeaturesExtractor], check_extractor] = FlattenExtractor,
         features_extractor_kwargs: Settings | None = None,
@@ -346,7 +325,7 @@ class ActPCPolicy(BasePolicy):
         self.net_arch, self.n_critics, self.memory_history = net_arch, n_critics, memory_history
         self.circuit_kwargs = dict(circuit_kwargs or {})
         self.kwargs_of = dict(zip(CIRCUITS, (actor_kwargs, critic_kwargs, generator_kwargs, prior_kwargs), strict=True))
-        self.habit, self.trust_radius, self.nudge = habit, trust_radius, nudge
+        self.is_gated, self.nudge = is_gated, nudge
         self.lr_schedule = lr_schedule
         self._build()
 
@@ -362,43 +341,40 @@ class ActPCPolicy(BasePolicy):
             arch,
             kwargs,
             self.memory_history,
-            self.habit,
+            self.is_gated,
             self.normalize_images,
         )
         n_features, n_actions = extractor.features_dim, int(np.prod(self.action_space.shape))
         n_memory = self.actor.memory.size if self.actor.memory else 0
-        self.critic = Critics(
-            self._circuit("critic", n_features + n_actions, n_actions, n_feedback_inputs=n_actions)
-            for _ in range(self.n_critics)
+        n_members = self.n_critics if self.n_critics > 1 else 0
+        self.critic = self._circuit(
+            "critic", n_features + n_actions, n_actions, n_feedback_inputs=n_actions, n_members=n_members
         )
         self.generator = self._circuit("generator", n_features + n_actions, n_features, n_memory=n_memory)
         self.prior = self._circuit("prior", n_features, n_features, n_memory=n_memory)
-        check_agreement(self.actor.circuit, self.critic.first())
+        check_agreement(self.actor.circuit, self.critic)
         self.actor_target = copy.deepcopy(self.actor.circuit)
         self.critic_target = copy.deepcopy(self.critic)
-        # of the demonstrated actions around their clone; unknown before there is one
-        self.register_buffer("spread", th.full((n_actions,), th.inf))
+        # of the demonstrated actions around the BC policy; infinite before there is one
+        self.register_buffer("residual_std", th.full((n_actions,), th.inf))
         # what the demonstrations have taught, which goes where the synapses go; floats, as SB3 expects of parameters
         self.register_buffer("has_imitated", th.tensor(0.0))
         self.register_buffer("n_prior_updates", th.tensor(0.0))
-        # the slow average of the learning actor, a frozen copy of it that has to prove itself, and the habit before this one
-        self.actor_average, self.candidate, self.former_habit = (
-            copy.deepcopy(self.actor.circuit) if self.habit else None for _ in range(3)
-        )
-        self.trust_region = TrustRegion(self.trust_radius, n_actions) if self.habit and self.trust_radius else None
+        names = ("average", "challenger", "previous") if self.is_gated else ()
+        self.selection = nn.ModuleDict({name: copy.deepcopy(self.actor.circuit) for name in names})
         for name, circuit in self.named_circuits():
             circuit.optimizer = self._optimizer(name.partition(".")[0], circuit)
 
-    def make_actor(self) -> NGCCircuit:
-        """An actor's circuit that has learned nothing yet."""
-        circuit = self.actor.make_circuit()
-        circuit.optimizer = self._optimizer("actor", circuit)
-        return circuit
-
     def named_circuits(self) -> list[tuple[str, NGCCircuit]]:
-        """The circuits that learn, with their names: actor, critic.0, ..., generator, prior."""
-        critics = [(f"critic.{index}", critic) for index, critic in enumerate(self.critic)]
-        return [("actor", self.actor.circuit), *critics, ("generator", self.generator), ("prior", self.prior)]
+        """The circuits that learn, with their names: actor, critic, generator, prior."""
+        others = [("critic", self.critic), ("generator", self.generator), ("prior", self.prior)]
+        return [("actor", self.actor.circuit), *others]
+
+    def selection_circuits(self) -> dict[str, NGCCircuit] | None:
+        """The circuits of the deployment gate: deployed, average, challenger and previous; None without a gate."""
+        if self.actor.deployed is None:
+            return None
+        return {"deployed": self.actor.deployed, **dict(self.selection.items())}  # type: ignore[dict-item]
 
     def _settings_of(self, name: str) -> dict[str, Any]:
         return dict(self.kwargs_of[name] or {})
@@ -416,6 +392,8 @@ class ActPCPolicy(BasePolicy):
         default: dict[str, Any] = {"feedback": "learned", "feedback_start": "mirrored", "weight_decay": 0.1}
         if name == "prior":
             default["activation"] = "relu"
+        if name == "critic" and self.circuit_kwargs.get("settling") == "scheduled":
+            default |= {"normalization": "layer", "activation": "relu"}
         own = {k: v for k, v in self._settings_of(name).items() if k not in ("net_arch", "learning_rate", "batch_size")}
         kwargs = {**default, **self.circuit_kwargs, **own}
         unknown = sorted(set(kwargs) - CIRCUIT_KEYWORDS)
@@ -429,7 +407,7 @@ class ActPCPolicy(BasePolicy):
 
     def _optimizer(self, name: str, circuit: NGCCircuit) -> th.optim.Optimizer:
         start, own = self.lr_schedule(1.0), self._settings_of(name).get("learning_rate")
-        scale = 1.0 / ACTOR_SLOWNESS if self.habit and name == "actor" else 1.0
+        scale = 1.0
         if own is not None:
             scale = own / start if start else 0.0  # a loaded policy has no schedule, and does not learn
         groups = circuit.parameter_groups(start * scale if own is None else own)
@@ -457,8 +435,7 @@ class ActPCPolicy(BasePolicy):
             n_critics=self.n_critics,
             circuit_kwargs=self.circuit_kwargs,
             memory_history=self.memory_history,
-            habit=self.habit,
-            trust_radius=self.trust_radius,
+            is_gated=self.is_gated,
             nudge=self.nudge,
             optimizer_class=self.optimizer_class,
             optimizer_kwargs=self.optimizer_kwargs,

@@ -5,68 +5,20 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
 
-from sb3_actpc.actpc.arguments import Between, checked
 from sb3_actpc.demonstrations import Demonstrations, scaled_actions
 from sb3_actpc.demonstrations.rows import split_observations
 
 Observations = np.ndarray | dict[str, np.ndarray]
 TensorObservations = th.Tensor | dict[str, th.Tensor]
 Weighting = Literal["returns", "uniform"]
-RETURN_EXPONENT = 4.0  # an episode that was paid half as much is imitated a sixteenth as often
+RETURN_EXPONENT = 4.0  # an episode with half the return is imitated a sixteenth as often
 PATIENCE = 20  # episodes, all with a negative return, after which the memory warns
-
-
-class Refresh:
-    """How refresh and warm start imitate.
-
-    :param weighting: "returns" (a step is drawn in proportion to its episode's return to the power of ``RETURN_EXPONENT``, a
-        reward-weighted regression, Peters and Schaal 2007; uniformly where no demonstration's return is positive) or
-        "uniform" (the paper). Returns are compared as they are: where episodes differ in difficulty, as with random goals, the
-        easy ones are imitated most
-    :param noise: clones imitate steps between those that are shown and the nearest of other episodes, with Gaussian noise of
-        this standard deviation on the features (normalised observations), in units of a step's length
-        (:mod:`sb3_actpc.actpc.room`); not on the working memory's, nor on what the learning actor is refreshed with, which
-        has to become precise. 0 for neither (the paper; so it is with a single demonstration); None for 1 where the
-        demonstrations leave room (the nearest step of another one is farther than a step leads, by the medians: arms and
-        goals, 2 to 8 times; gaits, 0.03 to 0.7, where this only blurs what to do) and clones of some of them are then about
-        as precise on the others (:mod:`sb3_actpc.actpc.held_out`), else 0. Where there is room and it is None, every other
-        further clone imitates the other way
-    :param own_episodes: which of them are imitated too: "paid" (every one, as often as its return says; "best" where steps are
-        not drawn by returns, or nothing is demonstrated) or "best" (those that are paid at least what the best one was: the
-        paper)
-    :param weight_decay: λ of the synapses of clones and their teachers, in the place of their circuit's; None for 1 where the
-        demonstrations leave room, in which small synapses guess better, or with a noise that is given, else as the circuit's
-    :param ensemble_size: others that teach a clone what to do around the imitated steps, 2 or more; 1 for none (the
-        paper). See :mod:`sb3_actpc.actpc.cloning`
-    :param n_clones: clones that are tried at most, the first included, while the habit is paid less than nine tenths of what
-        it imitates, before learning less than half (:mod:`sb3_actpc.actpc.habit`): returns of environment and demonstrations
-        must be of one scale. 1 for the warm-started actor alone (the paper); without a habit or a warm start there are no
-        others
-    :param habit: whether the habit, where it began as a clone, teaches the learning actor too, in the batch's states (half of
-        what refresh imitates), if a critic presses; decided at the warm start. None for where clones guess between the
-        demonstrations, unless all of these return 0; noise is then as wide as the trust region's unit. False for the paper
-    :raises ValueError: for another value
-    """
-
-    @checked
-    def __init__(
-        self,
-        weighting: Weighting = "returns",
-        noise: Annotated[float | None, Between(0)] = None,
-        own_episodes: Literal["paid", "best"] = "paid",
-        weight_decay: Annotated[float | None, Between(0)] = None,
-        ensemble_size: Annotated[int, Between(1)] = 3,
-        n_clones: Annotated[int, Between(1)] = 6,
-        habit: bool | None = None,
-    ) -> None:
-        self.weighting, self.noise, self.own_episodes = weighting, noise, own_episodes
-        self.weight_decay, self.ensemble_size, self.n_clones, self.habit = weight_decay, ensemble_size, n_clones, habit
 
 
 class ImitationSamples(NamedTuple):
@@ -76,14 +28,12 @@ class ImitationSamples(NamedTuple):
     :param actions: (B, A), scaled to [-1, 1]
     :param history: (B, H, *obs_shape), the observations before each row in its episode, oldest first; or None
     :param history_mask: (B, H), 1 where there was such an observation, or None
-    :param neighbours: (B, k), or None: see :class:`Episodes`
     """
 
     observations: Observations
     actions: np.ndarray
     history: Observations | None
     history_mask: np.ndarray | None
-    neighbours: np.ndarray | None = None
 
 
 def map_observations(function: Callable[[Any], Any], observations: Any) -> Any:
@@ -100,15 +50,13 @@ class Episodes:
     :param observations: (N, *obs_shape), or a dict of such
     :param actions: (N, A), scaled to [-1, 1]
     :param starts: (N,) index of the first transition of each row's episode
-    :param returns: (N,) what each row's episode was paid
-    :param neighbours: (N, k) rows of the demonstrations (:mod:`sb3_actpc.actpc.room`); None before they are looked for
+    :param returns: (N,), the return of each row's episode
     """
 
     observations: Observations
     actions: np.ndarray
     starts: np.ndarray
     returns: np.ndarray
-    neighbours: np.ndarray | None = None
 
     @cached_property
     def weights(self) -> np.ndarray:
@@ -119,11 +67,6 @@ class Episodes:
     def cumulative_weights(self) -> np.ndarray:
         """(N,), their running sum."""
         return np.cumsum(self.weights)
-
-    def effective_number(self) -> float:
-        """Of the episodes, as they are drawn by returns: (Σw)^2 / Σw^2; 0 where none is."""
-        weights = np.add.reduceat(self.weights, np.unique(self.starts))
-        return float(weights.sum() ** 2 / max((weights**2).sum(), np.finfo(float).tiny))
 
     def __len__(self) -> int:
         return len(self.actions)
@@ -142,19 +85,11 @@ class Episodes:
             returns=np.repeat(demonstrations.episode_returns, lengths),
         )
 
-    def select(self, is_kept: np.ndarray) -> "Episodes":
-        """:param is_kept: (N,), the same for all rows of an episode
-        :return: those episodes, whose neighbours are not known"""
-        rows = np.flatnonzero(is_kept)
-        observations = map_observations(lambda array: array[rows], self.observations)
-        return Episodes(observations, self.actions[rows], np.searchsorted(rows, self.starts[rows]), self.returns[rows])
-
     def take(self, indices: np.ndarray, history: int = 0) -> ImitationSamples:
         """(B,) rows, each with ``history`` preceding observations of the same episode."""
         past, mask = self.past(indices, history)
-        neighbours = None if self.neighbours is None else self.neighbours[indices]
         observations = map_observations(lambda array: array[indices], self.observations)
-        return ImitationSamples(observations, self.actions[indices], past, mask, neighbours)
+        return ImitationSamples(observations, self.actions[indices], past, mask)
 
     def past(
         self, indices: np.ndarray, history: int, including: bool = False
@@ -170,7 +105,7 @@ class Episodes:
 
 
 def _arrays(episodes: Episodes) -> list[np.ndarray]:
-    """All that has a row for each transition but neighbours: observations (by key), actions, starts, returns, weights."""
+    """All that has a row for each transition: observations (by key), actions, starts, returns, weights."""
     seen = episodes.observations
     observed = [seen[key] for key in sorted(seen)] if isinstance(seen, dict) else [seen]
     return [*observed, episodes.actions, episodes.starts, episodes.returns, episodes.weights]
@@ -312,7 +247,7 @@ class SelfImitationMemory:
         """The stored episodes and their returns, for a checkpoint."""
         episodes = None
         if self.episodes is not None:
-            names = [field.name for field in fields(self.episodes) if field.name != "neighbours"]  # they are looked for anew
+            names = [field.name for field in fields(self.episodes)]
             episodes = {name: getattr(self.episodes, name) for name in names}
         ended = [self._n_ended, None if self._n_ended == 0 else self._best_ended]
         return {"returns": list(self.returns), "lengths": list(self.lengths), "episodes": episodes, "ended": ended}
@@ -332,15 +267,9 @@ def is_by_return(parts: list[Episodes], weighting: Weighting) -> bool:
     return weighting == "returns" and bool(parts[0].cumulative_weights[-1] > 0.0)
 
 
-def imitated_return(parts: list[Episodes], weighting: Weighting) -> float:
-    """Mean return of the episodes that steps of the union of ``parts`` are drawn from."""
-    returns = np.concatenate([part.returns for part in parts])
-    weights = np.concatenate([part.weights for part in parts]) if is_by_return(parts, weighting) else None
-    return float(np.average(returns, weights=weights))
-
-
 def sample_union(parts: list[Episodes], n: int, history: int = 0, weighting: Weighting = "uniform") -> ImitationSamples:
-    """``n`` rows drawn from the union of ``parts`` (global NumPy generator, as SB3's buffers); see :class:`Refresh`."""
+    """``n`` rows drawn from the union of ``parts`` (global NumPy generator, as SB3's buffers), each as often as another or, with
+    "returns", by its episode's return."""
     parts = [part for part in parts if len(part)]
     by_return = is_by_return(parts, weighting)
     if by_return:

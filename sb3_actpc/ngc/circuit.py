@@ -11,8 +11,8 @@ from torch import nn
 from sb3_actpc.ngc.activations import ACTIVATIONS, get_activation
 from sb3_actpc.ngc.dynamics import DYNAMICS, ChainSettings, Rates, SettledState, SettlingChain
 from sb3_actpc.ngc.krylov import settle_krylov
-from sb3_actpc.ngc.plasticity import SYNAPTIC_SCALINGS, HebbianChanges, bound_columns_, hebbian_changes, mirrored, soft_bound_
 from sb3_actpc.ngc.normalization import EPSILON, NORMALIZATIONS, jacobian_product, normalize
+from sb3_actpc.ngc.plasticity import SYNAPTIC_SCALINGS, HebbianChanges, bound_columns_, hebbian_changes, mirrored, soft_bound_
 from sb3_actpc.ngc.products import affine
 from sb3_actpc.ngc.stability import largest_norm_, settling_rates
 from sb3_actpc.ngc.synapses import Synapses
@@ -241,23 +241,27 @@ class NGCCircuit(nn.Module):
 
     # ------------------------------------------------------------------ inference
 
-    def project(self, x: th.Tensor, memory: th.Tensor | None = None) -> th.Tensor:
+    def project(self, x: th.Tensor, memory: th.Tensor | None = None, members: th.Tensor | None = None) -> th.Tensor:
         """
         Ancestral projection f_proj: one feed-forward pass, no settling (paper, eq. for projection).
 
         :param x: (B, n_inputs)
         :param memory: m_t, (B, n_memory), for a circuit with a working memory
+        :param members: of an ensemble, the indices of those that are asked; None for all
         :return: (B, n_outputs), of an ensemble (M, B, n_outputs)
         :raises ValueError: for an input that is no such tensor, for a memory that is missing, not wanted or of the wrong size
         """
         x = self._as_input(x)
         biases = self.synapses.layer_biases(memory, self.memory_weight)
-        for weights, bias in zip(self.synapses.weights[:-1], biases[:-1], strict=True):
+        layers = self.synapses.weights
+        if members is not None:
+            x, biases, layers = x[: len(members)], [b[members] for b in biases], [w[members] for w in layers]
+        for weights, bias in zip(layers[:-1], biases[:-1], strict=True):
             latents = affine(bias, x, weights)
             if self.normalization == "layer":
                 latents = th.layer_norm(latents, latents.shape[-1:], None, None, EPSILON)
             x = self.activation.apply(latents, latents)
-        output = affine(biases[-1], x, self.synapses.weights[-1])
+        output = affine(biases[-1], x, layers[-1])
         return self.output_activation.apply(output, output)
 
     def settle(self, x: th.Tensor, target: th.Tensor, memory: th.Tensor | None = None) -> SettledState:
@@ -405,10 +409,11 @@ class NGCCircuit(nn.Module):
             self.update_settling_rates()
 
     def _decay_synapses(self, weight_decay: float) -> None:
-        for group in self.optimizer.param_groups if weight_decay else ():
-            matrices = [
-                parameter for parameter in group["params"] if not any(parameter is bias for bias in self.synapses.biases)
-            ]
+        if not weight_decay:
+            return
+        biases = set(map(id, self.synapses.biases))
+        for group in self.optimizer.param_groups:
+            matrices = [parameter for parameter in group["params"] if id(parameter) not in biases]
             if matrices:
                 kept = 1.0 - group["lr"] * weight_decay  # a tensor where a CUDA graph reads the rate
                 th._foreach_mul_(matrices, kept.clamp_min(0.0) if isinstance(kept, th.Tensor) else max(0.0, kept))
@@ -423,6 +428,11 @@ class NGCCircuit(nn.Module):
         elif self.synaptic_scaling == "column_norm":
             for synapses in self._scaled_synapses():
                 bound_columns_(synapses, self.weight_bound)
+
+    def move_towards(self, other: "NGCCircuit", share: float) -> None:
+        """Move all synapses by ``share`` (0 to 1) of the way towards those of an equal circuit (Polyak averaging)."""
+        mine, theirs = ([p for kind in circuit.synapses for p in kind] for circuit in (self, other))
+        th._foreach_lerp_(mine, theirs, share)
 
     # ------------------------------------------------------------------ stability
 

@@ -1,0 +1,17 @@
+"""
+What ActPC adds to the paper: a behavior-regularized actor-critic with gated deployment, self-imitation and BC pre-training.
+
+The actor circuit maximizes, by local changes alone,
+
+    J(θ) = w_c E[Q(s, π_θ(s))] / mean|Q|  -  w_i E[||a - π_θ(s)||²] / 2
+
+over replayed states s (value term) and over demonstrated and self-imitated steps (s, a) (imitation term). Learning starts
+from a behavior-cloned (BC) policy. During a warm-up w_c is 0, so that the critic first sees what the BC policy's own actions
+lead to. The deployed policy, which ``predict`` uses, is the best one that evaluation episodes have validated so far.
+"""
+
+from sb3_actpc.guidance.base import ActorGuidance, GuidanceContext
+from sb3_actpc.guidance.guidance import BehaviorGuidance, GuidanceConfig
+from sb3_actpc.guidance.policy_selection import PolicySelection
+
+__all__ = ["ActorGuidance", "BehaviorGuidance", "GuidanceConfig", "GuidanceContext", "PolicySelection"]

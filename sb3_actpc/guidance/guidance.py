@@ -1,0 +1,169 @@
+"""The default guidance: BC pre-training, critic warm-up, return-weighted imitation and the deployment gate, as hooks."""
+
+from dataclasses import dataclass, fields
+from typing import Any, Literal
+
+import numpy as np
+
+from sb3_actpc.guidance.base import ActorGuidance, GuidanceContext
+from sb3_actpc.guidance.behavior_cloning import clone_behavior, residual_std
+from sb3_actpc.guidance.policy_selection import PolicySelection
+from sb3_actpc.ngc import NGCCircuit
+
+
+@dataclass(frozen=True)
+class GuidanceConfig:
+    """
+    Every constant of the default guidance; ``guidance_kwargs`` sets them.
+
+    :param bc_updates: BC updates of the actor before learning
+    :param critic_warmup: updates before the critic term reaches the actor: the critic first learns from the BC policy's own
+        episodes (WSRL, arXiv 2412.07762, warms up on 5,000 such steps)
+    :param imitation_half_life: updates after which the imitation term has half its weight; 0 for a constant one
+    :param weighting: "returns" draws imitated steps by their episode's return to the power of four (reward-weighted
+        regression, Peters and Schaal 2007), "uniform" as the paper does
+    :param gate: whether the deployed policy changes only after evaluation episodes; else the actor is deployed
+    :param evaluation_share: largest share of environment steps in evaluation episodes
+    :param averaging_rate: step of the actor's moving average per update of the actor
+    :raises ValueError: for a value out of range
+    """
+
+    bc_updates: int = 3000
+    critic_warmup: int = 6000
+    imitation_half_life: int = 0
+    weighting: Literal["returns", "uniform"] = "returns"
+    gate: bool = True
+    evaluation_share: float = 0.25
+    averaging_rate: float = 0.001
+
+    def __post_init__(self) -> None:
+        for name in ("bc_updates", "critic_warmup", "imitation_half_life"):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int) or value < 0:
+                raise ValueError(f"guidance_kwargs[{name!r}]={value!r} must be a whole number of at least 0")
+        for name in ("evaluation_share", "averaging_rate"):
+            value = getattr(self, name)
+            if not isinstance(value, (int, float)) or not 0.0 <= value <= 1.0:
+                raise ValueError(f"guidance_kwargs[{name!r}]={value!r} must be a number from 0 to 1")
+        if self.weighting not in ("returns", "uniform"):
+            raise ValueError(f"guidance_kwargs['weighting']={self.weighting!r} must be 'returns' or 'uniform'")
+        if not isinstance(self.gate, bool):
+            raise ValueError(f"guidance_kwargs['gate']={self.gate!r} must be True or False")
+
+    @classmethod
+    def names(cls) -> list[str]:
+        """The keywords."""
+        return [one.name for one in fields(cls)]
+
+
+class BehaviorGuidance(ActorGuidance):
+    """
+    :param config: its constants
+    """
+
+    stores: Literal["positive", "best"] = "positive"
+
+    def __init__(self, config: GuidanceConfig) -> None:
+        self.config = config
+        self.weighting = config.weighting
+        self.has_gate = config.gate
+        self.selection: PolicySelection | None = None
+
+    def on_training_start(self, context: GuidanceContext, is_pretrained: bool) -> None:
+        """BC pre-training, once."""
+        if self.has_gate and (self.selection is None or self.selection.n_envs != context.n_envs):
+            self.selection = PolicySelection(context.n_envs, self.config.evaluation_share)
+        if is_pretrained or context.sample is None or not self.config.bc_updates:
+            return
+        clone_behavior(context.actor, context.sample, self.config.bc_updates)
+        context.residual_std.copy_(residual_std(context.actor, context.sample))
+        copies = [*context.targets, *(context.selection_circuits or {}).values()]
+        for circuit in copies:
+            copy_circuit(context.actor, circuit)
+
+    def acting_circuits(self, context: GuidanceContext) -> list[NGCCircuit]:
+        """The actor explores; incumbent and challenger play their evaluation episodes."""
+        if self.selection is None or context.selection_circuits is None:
+            return [context.actor] * context.n_envs
+        circuits = context.selection_circuits
+        players = {"actor": context.actor, "incumbent": circuits["deployed"], "challenger": circuits["challenger"]}
+        return [players[role] for role in self.selection.roles]
+
+    def explores(self, env: int) -> bool:
+        """Only the actor's episodes have noise."""
+        return self.selection is None or self.selection.roles[env] == "actor"
+
+    def exploration_scale(self, context: GuidanceContext, scale: float) -> np.ndarray:
+        """No wider than the demonstrated actions spread around the BC policy."""
+        return context.residual_std.clamp_max(scale).cpu().numpy()
+
+    def on_step(self, context: GuidanceContext, rewards: np.ndarray, dones: np.ndarray, n_updates: int) -> None:
+        """Evaluation episodes end, policies are promoted, rejected or rolled back, the next episodes begin."""
+        selection, circuits = self.selection, context.selection_circuits
+        if selection is None or circuits is None:
+            return
+        for env in range(context.n_envs):
+            selection.step(env, float(rewards[env]))
+            if not dones[env]:
+                continue
+            decision = selection.end_episode(env)
+            if decision == "promoted":
+                copy_circuit(circuits["deployed"], circuits["previous"])
+                copy_circuit(circuits["challenger"], circuits["deployed"])
+            elif decision == "rolled back":
+                copy_circuit(circuits["previous"], circuits["deployed"])
+            if selection.begin_episode(env, n_updates > self.config.critic_warmup):
+                copy_circuit(circuits["average"], circuits["challenger"])
+
+    def on_reset(self) -> None:
+        """Cut episodes have no return."""
+        if self.selection is not None:
+            self.selection.reset()
+
+    def critic_weight(self, n_updates: int) -> float:
+        """0 during the warm-up, then 1."""
+        return float(n_updates > self.config.critic_warmup)
+
+    def imitation_weight(self, n_updates: int) -> float:
+        """Halves every ``imitation_half_life`` updates after the warm-up."""
+        if not self.config.imitation_half_life:
+            return 1.0
+        return 0.5 ** (max(n_updates - self.config.critic_warmup, 0) / self.config.imitation_half_life)
+
+    def after_update(self, context: GuidanceContext) -> None:
+        """The actor's moving average."""
+        if context.selection_circuits is not None:
+            context.selection_circuits["average"].move_towards(context.actor, self.config.averaging_rate)
+
+    def logs(self) -> dict[str, float]:
+        """Decisions of the gate, and the incumbent's mean return."""
+        if self.selection is None:
+            return {}
+        values = {
+            "policies_promoted": float(self.selection.n_promoted),
+            "policies_rejected": float(self.selection.n_rejected),
+            "policies_rolled_back": float(self.selection.n_rolled_back),
+        }
+        if self.selection.incumbent_returns:
+            values["deployed_return"] = float(np.mean(self.selection.incumbent_returns))
+        return values
+
+    def describe(self) -> str:
+        """One line."""
+        gate = "deployment gate on" if self.has_gate else "no deployment gate"
+        config = self.config
+        return f"guidance: {config.bc_updates} BC updates, {config.critic_warmup} updates of critic warm-up, {gate}"
+
+    def state_dict(self) -> dict[str, Any]:
+        """The gate's fields."""
+        return {"selection": None if self.selection is None else self.selection.state_dict()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """As stored."""
+        stored = state["selection"]
+        self.selection = None if stored is None else PolicySelection(**stored)
+
+
+def copy_circuit(source: NGCCircuit, target: NGCCircuit) -> None:
+    """All synapses of ``source`` into ``target``."""
+    target.load_state_dict(source.state_dict())

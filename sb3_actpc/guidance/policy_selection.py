@@ -1,0 +1,144 @@
+"""The deployment gate: which policy ``predict`` uses, decided by evaluation episodes without noise during learning.
+
+An *incumbent* is deployed. A *challenger*, a frozen copy of the actor's moving average, plays evaluation episodes next to it.
+A sequential test on the difference of mean returns promotes or rejects the challenger. An incumbent that turns out worse than
+the one before it is rolled back.
+"""
+
+from dataclasses import asdict, dataclass, field
+from statistics import fmean
+from typing import Any, Literal
+
+Role = Literal["actor", "challenger", "incumbent"]
+Decision = Literal["promoted", "rejected", "rolled back"]
+
+
+@dataclass
+class PolicySelection:
+    """
+    Who plays the next episode, and what follows from returns. Holds no circuits.
+
+    :param n_envs: environments
+    :param share: largest share of environment steps in evaluation episodes
+    :param promote: standard errors by which the challenger's mean return must exceed the incumbent's
+    :param reject: standard errors by which it must fall short
+    :param budget: evaluation episodes of a challenger, after which the sign of the difference decides
+    :param min_episodes: evaluation episodes of a challenger before any decision
+    """
+
+    n_envs: int
+    share: float = 0.25
+    promote: float = 1.0
+    reject: float = 0.5
+    budget: int = 10
+    min_episodes: int = 2
+    steps: int = 0
+    evaluation_steps: int = 0
+    has_challenger: bool = False
+    incumbent_returns: list[float] = field(default_factory=list)
+    challenger_returns: list[float] = field(default_factory=list)
+    previous_returns: list[float] = field(default_factory=list)
+    roles: list[Role] = field(default_factory=list)
+    running: list[float] = field(default_factory=list)
+    n_promoted: int = 0
+    n_rejected: int = 0
+    n_rolled_back: int = 0
+
+    def __post_init__(self) -> None:
+        if len(self.roles) != self.n_envs:
+            self.reset()
+
+    def reset(self) -> None:
+        """All running episodes are cut: exploration episodes begin."""
+        self.roles = ["actor"] * self.n_envs
+        self.running = [0.0] * self.n_envs
+
+    def step(self, env: int, reward: float) -> None:
+        """One environment step of ``env`` with the task's reward."""
+        self.running[env] += reward
+        self.steps += 1
+        if self.roles[env] != "actor":
+            self.evaluation_steps += 1
+
+    def end_episode(self, env: int) -> Decision | None:
+        """The episode of ``env`` has ended: what its return decides, if anything."""
+        role = self.roles[env]
+        episode_return = self.running[env]
+        self.running[env] = 0.0
+        self.roles[env] = "actor"
+        if role == "incumbent":
+            self.incumbent_returns.append(episode_return)
+        if role == "challenger" and self.has_challenger:
+            self.challenger_returns.append(episode_return)
+        return self._decide() if role != "actor" else None
+
+    def begin_episode(self, env: int, challenger_is_ready: bool) -> bool:
+        """
+        Choose who plays the next episode of ``env``.
+
+        :param env: which environment
+        :param challenger_is_ready: whether the actor's average may become a challenger
+        :return: whether a new challenger begins: the caller then copies the average
+        """
+        if self.evaluation_steps > self.share * self.steps:
+            return False
+        begins = challenger_is_ready and not self.has_challenger and bool(self.incumbent_returns)
+        if begins:
+            self.has_challenger = True
+            self.challenger_returns = []
+        plays_challenger = self.has_challenger and len(self.challenger_returns) <= len(self.incumbent_returns)
+        self.roles[env] = "challenger" if plays_challenger else "incumbent"
+        return begins
+
+    def _decide(self) -> Decision | None:
+        if self.has_challenger and len(self.challenger_returns) >= self.min_episodes:
+            gain, error = compare(self.challenger_returns, self.incumbent_returns)
+            is_last = len(self.challenger_returns) >= self.budget
+            if gain > self.promote * error or (is_last and gain > 0.0):
+                return self._promote()
+            if gain < -self.reject * error or is_last:
+                self.has_challenger = False
+                self.n_rejected += 1
+                return "rejected"
+        if self.previous_returns and len(self.incumbent_returns) >= self.min_episodes:
+            gain, error = compare(self.incumbent_returns, self.previous_returns)
+            if gain < -self.promote * error:
+                self.incumbent_returns = self.previous_returns
+                self.previous_returns = []
+                self.has_challenger = False
+                self.n_rolled_back += 1
+                return "rolled back"
+        return None
+
+    def _promote(self) -> Decision:
+        self.previous_returns = self.incumbent_returns
+        self.incumbent_returns = self.challenger_returns
+        self.challenger_returns = []
+        self.has_challenger = False
+        # episodes of the old incumbent that are still running count for nobody
+        self.roles = ["actor" if role == "incumbent" else role for role in self.roles]
+        self.n_promoted += 1
+        return "promoted"
+
+    def state_dict(self) -> dict[str, Any]:
+        """All fields, as plain values."""
+        return asdict(self)
+
+
+def compare(ours: list[float], theirs: list[float]) -> tuple[float, float]:
+    """
+    Difference of mean returns and its standard error.
+
+    Both samples get one pseudo-episode at the worst observed return: a policy with few episodes may not have failed yet.
+
+    :param ours: returns of one policy, at least one
+    :param theirs: returns of the other, at least one
+    :return: mean(ours) - mean(theirs), and the standard error from the pooled variance
+    """
+    worst = min(min(ours), min(theirs))
+    samples = [[*ours, worst], [*theirs, worst]]
+    means = [fmean(sample) for sample in samples]
+    squares = sum((one - mean) ** 2 for sample, mean in zip(samples, means, strict=True) for one in sample)
+    degrees = len(samples[0]) + len(samples[1]) - 2
+    error = (squares / degrees * (1 / len(samples[0]) + 1 / len(samples[1]))) ** 0.5
+    return means[0] - means[1], error
