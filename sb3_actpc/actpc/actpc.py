@@ -87,7 +87,7 @@ class ActPC(StoresLastTransition):
     ====================================== ============== =======
     keyword                                demonstrations without
     ====================================== ============== =======
-    ``learning_starts``                    0              1000
+    ``learning_starts``                    0              100
     ``n_steps``                            3              1
     ``demonstration_fraction``             0.5            0
     ``observation_normalization``          demonstrations none
@@ -235,7 +235,7 @@ class ActPC(StoresLastTransition):
             env,
             learning_rate,
             buffer_size,
-            default(learning_starts, 0, 1000),
+            default(learning_starts, 0, 100),
             batch_size,
             tau,
             gamma,
@@ -834,18 +834,18 @@ class ActPC(StoresLastTransition):
         self._update_learning_rate([circuit.optimizer for _, circuit in self.policy.named_circuits()])
         n_actor, n_critic, n_generator = self._batch_sizes(batch_size)
         # Sample the minibatches of all updates together (line 17)
-        for batch in self._sample_batches(gradient_steps, batch_size):
+        for batch in self.sample_batches(gradient_steps, batch_size):
             self._n_updates += 1
             self.diagnostics.begin_update(self._n_updates, self.num_timesteps, self.policy_delay)
             # Motor-action circuit: the critic term plus imitation (lines 19 and 26)
             if self._n_updates % self.policy_delay == 0:
-                self._update_actor(batch.first(n_actor))
+                self.update_actor(batch.first(n_actor))
             # Policy circuit: settle on the bootstrapped targets (lines 21 and 22)
             if self.critic_weight:
-                self._update_critic(batch.first(n_critic))
+                self.update_critic(batch.first(n_critic))
             # World model: settle on the next observation (line 24). Without weight in the reward it has no role
             if self.alpha_ep:
-                self._update_generator(batch.first(n_generator))
+                self.update_generator(batch.first(n_generator))
             # Target circuits follow
             if self.target_update_interval == 1:
                 self._update_targets(self.tau)
@@ -870,7 +870,7 @@ class ActPC(StoresLastTransition):
         if self._n_updates % EXPERT_SIGNALS_INTERVAL == 1 or not self.expert.has_signals:
             self.expert.refresh_signals(self._raw_signals, self.inputs, *self.signals.rescored)
 
-    def _sample_batches(self, n_batches: int, batch_size: int) -> Iterator[Batch]:
+    def sample_batches(self, n_batches: int, batch_size: int) -> Iterator[Batch]:
         """Minibatches of replayed transitions, the newest in each, then the share that comes from the demonstrations."""
         assert self.replay_buffer is not None
         if n_batches < 1:
@@ -898,7 +898,7 @@ class ActPC(StoresLastTransition):
             # circuits with a smaller batch take its first rows: the newest, then a fair mixture of the rest
             yield batch if min(sizes) == largest else batch.shuffled(keep=n_newest)
 
-    def _update_actor(self, batch: Batch) -> None:
+    def update_actor(self, batch: Batch) -> None:
         """Critic term (line 19) and imitation term (line 26), added up for one step of the optimizer."""
         actor = self.actor.circuit
         changes = None
@@ -925,14 +925,14 @@ class ActPC(StoresLastTransition):
             actor.apply_changes(changes)
             self.guidance.after_update(self._context())
 
-    def _update_critic(self, batch: Batch) -> None:
+    def update_critic(self, batch: Batch) -> None:
         """All members settle on the same targets."""
         inputs = th.cat([batch.features, batch.actions], dim=1)
-        state = self.critic.settle(inputs, self._critic_targets(batch))
+        state = self.critic.settle(inputs, self.critic_targets(batch))
         self.diagnostics.settled("critic", state)
         self.critic.apply_changes(self.critic.hebbian_update(state))
 
-    def _update_generator(self, batch: Batch) -> None:
+    def update_generator(self, batch: Batch) -> None:
         """The generator settles on the next observation."""
         inputs = th.cat([batch.features, batch.actions], dim=1)
         state = self.generator.settle(inputs, batch.next_features, batch.memory)
@@ -944,7 +944,7 @@ class ActPC(StoresLastTransition):
         bound = TARGET_NOISE_CLIP * self.target_policy_noise
         return (th.randn_like(actions) * self.target_policy_noise).clamp(-bound, bound)
 
-    def _critic_targets(self, batch: Batch) -> th.Tensor:
+    def critic_targets(self, batch: Batch) -> th.Tensor:
         """t = r + γ c, or r alone when terminal; one and the same reward for every action output, (B, A)."""
         if self.bootstrap == "literal":
             next_actions = batch.actions

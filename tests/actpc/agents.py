@@ -16,12 +16,11 @@ SMALL = {
     "seed": 0,
     "device": "cpu",
 }
-# one critic and tied error synapses, which do not decay; no habit
+# one critic and tied error synapses, which do not decay; nothing is normalized
 PLAIN_POLICY = {
     "net_arch": [16, 16],
     "n_critics": 1,
-    "habit": False,
-    "circuit_kwargs": {"feedback": "tied", "weight_decay": 0.0},
+    "circuit_kwargs": {"feedback": "tied", "weight_decay": 0.0, "normalization": "none", "activation": "relu6"},
 }
 # Algorithm 1 and nothing else: what a test of one mechanism starts from, so that no other one can be the reason
 PLAIN: dict[str, Any] = {
@@ -30,21 +29,21 @@ PLAIN: dict[str, Any] = {
     "tau": 0.005,
     "n_steps": 1,
     "prior_updates": 5,
-    "actor_warm_start": 0,
-    "critic_warmup": 0,
+    "guidance": "none",
     "policy_delay": 1,
+    "gradient_steps": 1,
     "demonstration_fraction": 0.0,
     "observation_normalization": "none",
     "exploration_noise": 0.0,
     "target_policy_noise": 0.0,
-    "scale_pressure": False,
+    "normalize_critic_term": False,
     "alpha_ep": 1.0,
     "alpha_in": 1.0,
     "alpha_ext": 1.0,
     "signal_kwargs": {"normalizer": "max", "normalization": "stored"},
 }
-# the constructor's defaults, but for sizes: a warm start and a warm-up of no time
-QUICK: dict[str, Any] = {**SMALL, "learning_starts": None, "actor_warm_start": 5, "critic_warmup": 5}
+# the constructor's defaults, but for sizes: BC and a critic warm-up of no time
+QUICK: dict[str, Any] = {**SMALL, "learning_starts": None, "guidance_kwargs": {"bc_updates": 5, "critic_warmup": 5}}
 
 
 def plain(**keywords: Any) -> dict[str, Any]:
@@ -55,7 +54,7 @@ def plain(**keywords: Any) -> dict[str, Any]:
 
 
 def imitating(env=CountingEnv, policy_kwargs=None, **keywords):
-    """The constructor's defaults but for sizes: with demonstrations there is a habit."""
+    """The constructor's defaults but for sizes: with demonstrations there is guidance."""
     env = env if isinstance(env, VecEnv) else DummyVecEnv([env])
     policy_kwargs = {"net_arch": [16, 16], **(policy_kwargs or {})}
     keywords = {"demonstrations": demonstrations(), **QUICK, **keywords, "policy_kwargs": policy_kwargs}
@@ -75,20 +74,4 @@ def differ(one, other) -> bool:
     return any(not th.equal(a, b) for a, b in zip(one, other, strict=True))
 
 
-PARTS = {
-    "demonstrations": demonstrations(),
-    "demonstration_fraction": 0.5,
-    "target_policy_noise": 0.2,
-    "refresh_kwargs": {"noise": 0.1},
-    "scale_pressure": True,
-    "actor_warm_start": 5,
-}
-EQUATION_1 = {"dynamics": "state", "n_settling_steps": 3}
 LEARNED = {"feedback": "learned", "feedback_start": "mirrored", "weight_decay": 0.1}
-
-
-def with_all_parts(settling="scheduled", circuits=None, nudge=None, habit=False, **keywords):
-    """An agent whose updates have all their parts; a habit and its trust region by choice."""
-    policy = {"net_arch": [16, 16], "n_critics": 2, "memory_history": 2, "nudge": nudge, "circuit_kwargs": circuits or LEARNED}
-    keywords = {**PARTS, "refresh_weight": 0.3, **keywords}
-    return make(settling=settling, policy_kwargs={**policy, "habit": habit}, **keywords)

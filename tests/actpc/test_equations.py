@@ -15,11 +15,11 @@ def test_the_actors_step_is_proportional_to_the_weight_of_the_critics_pressure()
     untouched = {"refresh_weight": 0.0, "learning_starts": 60, "learning_rate": 1.0, "policy_kwargs": SGD}
     steps = []
     for weight in (0.5, 1.0):
-        model = make(actor_pressure=weight, **untouched)
+        model = make(critic_weight=weight, **untouched)
         model.learn(50)  # nothing is learned yet: both agents are the same
         before = [parameter.clone() for parameter in model.actor.circuit.parameters()]
         model._n_updates = 1
-        model._update_actor(model._sample_batch(16))
+        model.update_actor(next(model.sample_batches(1, 16)))
         steps.append([new - old for new, old in zip(model.actor.circuit.parameters(), before, strict=True)])
     assert any(bool(step.abs().max() > 1e-9) for step in steps[1])
     for half, whole in zip(*steps, strict=True):
@@ -65,17 +65,19 @@ def test_the_bootstrapped_action_is_that_of_the_next_observation_with_the_memory
     """μ'(o_t+1, m_t+1), where m_t+1 holds o_t: with m_t the target actor would act on what it had forgotten."""
     model = make(learning_starts=20, policy_kwargs={"memory_history": 3})
     model.learn(60)
-    batch = model._sample_batch(32)
+    batch = next(model.sample_batches(1, 32))
     next_actions = model.actor_target.project(batch.bootstrap_features, batch.next_memory)
     forgetful = model.actor_target.project(batch.bootstrap_features, batch.memory)
     assert (next_actions - forgetful).abs().max() > 1e-3
-    values = model.critic_target[0].project(th.cat([batch.bootstrap_features, next_actions], dim=1))
+    values = model.critic_target.project(th.cat([batch.bootstrap_features, next_actions], dim=1))
     expected = batch.rewards + (1.0 - batch.dones) * model.gamma * values
-    th.testing.assert_close(model._critic_targets(batch, model._target_noise(batch)), expected)
+    th.testing.assert_close(model.critic_targets(batch), expected)
 
 
 def test_the_target_actor_begins_where_the_warm_start_ends():
-    model = make(learning_starts=20, actor_warm_start=3, demonstrations=demonstrations())
+    model = make(
+        learning_starts=20, guidance="default", guidance_kwargs={"bc_updates": 3, "gate": False}, demonstrations=demonstrations()
+    )
     before = model.actor.circuit.weights[0].clone()
     model.learn(1)
     assert not th.equal(before, model.actor.circuit.weights[0])

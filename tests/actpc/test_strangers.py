@@ -180,7 +180,7 @@ class Closed(ActPCPolicy):
 def test_a_policy_has_to_pass_on_what_it_does_not_know():
     with pytest.raises(ValueError, match=r"Closed does not take \['circuit_kwargs'\].*\*\*kwargs"):
         ActPC(Closed, CountingEnv())
-    with pytest.raises(ValueError, match=r"Closed does not take \['circuit_kwargs', 'habit'\].*\*\*kwargs"):
+    with pytest.raises(ValueError, match=r"Closed does not take \['circuit_kwargs', 'is_gated'\].*\*\*kwargs"):
         ActPC(Closed, CountingEnv(), demonstrations=demonstrations())
 
 
@@ -190,8 +190,8 @@ def test_misspelt_keywords_of_the_buffer_are_named():
 
 
 def test_nothing_is_imitated_where_nothing_is_shown_or_kept():
-    assert "imitated: nothing" in make(replay_buffer_kwargs={"self_imitation_size": 0}).describe()
-    assert "imitated: own episodes" in make().describe()
+    assert "self-imitation" in make(replay_buffer_kwargs={"self_imitation_size": 0}).describe().splitlines()[-1]
+    assert "self-imitation" not in make().describe()
 
 
 # ---------------------------------------------------------------------- files
@@ -229,7 +229,7 @@ def test_a_trained_agent_goes_on_without_demonstrations_where_that_is_asked(tmp_
     with pytest.warns(UserWarning, match="goes on without"):
         loaded.learn(10)
     with pytest.raises(ValueError, match="need demonstrations="):
-        ActPC("MlpPolicy", CountingEnv(), actor_warm_start=5)
+        ActPC("MlpPolicy", CountingEnv(), demonstration_fraction=0.5)
 
 
 def test_a_circuits_own_learning_rate_outlasts_another_of_the_agent(tmp_path):
@@ -237,7 +237,7 @@ def test_a_circuits_own_learning_rate_outlasts_another_of_the_agent(tmp_path):
     loaded = ActPC.load(tmp_path / "agent", env=CountingEnv(), learning_rate=1e-3)
     loaded.learn(15)
     assert loaded.actor.circuit.optimizer.param_groups[0]["lr"] == pytest.approx(1e-4)
-    assert loaded.critic[0].optimizer.param_groups[0]["lr"] == pytest.approx(1e-3)
+    assert loaded.critic.optimizer.param_groups[0]["lr"] == pytest.approx(1e-3)
 
 
 def test_buffers_of_others_are_refused(tmp_path):
@@ -302,9 +302,9 @@ def test_noise_of_several_environments_is_that_of_one_in_another_number_of_them(
 def test_the_keywords_of_an_agents_policy_are_those_of_the_loaded_one(tmp_path):
     """What demonstrations add to them is none that the user has given."""
     imitating().save(tmp_path / "agent")
-    for given in ({"net_arch": [16, 16]}, {"net_arch": [16, 16], "habit": True}):
-        assert ActPC.load(tmp_path / "agent", policy_kwargs=given).policy.habit
-    for other in ({"net_arch": [16, 16], "habit": False}, {"net_arch": [8]}):
+    for given in ({"net_arch": [16, 16]}, {"net_arch": [16, 16], "is_gated": True}):
+        assert ActPC.load(tmp_path / "agent", policy_kwargs=given).policy.is_gated
+    for other in ({"net_arch": [16, 16], "is_gated": False}, {"net_arch": [8]}):
         with pytest.raises(ValueError, match=re.escape(f"specified kwargs: {other}")):  # as they were given
             ActPC.load(tmp_path / "agent", policy_kwargs=other)
 
