@@ -2,7 +2,7 @@
 
 import warnings
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Annotated, Any, Literal, NamedTuple
@@ -14,6 +14,7 @@ from gymnasium import spaces
 from sb3_actpc.actpc.arguments import Between, checked
 from sb3_actpc.demonstrations import Demonstrations, scaled_actions
 from sb3_actpc.demonstrations.rows import split_observations
+from sb3_actpc.utils.nested import map_observations
 
 Observations = np.ndarray | dict[str, np.ndarray]
 TensorObservations = th.Tensor | dict[str, th.Tensor]
@@ -84,13 +85,6 @@ class ImitationSamples(NamedTuple):
     history: Observations | None
     history_mask: np.ndarray | None
     neighbours: np.ndarray | None = None
-
-
-def map_observations(function: Callable[[Any], Any], observations: Any) -> Any:
-    """Apply ``function`` to an array or tensor, or to every one of a dict."""
-    if isinstance(observations, dict):
-        return {key: function(value) for key, value in observations.items()}
-    return function(observations)
 
 
 @dataclass

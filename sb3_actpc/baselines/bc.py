@@ -8,10 +8,10 @@ from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
 from torch import nn
 
-from sb3_actpc.actpc.arguments import Positive, Weight, checked
 from sb3_actpc.baselines.bc_policies import BCPolicy, BCRNNPolicy, CloningPolicy
 from sb3_actpc.baselines.offline_algorithm import OfflineAlgorithm
 from sb3_actpc.demonstrations import Demonstrations, scaled_actions
+from sb3_actpc.utils.arguments import Positive, Weight, checked
 
 
 class BC(OfflineAlgorithm):

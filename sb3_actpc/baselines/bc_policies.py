@@ -11,7 +11,7 @@ from stable_baselines3.common.torch_layers import create_mlp
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
-from sb3_actpc.actpc.arguments import Between, Positive, checked
+from sb3_actpc.utils.arguments import Between, Positive, checked
 
 CELLS: dict[str, type[nn.GRU] | type[nn.LSTM]] = {"gru": nn.GRU, "lstm": nn.LSTM}
 SMALLEST_SPREAD = 1e-3  # an entry that hardly varies in the demonstrations is not blown up

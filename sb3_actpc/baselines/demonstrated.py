@@ -1,54 +1,15 @@
 """What baselines share: demonstrations that fit the task, and, off policy, a share of them in every batch."""
 
-import os
-from pathlib import Path
 from typing import Any
 
-from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
-from sb3_actpc.actpc.arguments import Share, checked
 from sb3_actpc.baselines.demonstration_buffers import WithDemonstrations, demonstration_buffer_class
-from sb3_actpc.demonstrations import Demonstrations, fit_demonstrations
-
-
-class LearnsFromDemonstrations(BaseAlgorithm):
-    """The demonstrations of an algorithm: what the user asked for, and what of it fits the environment.
-
-    :param policy: as SB3's
-    :param env: as SB3's
-    :param demonstrations: a path, or a :class:`~sb3_actpc.demonstrations.dataset.Demonstrations`; None learns without
-    :param n_demonstrations: use only the first so many episodes of them
-    :param n_demonstration_transitions: use only the first so many transitions
-    :param options: keywords of the algorithm
-    :raises ValueError: for demonstrations that do not fit the environment
-    """
-
-    def __init__(
-        self,
-        policy: Any,
-        env: GymEnv | str | None,
-        *,
-        demonstrations: Demonstrations | str | Path | None = None,
-        n_demonstrations: int | None = None,
-        n_demonstration_transitions: int | None = None,
-        **options: Any,
-    ) -> None:
-        # a saved agent holds the path as it was given, and no object of one system's paths
-        self.demonstrations = os.fspath(demonstrations) if isinstance(demonstrations, Path) else demonstrations
-        self.n_demonstrations, self.n_demonstration_transitions = n_demonstrations, n_demonstration_transitions
-        super().__init__(policy, env, **options)
-
-    def _fitted_demonstrations(self) -> Demonstrations:
-        assert self.demonstrations is not None
-        limits = self.n_demonstrations, self.n_demonstration_transitions
-        try:
-            return fit_demonstrations(self.demonstrations, self.env, self.observation_space, self.action_space, *limits)
-        except FileNotFoundError as error:
-            raise FileNotFoundError(f"{error}; or pass demonstrations=, which load(path, env=env, ...) takes too") from error
+from sb3_actpc.demonstrations.mixin import LearnsFromDemonstrations
+from sb3_actpc.utils.arguments import Share, checked
 
 
 class DemonstratedAlgorithm(LearnsFromDemonstrations, OffPolicyAlgorithm):

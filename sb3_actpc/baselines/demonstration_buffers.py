@@ -10,10 +10,10 @@ from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
-from sb3_actpc.actpc.arguments import Share, checked
-from sb3_actpc.actpc.self_imitation import map_observations
 from sb3_actpc.demonstrations import Demonstrations, scaled_actions
 from sb3_actpc.demonstrations.rows import split_observations
+from sb3_actpc.utils.arguments import Share, checked
+from sb3_actpc.utils.nested import map_observations
 
 
 def fill_with_demonstrations(

@@ -7,10 +7,10 @@ import torch as th
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
-from sb3_actpc.actpc.arguments import Share, checked
 from sb3_actpc.baselines.demonstration_buffers import DemonstrationHerReplayBuffer, WithDemonstrations
 from sb3_actpc.baselines.prioritized import DemonstrationPrioritizedHerReplayBuffer
 from sb3_actpc.baselines.td3 import DDPGDemo
+from sb3_actpc.utils.arguments import Share, checked
 
 
 class HER(DDPGDemo):

@@ -15,8 +15,8 @@ from stable_baselines3.common.torch_layers import create_mlp
 from stable_baselines3.common.type_aliases import GymEnv
 from torch import nn
 
-from sb3_actpc.actpc.arguments import Count, Positive, Share, Weight, checked
-from sb3_actpc.baselines.demonstrated import LearnsFromDemonstrations
+from sb3_actpc.demonstrations.mixin import LearnsFromDemonstrations
+from sb3_actpc.utils.arguments import Count, Positive, Share, Weight, checked
 
 ZERO_DELTA = 6e-7  # at or below this the guidance step is left out (the authors' code)
 _NETS = ("discriminator", "guidance_value", "discriminator_optimizer", "guidance_value_optimizer")
@@ -58,7 +58,7 @@ class LOGO(LearnsFromDemonstrations, TRPO):
     :param discriminator_learning_rate: Adam's
     :param discriminator_updates: updates each iteration, each on all transitions of the iteration and all demonstrations
     :param discriminator_net_arch: hidden sizes of the discriminator and of the guidance value net
-    :param options: keywords of :class:`~sb3_actpc.baselines.demonstrated.LearnsFromDemonstrations` (without demonstrations it
+    :param options: keywords of :class:`~sb3_actpc.demonstrations.mixin.LearnsFromDemonstrations` (without demonstrations it
         is TRPO) and of sb3-contrib's TRPO; ``target_kl`` is the paper's ``high_kl``, and unless given ``cg_max_steps`` is 10,
         ``line_search_shrinking_factor`` 0.5
     :raises ValueError: for a keyword with a value that is not allowed, for demonstrations that do not fit the environment,

@@ -11,9 +11,9 @@ from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 
-from sb3_actpc.actpc.arguments import Positive, checked
-from sb3_actpc.baselines.demonstrated import LearnsFromDemonstrations
 from sb3_actpc.demonstrations.dataset import Demonstrations
+from sb3_actpc.demonstrations.mixin import LearnsFromDemonstrations
+from sb3_actpc.utils.arguments import Positive, checked
 
 SelfOffline = TypeVar("SelfOffline", bound="OfflineAlgorithm")
 
@@ -27,7 +27,7 @@ class OfflineAlgorithm(LearnsFromDemonstrations):
 
     :param policy: "MlpPolicy"
     :param env: a task with Box observations and actions; for its spaces and for evaluations
-    :param demonstrations: as of :class:`~sb3_actpc.baselines.demonstrated.LearnsFromDemonstrations`, with ``n_demonstrations``
+    :param demonstrations: as of :class:`~sb3_actpc.demonstrations.mixin.LearnsFromDemonstrations`, with ``n_demonstrations``
         and ``n_demonstration_transitions``
     :param learning_rate: of the optimiser, or a schedule; the other keywords are SB3's
     :param batch_size: B

@@ -8,8 +8,8 @@ from stable_baselines3.common.type_aliases import DictReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
-from sb3_actpc.actpc.arguments import Share, Weight, checked
 from sb3_actpc.baselines.demonstration_buffers import DemonstrationHerReplayBuffer, join_batches
+from sb3_actpc.utils.arguments import Share, Weight, checked
 
 
 class SumTree:

@@ -10,10 +10,10 @@ from stable_baselines3 import TD3
 from stable_baselines3.common.policies import BaseModel
 from stable_baselines3.common.utils import polyak_update
 
-from sb3_actpc.actpc.arguments import Share, Weight, checked
-from sb3_actpc.actpc.self_imitation import map_observations
 from sb3_actpc.baselines.demonstrated import DemonstratedAlgorithm
+from sb3_actpc.utils.arguments import Share, Weight, checked
 from sb3_actpc.utils.checks import check_kind
+from sb3_actpc.utils.nested import map_observations
 
 OPTIMIZERS: dict[str, type[th.optim.Optimizer]] = {"adam": th.optim.Adam, "adamw": th.optim.AdamW}
 NETWORK_KEYWORDS = ("learning_rate", "optimizer", "optimizer_kwargs", "tau")

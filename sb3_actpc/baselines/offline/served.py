@@ -15,13 +15,13 @@ from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import Schedule
 
-from sb3_actpc.actpc.arguments import Between, checked
 from sb3_actpc.baselines.bc_policies import LARGEST_INPUT, SMALLEST_SPREAD, State, StatefulPolicy
 from sb3_actpc.baselines.offline.installation import environment_python
 from sb3_actpc.baselines.offline.process import ServerProcess
 from sb3_actpc.baselines.offline.servers.frames import Arrays, Values
 from sb3_actpc.baselines.offline_algorithm import OfflineAlgorithm
 from sb3_actpc.demonstrations import Demonstrations, scaled_actions
+from sb3_actpc.utils.arguments import Between, checked
 
 SERVERS = Path(__file__).resolve().parent / "servers"
 D3RLPY_RATES = "actor_learning_rate, critic_learning_rate, ..."

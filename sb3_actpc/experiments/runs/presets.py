@@ -15,7 +15,6 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 
-from sb3_actpc.actpc.arguments import check_settings
 from sb3_actpc.checkpoints import why_no_checkpoints
 from sb3_actpc.demonstrations import is_minari_id, shipped_demonstrations
 from sb3_actpc.demonstrations.minari import minari_files
@@ -23,6 +22,7 @@ from sb3_actpc.envs import sparse_env_id
 from sb3_actpc.experiments.runs.algorithms import check_keywords, load_algorithm
 from sb3_actpc.experiments.runs.environments import make_env
 from sb3_actpc.experiments.runs.schema import Run, merged
+from sb3_actpc.utils.arguments import check_settings
 from sb3_actpc.utils.checks import Settings, check_kind, nearest
 from sb3_actpc.utils.constructors import constructor_keywords
 from sb3_actpc.utils.files import file_hash

@@ -1,0 +1,52 @@
+"""The demonstrations of an algorithm, shared by ActPC and the baselines."""
+
+import os
+from pathlib import Path
+from typing import Any
+
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.type_aliases import GymEnv
+
+from sb3_actpc.demonstrations.dataset import Demonstrations
+from sb3_actpc.demonstrations.fitting import fit_demonstrations
+
+
+class LearnsFromDemonstrations(BaseAlgorithm):
+    """Keeps what the user passed as demonstrations, and fits it to the environment on request.
+
+    :param policy: as SB3's
+    :param env: as SB3's
+    :param demonstrations: a path, or a :class:`~sb3_actpc.demonstrations.dataset.Demonstrations`; None learns without
+    :param n_demonstrations: use only this many episodes, the first ones
+    :param n_demonstration_transitions: use only this many transitions, the first ones
+    :param options: keywords of the algorithm
+    """
+
+    def __init__(
+        self,
+        policy: Any,
+        env: GymEnv | str | None,
+        *,
+        demonstrations: Demonstrations | str | Path | None = None,
+        n_demonstrations: int | None = None,
+        n_demonstration_transitions: int | None = None,
+        **options: Any,
+    ) -> None:
+        # a saved agent holds the path as text, which every system can read
+        self.demonstrations = os.fspath(demonstrations) if isinstance(demonstrations, Path) else demonstrations
+        self.n_demonstrations = n_demonstrations
+        self.n_demonstration_transitions = n_demonstration_transitions
+        super().__init__(policy, env, **options)
+
+    def _fitted_demonstrations(self) -> Demonstrations:
+        """The demonstrations as the environment would have recorded them.
+
+        :raises ValueError: for demonstrations that do not fit the environment
+        :raises FileNotFoundError: when the file is missing
+        """
+        assert self.demonstrations is not None
+        limits = self.n_demonstrations, self.n_demonstration_transitions
+        try:
+            return fit_demonstrations(self.demonstrations, self.env, self.observation_space, self.action_space, *limits)
+        except FileNotFoundError as error:
+            raise FileNotFoundError(f"{error}; or pass demonstrations=, which load(path, env=env, ...) takes too") from error

@@ -1,0 +1,262 @@
+"""What the constructors of ActPC, of its policy and of the baselines take. The kind and the range of a keyword stand in the
+constructor's signature, where type checkers see them too; :func:`checked` holds the values to it before anything is made.
+"""
+
+import inspect
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import wraps
+from numbers import Integral
+from typing import Annotated, Any, Literal, ParamSpec, get_args, get_origin
+
+import gymnasium as gym
+import numpy as np
+import torch as th
+from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.type_aliases import TrainFreq
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_actpc.ngc.circuit import LARGEST_SIZE as LARGEST_LAYER
+from sb3_actpc.utils.checks import KINDS, LARGEST_SIZE, check_device, check_kind, nearest
+from sb3_actpc.utils.constructors import constructors
+
+Parameters = ParamSpec("Parameters")
+CIRCUITS = ("actor", "critic", "generator", "prior")
+MAX_CRITICS = 100
+MAX_SEED = 2**32 - 1  # NumPy's
+
+
+@dataclass(frozen=True)
+class Between:
+    """Bounds of a number, both allowed; None passes."""
+
+    low: float
+    high: float = np.inf
+
+    def __call__(self, name: str, value: Any) -> None:
+        """:raises ValueError: naming the keyword, its value and the bounds"""
+        if value is not None and not self.low <= value <= self.high:
+            bounds = f"at least {self.low}" if np.isinf(self.high) else f"between {self.low} and {self.high}"
+            raise ValueError(f"{name}={value!r} must be {bounds}")
+
+
+Share = Annotated[float, Between(0, 1)]
+Weight = Annotated[float, Between(0)]
+Count = Annotated[int, Between(0)]
+Positive = Annotated[int, Between(1)]
+Size = Annotated[int, Between(1, LARGEST_SIZE)]
+
+
+def checked(init: Callable[Parameters, None]) -> Callable[Parameters, None]:
+    """A constructor that refuses values which its annotations do not allow.
+
+    :param init: an ``__init__``; a function (name, value) in an ``Annotated`` raises ValueError for a bad value
+    :return: the same, checked; it names the nearest keyword to one that it does not know, and takes NumPy's numbers
+    """
+    signature = inspect.signature(init, eval_str=True)
+    known = list(signature.parameters)[1:]
+    is_open = any(parameter.kind is parameter.VAR_KEYWORD for parameter in signature.parameters.values())
+
+    @wraps(init)
+    def checking(*args: Parameters.args, **kwargs: Parameters.kwargs) -> None:
+        for name in kwargs:
+            if not is_open and name not in known:
+                expected = f": expected some of {', '.join(known)}" if len(known) < 10 else ""
+                raise TypeError(f"{type(args[0]).__name__} has no keyword {name!r}{nearest(name, known)}{expected}")
+        given = signature.bind(*args, **kwargs)
+        given.apply_defaults()
+        for name, value in given.arguments.items():
+            given.arguments[name] = _plain(value)
+            _check(name, given.arguments[name], signature.parameters[name].annotation)
+        init(*given.args, **given.kwargs)
+
+    return checking
+
+
+def _plain(value: Any) -> Any:
+    """Python's own numbers in the place of NumPy's, which SB3 does not take everywhere."""
+    if type(value) is tuple:
+        return tuple(map(_plain, value))
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def check_settings(kind: type, settings: Mapping[str, Any]) -> None:
+    """ValueError for the first of the settings that a :func:`checked` constructor of a class would refuse, or that SB3's own,
+    which check little, cannot work with."""
+    annotations: dict[str, Any] = {}
+    for init in constructors(kind):
+        if hasattr(init, "__wrapped__"):
+            own = inspect.signature(init, eval_str=True).parameters.values()
+            annotations = {**{one.name: one.annotation for one in own}, **annotations}
+    annotations = {**OF_SB3, **annotations}
+    for name in filter(annotations.__contains__, settings):
+        _check(name, settings[name], annotations[name])
+
+
+def _check(name: str, value: Any, annotation: Any) -> None:
+    """:raises ValueError: naming the keyword, its value, what is allowed, and how to mend it"""
+    kind, *checks = get_args(annotation) if get_origin(annotation) is Annotated else (annotation,)
+    if get_origin(kind) is Literal:
+        if not isinstance(value, str) or value not in get_args(kind):
+            raise ValueError(f"{name}={value!r} is unknown; choose one of {list(get_args(kind))}")
+    elif kind in KINDS:  # others are left to the functions in Annotated
+        check_kind(name, value, kind)
+    for check in checks:
+        check(name, value)
+
+
+# ---------------------------------------------------------------------- of the agent
+
+
+def check_env(name: str, env: Any) -> None:
+    """None is for agents that are loaded to be played."""
+    if env is not None and not isinstance(env, (str, gym.Env, VecEnv)):
+        raise ValueError(f"{name}={env!r} must be an environment or the id of one, such as 'Pendulum-v1'")
+
+
+def check_learning_rate(name: str, learning_rate: Any) -> None:
+    """A number that is not negative, or a function that begins with one."""
+    try:
+        start = float(learning_rate(1.0)) if callable(learning_rate) else learning_rate
+    except (TypeError, ValueError) as error:
+        raise ValueError(
+            f"{name}={learning_rate!r} must be a number, or a function of the remaining progress (1 to 0): {error}"
+        ) from error
+    _check(name, start, Weight)
+
+
+def check_train_freq(name: str, train_freq: Any) -> None:
+    """A number of steps, or a number with its unit."""
+    frequency, unit = train_freq if isinstance(train_freq, tuple) and len(train_freq) == 2 else (train_freq, "step")
+    is_known = isinstance(train_freq, TrainFreq) or unit in ("step", "episode")
+    if not is_known or not isinstance(frequency, int) or not 1 <= frequency <= LARGEST_SIZE:
+        raise ValueError(f"{name}={train_freq!r} must be a whole number of at least 1, or (number, 'step' or 'episode')")
+
+
+def check_noise(name: str, noise: Any) -> None:
+    """One of SB3's."""
+    if noise is not None and not isinstance(noise, ActionNoise):
+        raise ValueError(f"{name}={noise!r} must be None or one of SB3's, such as NormalActionNoise(mean, sigma)")
+
+
+def check_nudge(name: str, nudge: Any) -> None:
+    """None, or above 0 and at most 1."""
+    if nudge is not None and not 0.0 < nudge <= 1.0:
+        raise ValueError(f"{name}={nudge!r} must be above 0 and at most 1")
+
+
+def check_compile(name: str, value: Any) -> None:
+    """True, False or "auto"."""
+    if not isinstance(value, bool) and value != "auto":
+        raise ValueError(f"{name}={value!r} must be True, False or 'auto'")
+
+
+def check_computes(name: str, device: Any) -> None:
+    """A device of this machine; the keyword is ``device``."""
+    check_device(device)
+
+
+def check_actions(space: gym.spaces.Box, noise: ActionNoise | None) -> None:
+    """:param space: of the environment's actions
+    :param noise: of exploration; its shape is known for SB3's kinds
+    :raises ValueError: when a dimension has no finite extent, or the noise another shape
+    """
+    with np.errstate(over="ignore", invalid="ignore"):
+        is_finite = np.all(np.isfinite(space.high - space.low))  # the largest numbers that there are stand for no bound too
+    if not is_finite:
+        raise ValueError(
+            f"action_space={space} must have finite bounds: give its actions those that they have, by "
+            "gymnasium.wrappers.TransformAction(env, lambda action: action, gymnasium.spaces.Box(low, high))"
+        )
+    if not np.issubdtype(space.dtype, np.floating):  # SB3's buffer would cut scaled actions off to whole numbers
+        raise ValueError(
+            f"action_space={space} must have a floating dtype: wrap the environment in a gymnasium.ActionWrapper whose "
+            "action_space is Box(..., dtype=np.float32), which rounds"
+        )
+    fixed = np.argwhere(space.low >= space.high)
+    if len(fixed):
+        where = tuple(map(int, fixed[0]))
+        raise ValueError(
+            f"action_space={space}: dimension {where[0] if len(where) == 1 else where} has low == high == {space.low[where]}; "
+            "wrap the environment to leave it out of the action"
+        )
+    noise = getattr(noise, "base_noise", noise)
+    shapes = [np.shape(getattr(noise, part, 0.0)) for part in ("_mu", "_sigma")]
+    try:
+        fits = np.broadcast_shapes(*shapes, space.shape) == space.shape
+    except ValueError:
+        fits = False
+    if not fits:
+        raise ValueError(
+            f"action_noise has a mean and a sigma of shapes {shapes[0]} and {shapes[1]}, an action has {space.shape}: use "
+            f"NormalActionNoise(np.zeros({space.shape}), 0.1 * np.ones({space.shape}))"
+        )
+
+
+# keywords of SB3's constructors, as theirs that are not ``checked`` mean them
+OF_SB3: dict[str, Any] = {
+    "learning_rate": Annotated[Any, check_learning_rate],
+    **dict.fromkeys(("buffer_size", "batch_size", "n_steps", "n_epochs", "stats_window_size"), Size),
+    **dict.fromkeys(("policy_delay", "target_update_interval"), Positive),
+    **dict.fromkeys(("gamma", "tau", "gae_lambda"), Share),
+    **dict.fromkeys(("learning_starts", "vf_coef", "target_policy_noise"), Weight),
+    "train_freq": Annotated[Any, check_train_freq],
+    "gradient_steps": Annotated[int, Between(-1)],
+    "target_kl": Annotated[float | None, Between(0)],
+    "use_sde": bool,
+    "tensorboard_log": str | None,
+}
+
+
+# ---------------------------------------------------------------------- of the policy
+
+
+def check_hidden(name: str, sizes: Any) -> None:
+    """Sizes of hidden layers, or None for the default."""
+    if sizes is None:
+        return
+    if not isinstance(sizes, (list, tuple)) or not all(_is_layer(size) for size in sizes):
+        raise ValueError(f"{name}={sizes!r} must be a list of layer sizes, whole numbers from 1 to {LARGEST_LAYER}")
+
+
+def _is_layer(size: Any) -> bool:
+    return isinstance(size, Integral) and 1 <= int(size) <= LARGEST_LAYER
+
+
+def check_net_arch(name: str, net_arch: Any) -> None:
+    """Sizes for all circuits, or for each."""
+    parts = net_arch if isinstance(net_arch, dict) else {"pi": net_arch}
+    unknown = sorted(set(parts) - {"pi", "qf", "generator", "prior"}, key=str)
+    if unknown:
+        raise ValueError(f"{name} has unknown keys {unknown}; choose from pi, qf, generator, prior")
+    for sizes in parts.values():
+        check_hidden(name, sizes)
+
+
+def check_circuit(name: str, settings: Any) -> None:
+    """What a circuit can have of its own beside the keywords of every circuit."""
+    for key, value in (settings or {}).items():
+        where = f"{name}[{key!r}]"
+        if key == "net_arch":
+            check_hidden(where, value)
+        elif key in ("learning_rate", "batch_size"):
+            _check(where, value, Size if key == "batch_size" else Annotated[float, Between(0, LARGEST_SIZE)])
+
+
+def check_extractor(name: str, kind: Any) -> None:
+    """A class of features extractors."""
+    _check_subclass(name, kind, BaseFeaturesExtractor)
+
+
+def check_optimizer(name: str, kind: Any) -> None:
+    """A class of ``torch.optim`` that steps by the changes alone."""
+    _check_subclass(name, kind, th.optim.Optimizer)
+    closure = inspect.signature(kind.step).parameters.get("closure")
+    if closure is not None and closure.default is closure.empty:
+        raise ValueError(f"{name}={kind!r} asks for a loss again and again; circuits have none: use one such as Adam or SGD")
+
+
+def _check_subclass(name: str, kind: Any, base: type) -> None:
+    if not isinstance(kind, type) or not issubclass(kind, base):
+        raise ValueError(f"{name}={kind!r} must be a subclass of {base.__name__}")
