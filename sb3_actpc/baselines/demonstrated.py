@@ -34,6 +34,7 @@ class DemonstratedAlgorithm(LearnsFromDemonstrations, OffPolicyAlgorithm):
         super().__init__(*args, **options)
 
     def _setup_model(self) -> None:
+        self._check_actions()
         asked = self.replay_buffer_class
         buffer = self._make_replay_buffer() if self.replay_buffer is None else self.replay_buffer
         self.replay_buffer = buffer

@@ -77,7 +77,7 @@ class OfflineAlgorithm(LearnsFromDemonstrations):
             self._setup_model()
 
     def _setup_model(self) -> None:
-        super()._setup_model()
+        self._check_actions()
         self._setup_lr_schedule()
         self.set_random_seed(self.seed)
         kwargs = {**self._network_kwargs(), **self.policy_kwargs}

@@ -22,7 +22,6 @@ class LearnsFromDemonstrations(BaseAlgorithm):
     :param n_demonstrations: use only this many episodes, the first ones
     :param n_demonstration_transitions: use only this many transitions, the first ones
     :param options: keywords of the algorithm; dictionaries among them are copied, since SB3 adds keys to some
-    :raises ValueError: for actions without finite bounds, without extent, or of whole numbers
     """
 
     def __init__(
@@ -41,10 +40,10 @@ class LearnsFromDemonstrations(BaseAlgorithm):
         self.n_demonstration_transitions = n_demonstration_transitions
         super().__init__(policy, env, **_copied(options))
 
-    def _setup_model(self) -> None:
+    def _check_actions(self) -> None:
+        """:raises ValueError: for actions that cannot be scaled to [-1, 1], or that are whole numbers"""
         if isinstance(self.action_space, spaces.Box):
             check_actions(self.action_space, getattr(self, "action_noise", None))
-        super()._setup_model()  # type: ignore[safe-super]
 
     def _fitted_demonstrations(self) -> Demonstrations:
         """The demonstrations as the environment would have recorded them.
