@@ -53,8 +53,7 @@ class RLPD(DemonstratedAlgorithm, SAC):
     """RLPD (Ball et al., arXiv 2302.02948): SAC with half of every batch from the demonstrations.
 
     Critics are layer-normalized, two drawn target critics bootstrap, and the actor climbs the mean of all critics.
-    ``gradient_steps`` updates of the critics follow each environment step, and one of the actor. The defaults are the
-    published ones for sparse rewards: 10 critics, 10 updates per step in ``hyperparams/rlpd_published.yml``.
+    ``gradient_steps`` updates of the critics follow each environment step, and one of the actor.
 
     Differences from RLPD's code (github.com/ikostrikov/rlpd):
 
