@@ -1,10 +1,18 @@
-"""The systems that ActPC is compared with, as Stable-Baselines3 algorithms on the same tasks and demonstrations."""
+"""The algorithms that ActPC is compared with, as Stable-Baselines3 algorithms on the same tasks and demonstrations."""
+
+from typing import Any
 
 from sb3_actpc.baselines.bc import BC, BCRNN
 from sb3_actpc.baselines.her import HER
 from sb3_actpc.baselines.logo import LOGO
-from sb3_actpc.baselines.offline.served import BCQ, CQL, HBC, IRIS
-from sb3_actpc.baselines.rlpd import RLPD
+from sb3_actpc.baselines.offline.served import BCQ, CQL
 from sb3_actpc.baselines.td3 import DDPGDemo, TD3Demo
+from sb3_actpc.utils.extras import import_extra
 
-__all__ = ["BC", "BCQ", "BCRNN", "CQL", "HBC", "HER", "IRIS", "LOGO", "RLPD", "DDPGDemo", "TD3Demo"]
+__all__ = ["BC", "BCQ", "BCRNN", "CQL", "HER", "LOGO", "RLPD", "DDPGDemo", "TD3Demo"]
+
+
+def __getattr__(name: str) -> Any:
+    if name != "RLPD":
+        raise AttributeError(f"module 'sb3_actpc.baselines' has no attribute {name!r}")
+    return import_extra("sb3_actpc.baselines.rlpd", "jax").RLPD

@@ -19,35 +19,6 @@ LARGEST_INPUT = 10.0  # as in SB3's VecNormalize
 State = tuple[np.ndarray, ...]  # recurrent, an entry in each array for each environment, as SB3's predict takes and returns it
 
 
-class StatefulPolicy(BasePolicy):
-    """A policy with a recurrent state."""
-
-    def predict(
-        self,
-        observation: np.ndarray | dict[str, np.ndarray],
-        state: State | None = None,
-        episode_start: np.ndarray | None = None,
-        deterministic: bool = False,
-    ) -> tuple[np.ndarray, State | None]:
-        """As SB3's: actions in the environment's units, and the next state, which begins anew where ``episode_start``, (n,),
-        is true; ``deterministic`` has no effect. ValueError when the state is not that of n episodes."""
-        self.set_training_mode(False)
-        rows, is_batch = self.obs_to_tensor(observation)
-        assert isinstance(rows, th.Tensor)
-        begins = np.full(len(rows), state is None) if episode_start is None else np.ravel(episode_start).astype(bool)
-        if len(begins) != len(rows):
-            raise ValueError(f"episode_start has {len(begins)} entries for {len(rows)} observations")
-        scaled, after = self.act(rows.float().flatten(1), begins, state)
-        shape = self.action_space.shape or ()
-        actions = np.asarray(self.unscale_action(np.clip(scaled, -1, 1).reshape(-1, *shape)))
-        return actions if is_batch else actions[0], after
-
-    @abstractmethod
-    def act(self, rows: th.Tensor, begins: np.ndarray, state: State | None) -> tuple[np.ndarray, State | None]:
-        """Actions (n, A), about in [-1, 1], and the next state, of observations (n, obs_dim); (n,) is true where an episode
-        begins."""
-
-
 class CloningPolicy(BasePolicy):
     """What both policies share: the normalisation of observations, the optimiser, and actions cut to [-1, 1] before they are
     given the environment's units. The parameters are SB3's; ValueError for observations that are no Box."""
@@ -98,11 +69,11 @@ class CloningPolicy(BasePolicy):
 
 
 class BCPolicy(CloningPolicy):
-    """A multilayer perceptron; ``net_arch`` are its hidden sizes, by default two of 512, the other keywords
+    """A multilayer perceptron; ``net_arch`` are its hidden sizes, by default two of 256, the other keywords
     :class:`CloningPolicy`'s."""
 
     def __init__(self, *args: Any, net_arch: list[int] | None = None, **kwargs: Any) -> None:
-        self.net_arch = [512, 512] if net_arch is None else list(net_arch)
+        self.net_arch = [256, 256] if net_arch is None else list(net_arch)
         super().__init__(*args, **kwargs)
 
     def _build(self) -> None:
@@ -120,7 +91,7 @@ class BCPolicy(CloningPolicy):
         return {**super()._get_constructor_parameters(), "net_arch": self.net_arch}
 
 
-class BCRNNPolicy(StatefulPolicy, CloningPolicy):
+class BCRNNPolicy(CloningPolicy):
     """A recurrent network.
 
     Its state is a tuple of arrays, as in sb3-contrib's RecurrentPPO: (n_layers, n, hidden_size) of the cells (two for an
@@ -170,21 +141,45 @@ class BCRNNPolicy(StatefulPolicy, CloningPolicy):
         hidden = [np.zeros((self.n_layers, n, self.hidden_size), dtype=np.float32) for _ in range(n_parts)]
         return *hidden, np.zeros(n, dtype=np.int64)
 
-    def act(self, rows: th.Tensor, begins: np.ndarray, state: State | None) -> tuple[np.ndarray, State]:
-        """See :class:`StatefulPolicy`; ValueError when the state is not that of n episodes of this network."""
-        initial, n = self.initial_state(len(rows)), len(rows)
-        wanted, found = ([np.shape(part) for part in parts] for parts in (initial, initial if state is None else state))
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: State | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, State]:
+        """As SB3's: actions in the environment's units, and the next state; ``deterministic`` has no effect.
+
+        :param observation: of n environments, or of one
+        :param state: what the last call returned; None begins n episodes
+        :param episode_start: (n,), true where the state begins anew
+        :raises ValueError: when state or ``episode_start`` is not that of n episodes of this network
+        """
+        self.set_training_mode(False)
+        tensor, is_batch = self.obs_to_tensor(observation)
+        assert isinstance(tensor, th.Tensor)
+        rows = tensor.float().flatten(1)
+        n = len(rows)
+        begins = np.full(n, state is None) if episode_start is None else np.ravel(episode_start).astype(bool)
+        if len(begins) != n:
+            raise ValueError(f"episode_start has {len(begins)} entries for {n} observations")
+        initial = self.initial_state(n)
+        before = initial if state is None else state
+        found, wanted = [np.shape(part) for part in before], [np.shape(part) for part in initial]
         if found != wanted:
             raise ValueError(f"state has arrays of shapes {found}: this network's, for {n} observations, have {wanted}")
-        *hidden, steps = initial if state is None else state
+        *hidden, steps = before
         if self.restart_every is not None:
             begins = begins | (steps >= self.restart_every)
-        kept = [np.where(begins[None, :, None], np.float32(0.0), part) for part in hidden]
+        kept = tuple(
+            th.as_tensor(np.where(begins[None, :, None], np.float32(0.0), part), device=self.device) for part in hidden
+        )
         with th.no_grad():
-            before = tuple(th.as_tensor(part, device=self.device) for part in kept)
-            outputs, after = self(self.normalized(rows)[:, None], before)
+            outputs, after = self(self.normalized(rows)[:, None], kept)
+        scaled = np.clip(outputs[:, 0].cpu().numpy(), -1, 1).reshape(-1, *(self.action_space.shape or ()))
+        actions = np.asarray(self.unscale_action(scaled))
         next_state = *(part.cpu().numpy() for part in after), np.where(begins, 0, steps) + 1
-        return outputs[:, 0].cpu().numpy(), next_state
+        return actions if is_batch else actions[0], next_state
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         """The first step of an episode; :meth:`predict` carries the state."""

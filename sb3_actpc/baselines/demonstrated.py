@@ -1,10 +1,14 @@
 """What baselines share: demonstrations that fit the task, and, off policy, a share of them in every batch."""
 
+import warnings
 from typing import Any
 
-from stable_baselines3.common.buffers import ReplayBuffer
+import numpy as np
+from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.type_aliases import GymEnv
+from stable_baselines3.common.type_aliases import GymEnv, RolloutReturn
+from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_actpc.baselines.demonstration_buffers import WithDemonstrations, demonstration_buffer_class
@@ -30,11 +34,14 @@ class DemonstratedAlgorithm(LearnsFromDemonstrations, OffPolicyAlgorithm):
         super().__init__(*args, **options)
 
     def _setup_model(self) -> None:
+        self._check_actions()
         asked = self.replay_buffer_class
-        if self.replay_buffer is None:
-            self.replay_buffer = self._make_replay_buffer()
+        buffer = self._make_replay_buffer() if self.replay_buffer is None else self.replay_buffer
+        self.replay_buffer = buffer
         super()._setup_model()
-        self.replay_buffer_class = asked  # SB3 puts its own default in the place of None; the agent is saved as it was made
+        # SB3 replaces None by its own default, and SBX makes a buffer of its own
+        self.replay_buffer_class = asked
+        self.replay_buffer = buffer
 
     def _replay_class(self) -> type[WithDemonstrations]:
         return demonstration_buffer_class(self.replay_buffer_class, self.observation_space, self.n_steps)
@@ -64,6 +71,46 @@ class DemonstratedAlgorithm(LearnsFromDemonstrations, OffPolicyAlgorithm):
             demonstration_fraction=self.demonstration_fraction,
             **kwargs,
         )
+
+    def collect_rollouts(self, env: VecEnv, callback: BaseCallback, *args: Any, **options: Any) -> RolloutReturn:
+        """As SB3's, which drops the transition at which a callback stops the training: here it is stored and counted.
+
+        After an exception or Ctrl-C the state of the environment is unknown, so the next ``learn`` resets it.
+        """
+        try:
+            rollout = super().collect_rollouts(env, callback, *args, **options)
+        except BaseException:
+            self._abandon_episode()
+            raise
+        if not rollout.continue_training:
+            step = callback.locals
+            self._update_info_buffer(step["infos"], step["dones"])
+            names = ("replay_buffer", "buffer_actions", "new_obs", "rewards", "dones", "infos")
+            self._store_transition(*(step[name] for name in names))
+            self._on_step()
+            self._episode_num += int(np.sum(step["dones"]))
+            if self.action_noise is not None and np.any(step["dones"]):
+                self.action_noise.reset()
+        return rollout
+
+    def _setup_learn(
+        self, total_timesteps: int, callback: Any = None, reset_num_timesteps: bool = True, *args: Any, **options: Any
+    ) -> tuple[int, BaseCallback]:
+        if reset_num_timesteps:  # SB3 resets the environment
+            self._abandon_episode()
+        return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, *args, **options)
+
+    def _abandon_episode(self) -> None:
+        """Start a new episode at the next step, which the buffer must not join to the last transition that it holds."""
+        self._last_obs = None
+        buffer = self.replay_buffer
+        if isinstance(buffer, HerReplayBuffer):
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", UserWarning)  # SB3 warns that it does what is asked for
+                buffer.truncate_last_trajectory()
+        elif isinstance(buffer, NStepReplayBuffer):
+            last = buffer.pos - 1
+            buffer.timeouts[last] = np.logical_or(buffer.timeouts[last], np.logical_not(buffer.dones[last]))
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         """As SB3's; an agent that was loaded without an environment gets its replay buffer and its demonstrations now."""

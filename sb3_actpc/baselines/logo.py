@@ -90,6 +90,7 @@ class LOGO(LearnsFromDemonstrations, TRPO):
         super().__init__(*args, **{"cg_max_steps": 10, "line_search_shrinking_factor": 0.5, **options})
 
     def _setup_model(self) -> None:
+        self._check_actions()
         super()._setup_model()
         self._shown: th.Tensor | None = None
         if self.demonstrations is None:

@@ -77,6 +77,7 @@ class OfflineAlgorithm(LearnsFromDemonstrations):
             self._setup_model()
 
     def _setup_model(self) -> None:
+        self._check_actions()
         self._setup_lr_schedule()
         self.set_random_seed(self.seed)
         kwargs = {**self._network_kwargs(), **self.policy_kwargs}
@@ -101,6 +102,9 @@ class OfflineAlgorithm(LearnsFromDemonstrations):
     @abstractmethod
     def _gradient_step(self) -> Mapping[str, float | th.Tensor]:
         """Learn from a batch: the losses, by name."""
+
+    def _validate(self) -> None:
+        """Choose what acts from now on; nothing to choose here."""
 
     @abstractmethod
     def _take(self, shown: Demonstrations) -> None:
@@ -145,5 +149,6 @@ class OfflineAlgorithm(LearnsFromDemonstrations):
             callback.update_locals({"actions": np.empty(0, dtype=np.float32), "infos": [], "dones": nothing})
             if not callback.on_step():
                 break
+        self._validate()
         callback.on_training_end()
         return self

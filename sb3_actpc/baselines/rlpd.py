@@ -1,95 +1,158 @@
-"""SAC with demonstrations in the way of RLPD: what a practitioner would try first today."""
+"""RLPD on SBX's SAC: reinforcement learning with prior data. Needs the extra ``jax``."""
 
 from typing import Any, ClassVar
 
-import torch as th
-from stable_baselines3 import SAC
-from stable_baselines3.common.policies import BasePolicy, ContinuousCritic
-from stable_baselines3.common.preprocessing import get_action_dim
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor, create_mlp
-from stable_baselines3.common.type_aliases import Schedule
-from stable_baselines3.sac.policies import SACPolicy
-from torch import nn
+import jax  # type: ignore[import-not-found]
+import jax.numpy as jnp  # type: ignore[import-not-found]
+import numpy as np
+from sbx import SAC
+from sbx.sac.policies import SACPolicy
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.utils import get_device
 
 from sb3_actpc.baselines.demonstrated import DemonstratedAlgorithm
 
-
-class LayerNormCritic(ContinuousCritic):
-    """SB3's critics with layer normalisation before every activation."""
-
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs)
-        self.n_drawn: int | None = None  # of the critics, how many answer; None for all
-        net_arch, activation = kwargs["net_arch"], kwargs.get("activation_fn", nn.ReLU)
-        n_inputs = kwargs["features_dim"] + get_action_dim(self.action_space)
-        for index in range(self.n_critics):
-            layers = create_mlp(n_inputs, 1, net_arch, activation, post_linear_modules=[nn.LayerNorm])
-            self.q_networks[index] = nn.Sequential(*layers)
-            self.add_module(f"qf{index}", self.q_networks[index])
-
-    def forward(self, obs: th.Tensor, actions: th.Tensor) -> tuple[th.Tensor, ...]:
-        """Action-values (B, 1) of every critic, or of ``n_drawn`` drawn ones."""
-        values = super().forward(obs, actions)
-        if self.n_drawn is None:
-            return values
-        return tuple(values[index] for index in th.randperm(len(values))[: self.n_drawn])
+SMALLEST_SPREAD = 1e-2  # an entry that hardly varies in the demonstrations is not scaled up
+LARGEST_INPUT = 10.0  # as in SB3's VecNormalize
+N_TARGET_CRITICS = 2  # drawn to bootstrap (REDQ, arXiv 2101.05982)
 
 
-class LayerNormSACPolicy(SACPolicy):
-    """SB3's SAC policy with :class:`LayerNormCritic`.
+class RLPDPolicy(SACPolicy):
+    """SBX's SAC policy with layer-normalized critics, for observations normalized by the demonstrations.
 
-    :param n_critics: how many critics
-    :param n_target_critics: how many drawn target critics give the smallest value that bootstraps (REDQ, arXiv 2101.05982)
-    :raises ValueError: when more are to be drawn than there are
+    :param args: as SBX's
+    :param n_critics: number of critics
+    :param options: further keywords, as SBX's
+    :raises ValueError: for fewer than two critics
     """
 
-    def __init__(self, *args: Any, n_critics: int = 10, n_target_critics: int = 2, **kwargs: Any) -> None:
-        if not 1 <= n_target_critics <= n_critics:
-            raise ValueError(f"n_target_critics={n_target_critics!r} must be between 1 and n_critics={n_critics}")
-        self.n_target_critics = n_target_critics
-        super().__init__(*args, **{**kwargs, "n_critics": n_critics})
+    def __init__(self, *args: Any, n_critics: int = 10, **options: Any) -> None:
+        if n_critics < N_TARGET_CRITICS:
+            raise ValueError(f"n_critics={n_critics!r} must be at least {N_TARGET_CRITICS}: two of them bootstrap")
+        super().__init__(*args, **{"layer_norm": True, **options, "n_critics": n_critics})
+        self.mean = np.float32(0.0)
+        self.spread = np.float32(1.0)
 
-    def _build(self, lr_schedule: Schedule) -> None:
-        super()._build(lr_schedule)
-        self.critic_target.n_drawn = self.n_target_critics  # type: ignore[assignment]
+    def fit_normalization(self, observations: np.ndarray) -> None:
+        """Give these observations, (N, obs_dim), mean 0 and standard deviation 1."""
+        self.mean = observations.mean(axis=0)
+        self.spread = np.maximum(observations.std(axis=0), SMALLEST_SPREAD)
 
-    def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> LayerNormCritic:
-        """As SB3's."""
-        kwargs = self._update_features_extractor(self.critic_kwargs, features_extractor)
-        return LayerNormCritic(**kwargs).to(self.device)
+    def normalized(self, observations: np.ndarray) -> np.ndarray:
+        """Normalized observations, (B, obs_dim)."""
+        rows = (observations - self.mean) / self.spread
+        return np.clip(rows, -LARGEST_INPUT, LARGEST_INPUT).astype(np.float32)
 
-    def _get_constructor_parameters(self) -> dict[str, Any]:
-        return {**super()._get_constructor_parameters(), "n_target_critics": self.n_target_critics}
-
-
-class LayerNormMultiInputPolicy(LayerNormSACPolicy):
-    """The same for Dict observations."""
-
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        super().__init__(*args, **{"features_extractor_class": CombinedExtractor, **kwargs})
+    def prepare_obs(self, observation: Any) -> tuple[np.ndarray, bool]:
+        """As SBX's, normalized; they are flattened, (n, obs_dim)."""
+        rows, is_batch = super().prepare_obs(observation)
+        return self.normalized(rows.reshape(len(rows), -1)), is_batch
 
 
 class RLPD(DemonstratedAlgorithm, SAC):
-    """SAC in the way of RLPD (Ball et al., arXiv 2302.02948): half of every batch from the demonstrations, layer-normalised
-    critics, an ensemble of which two bootstrap, several updates a step. The learning itself is Stable-Baselines3's SAC.
+    """RLPD (Ball et al., arXiv 2302.02948): SAC with half of every batch from the demonstrations.
 
-    Defaults are those published (10 critics, 20 updates a step, 5000 random steps before learning).
+    Critics are layer-normalized, two drawn target critics bootstrap, and the actor climbs the mean of all critics.
+    ``gradient_steps`` updates of the critics follow each environment step, and one of the actor.
 
     Differences from RLPD's code (github.com/ikostrikov/rlpd):
 
-    1. The actor and the temperature are updated with every update of the critic; there once for all 20.
-    2. The actor climbs the smallest of all critics' values, as in SB3; there their mean.
+    1. Observations are normalized by the demonstrations' mean and standard deviation.
+    2. The target has no entropy term for any task; there the task decides.
+    3. Returns can be n-step (``n_steps``).
 
-    :param args: policy, "MlpPolicy" or "MultiInputPolicy", and env; ``policy_kwargs`` takes ``n_critics`` and
-        ``n_target_critics``
-    :param options: keywords of :class:`~sb3_actpc.baselines.demonstrated.DemonstratedAlgorithm` and of SB3's SAC
+    :param args: policy, "MlpPolicy" or "MultiInputPolicy", and env; ``policy_kwargs`` takes ``net_arch`` and ``n_critics``
+    :param gradient_steps: critic updates per environment step
+    :param policy_delay: critic updates per actor update; None for ``gradient_steps``
+    :param ent_coef: of SAC; "auto_0.1" learns it from 0.1 on
+    :param options: keywords of :class:`~sb3_actpc.baselines.demonstrated.DemonstratedAlgorithm` and of SBX's SAC
     :raises ValueError: for a keyword with a value that is not allowed, for demonstrations that do not fit the environment
     """
 
-    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
-        "MlpPolicy": LayerNormSACPolicy,
-        "MultiInputPolicy": LayerNormMultiInputPolicy,
-    }
+    policy: RLPDPolicy
+    is_resumable: ClassVar[bool] = False  # checkpoints hold torch networks, these are JAX's
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": RLPDPolicy, "MultiInputPolicy": RLPDPolicy}
 
-    def __init__(self, *args: Any, learning_starts: int = 5000, gradient_steps: int = 20, **options: Any) -> None:
-        super().__init__(*args, learning_starts=learning_starts, gradient_steps=gradient_steps, **options)
+    def __init__(
+        self,
+        *args: Any,
+        gradient_steps: int = 10,
+        policy_delay: int | None = None,
+        ent_coef: str | float = "auto_0.1",
+        **options: Any,
+    ) -> None:
+        delay = gradient_steps if policy_delay is None else policy_delay
+        super().__init__(*args, gradient_steps=gradient_steps, policy_delay=delay, ent_coef=ent_coef, **options)
+
+    def _setup_model(self) -> None:
+        self.device = get_device("cpu")  # of the replay buffer: SBX takes its batches as NumPy arrays
+        is_new = getattr(self, "policy", None) is None
+        super()._setup_model()
+        demonstrated = getattr(self.replay_buffer, "demonstrated", None)
+        if is_new and demonstrated is not None:
+            parts = demonstrated.observations
+            columns = [parts[key] for key in parts] if isinstance(parts, dict) else [parts]
+            rows = [column.reshape(len(column), -1) for column in columns]
+            self.policy.fit_normalization(np.concatenate(rows, axis=1).astype(np.float32))
+
+    def _train(self, tau: float, target_entropy: Any, gradient_steps: int, data: Any, *states: Any) -> Any:
+        """SBX's updates, on normalized observations.
+
+        SBX cuts the rows into one batch after the other. The demonstrated rows come last, so every batch takes each
+        ``gradient_steps``-th row: all batches then hold the same share of demonstrations.
+        """
+        rows = np.arange(len(data.rewards)).reshape(-1, gradient_steps).T.ravel()
+        columns = data._replace(
+            observations=self.policy.normalized(data.observations.reshape(len(rows), -1)),
+            next_observations=self.policy.normalized(data.next_observations.reshape(len(rows), -1)),
+        )
+        batches = type(data)(*(column[rows] for column in columns))
+        return super()._train(tau, target_entropy, gradient_steps, batches, *states)
+
+    @staticmethod
+    @jax.jit
+    def update_critic(
+        actor_state: Any,
+        qf_state: Any,
+        ent_coef_state: Any,
+        observations: jax.Array,
+        actions: jax.Array,
+        next_observations: jax.Array,
+        rewards: jax.Array,
+        dones: jax.Array,
+        discounts: jax.Array,
+        key: jax.Array,
+    ) -> Any:
+        """One update of all critics, on rewards, dones and discounts (B,): the new state, (loss, entropy weight), and key."""
+        key, action_key, draw_key = jax.random.split(key, 3)
+        next_actions = actor_state.apply_fn(actor_state.params, next_observations).sample(seed=action_key)
+        # (n_critics, B, 1)
+        next_values = qf_state.apply_fn(qf_state.target_params, next_observations, next_actions)
+        drawn = jax.random.choice(draw_key, len(next_values), (N_TARGET_CRITICS,), replace=False)
+        bootstrap = next_values[drawn].min(axis=0)[:, 0]
+        targets = rewards + (1 - dones) * discounts * bootstrap
+
+        def critic_loss(params: Any) -> jax.Array:
+            values = qf_state.apply_fn(params, observations, actions)[..., 0]
+            return 0.5 * jnp.square(values - targets).mean(axis=1).sum()
+
+        loss, gradients = jax.value_and_grad(critic_loss)(qf_state.params)
+        entropy_weight = ent_coef_state.apply_fn({"params": ent_coef_state.params})
+        return qf_state.apply_gradients(grads=gradients), (loss, entropy_weight), key
+
+    @staticmethod
+    @jax.jit
+    def update_actor(actor_state: Any, qf_state: Any, ent_coef_state: Any, observations: jax.Array, key: jax.Array) -> Any:
+        """One update of the actor: its new state, that of the critics, loss, key and mean entropy."""
+        key, action_key = jax.random.split(key)
+        entropy_weight = ent_coef_state.apply_fn({"params": ent_coef_state.params})
+
+        def actor_loss(params: Any) -> tuple[jax.Array, jax.Array]:
+            distribution = actor_state.apply_fn(params, observations)
+            actions = distribution.sample(seed=action_key)
+            entropy = -distribution.log_prob(actions).mean()
+            values = qf_state.apply_fn(qf_state.params, observations, actions)
+            return -values.mean() - entropy_weight * entropy, entropy
+
+        (loss, entropy), gradients = jax.value_and_grad(actor_loss, has_aux=True)(actor_state.params)
+        return actor_state.apply_gradients(grads=gradients), qf_state, loss, key, entropy

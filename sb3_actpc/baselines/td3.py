@@ -9,13 +9,18 @@ import torch as th
 from stable_baselines3 import TD3
 from stable_baselines3.common.policies import BaseModel
 from stable_baselines3.common.utils import polyak_update
+from typing_extensions import Self
 
 from sb3_actpc.baselines.demonstrated import DemonstratedAlgorithm
-from sb3_actpc.utils.arguments import Share, Weight, checked
+from sb3_actpc.baselines.demonstration_buffers import WithDemonstrations
+from sb3_actpc.utils.arguments import Count, Share, Weight, checked
 from sb3_actpc.utils.checks import check_kind
 from sb3_actpc.utils.nested import map_observations
 
 OPTIMIZERS: dict[str, type[th.optim.Optimizer]] = {"adam": th.optim.Adam, "adamw": th.optim.AdamW}
+SMALLEST_VALUE = 1e-8  # mean absolute action-value that divides
+BC_LEARNING_RATE = 1e-3  # falls linearly to 0
+BC_BATCH_SIZE = 256
 NETWORK_KEYWORDS = ("learning_rate", "optimizer", "optimizer_kwargs", "tau")
 
 
@@ -28,6 +33,13 @@ class TD3Demo(DemonstratedAlgorithm, TD3):
     :param actor_kwargs: of the actor alone: ``learning_rate`` (a number; it follows the schedule of the algorithm's),
         ``optimizer`` ("adam" or "adamw"), ``optimizer_kwargs`` and ``tau``
     :param critic_kwargs: the same for the critic
+    :param policy_gradient_weight: of minus the mean action-value, where a cloning loss is added; otherwise 1
+    :param cloning_weight: of the mean over the batch's demonstrations of the squared distance between action and
+        demonstrated action (scaled to [-1, 1], summed over its dimensions); 0 for none
+    :param q_filter: clone only the demonstrated actions that the critic values above the actor's own
+    :param normalize_values: divide ``policy_gradient_weight`` by the batch's mean absolute action-value. TD3+BC (Fujimoto
+        and Gu, arXiv 2106.06860) with ``policy_gradient_weight=2.5, cloning_weight=1.0``
+    :param bc_steps: steps of behavior cloning on the demonstrations, before the first ``learn`` begins
     :param options: keywords of :class:`~sb3_actpc.baselines.demonstrated.DemonstratedAlgorithm` and of SB3's TD3
     :raises ValueError: for a keyword with a value that is not allowed, for demonstrations that do not fit the environment
     """
@@ -38,9 +50,20 @@ class TD3Demo(DemonstratedAlgorithm, TD3):
         *args: Any,
         actor_kwargs: dict[str, Any] | None = None,
         critic_kwargs: dict[str, Any] | None = None,
+        policy_gradient_weight: Weight = 1.0,
+        cloning_weight: Weight = 0.0,
+        q_filter: bool = False,
+        normalize_values: bool = False,
+        bc_steps: Count = 0,
         **options: Any,
     ) -> None:
-        self.actor_kwargs, self.critic_kwargs = actor_kwargs, critic_kwargs
+        self.actor_kwargs = actor_kwargs
+        self.critic_kwargs = critic_kwargs
+        self.policy_gradient_weight = policy_gradient_weight
+        self.cloning_weight = cloning_weight
+        self.q_filter = q_filter
+        self.normalize_values = normalize_values
+        self.bc_steps = bc_steps
         super().__init__(*args, **options)
 
     def _setup_model(self) -> None:
@@ -126,8 +149,49 @@ class TD3Demo(DemonstratedAlgorithm, TD3):
         self.actor.optimizer.step()
 
     def _actor_loss(self, batch: Any, actions: th.Tensor) -> th.Tensor:
-        """Minus the mean action-value of what the actor does, (B, A), in a batch."""
-        return -self.critic.q1_forward(batch.observations, actions).mean()
+        """Minus the mean action-value of the actor's actions, (B, A), and the cloning loss on the demonstrated rows."""
+        values = self.critic.q1_forward(batch.observations, actions)
+        n_demonstrated = self.replay_buffer.n_demonstrated(len(actions))  # type: ignore[union-attr]
+        if not (n_demonstrated and self.cloning_weight):
+            return -values.mean()
+        shown = slice(len(actions) - n_demonstrated, None)
+        distances = (actions[shown] - batch.actions[shown]).square().sum(dim=1, keepdim=True)
+        is_cloned = self._worth_cloning(batch, actions, shown)
+        self._losses["cloned_share"].append(is_cloned.mean().item())
+        value_weight = self.policy_gradient_weight
+        if self.normalize_values:
+            value_weight = value_weight / values.detach().abs().mean().clamp(min=SMALLEST_VALUE).item()
+        return self.cloning_weight * (distances * is_cloned).mean() - value_weight * values.mean()
+
+    def _worth_cloning(self, batch: Any, actions: th.Tensor, shown: slice) -> th.Tensor:
+        """The Q-filter: 1 where the critic values the demonstrated action above the actor's, (n_demonstrated, 1)."""
+        if not self.q_filter:
+            return th.ones_like(batch.rewards[shown])
+        rows = map_observations(lambda part: part[shown], batch.observations)
+        with th.no_grad():
+            demonstrated_values = self.critic.q1_forward(rows, batch.actions[shown])
+            return (demonstrated_values > self.critic.q1_forward(rows, actions[shown])).float()
+
+    def learn(self, total_timesteps: int, *args: Any, **options: Any) -> Self:
+        """As SB3's; the first call begins with ``bc_steps`` steps of behavior cloning."""
+        if self.bc_steps and not self._n_updates and getattr(self.replay_buffer, "demonstrated", None) is not None:
+            self._clone_actor()
+        return super().learn(total_timesteps, *args, **options)
+
+    def _clone_actor(self) -> None:
+        """Start the actor as behavior cloning does: least squares on the demonstrated actions, in [-1, 1]."""
+        assert isinstance(self.replay_buffer, WithDemonstrations) and self.replay_buffer.demonstrated is not None
+        demonstrated = self.replay_buffer.demonstrated
+        optimizer = th.optim.Adam(self.actor.parameters(), lr=BC_LEARNING_RATE)
+        self.actor.set_training_mode(True)
+        for step in range(self.bc_steps):
+            optimizer.param_groups[0]["lr"] = BC_LEARNING_RATE * (1 - step / self.bc_steps)
+            batch = demonstrated.sample(BC_BATCH_SIZE, self._vec_normalize_env)
+            loss = th.nn.functional.mse_loss(self.actor(batch.observations), batch.actions)
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+        self.actor_target.load_state_dict(self.actor.state_dict())
 
     def _update_targets(self) -> None:
         polyak_update(self.critic.parameters(), self.critic_target.parameters(), self._tau_of(self.critic_kwargs))
@@ -162,10 +226,9 @@ class DDPGDemo(TD3Demo):
     4. No L2 penalty on weights; ``actor_kwargs`` can ask for AdamW's decay.
 
     :param args: policy and env, as SB3's
-    :param policy_gradient_weight: λ1, of minus the mean action-value; 1 where nothing is cloned
-    :param cloning_weight: of the mean over the batch's demonstrations of the squared distance between action and
-        demonstrated action (scaled to [-1, 1], summed over its dimensions); 0 for none
-    :param q_filter: clone only what the critic values above the actor's own action
+    :param policy_gradient_weight: λ1
+    :param cloning_weight: λ2, of the mean
+    :param q_filter: as :class:`TD3Demo`'s
     :param demonstration_fraction: share of each batch; Nair et al. take 128 of 1152
     :param options: further keywords of :class:`TD3Demo`
     """
@@ -181,28 +244,13 @@ class DDPGDemo(TD3Demo):
         policy_kwargs: dict[str, Any] | None = None,
         **options: Any,
     ) -> None:
-        self.policy_gradient_weight, self.cloning_weight, self.q_filter = policy_gradient_weight, cloning_weight, q_filter
-        # SB3's DDPG
-        options = {"policy_delay": 1, "target_policy_noise": 0.1, "target_noise_clip": 0.0, **options}
-        policy_kwargs = {"n_critics": 1, **(policy_kwargs or {})}
-        super().__init__(*args, demonstration_fraction=demonstration_fraction, policy_kwargs=policy_kwargs, **options)
-
-    def _actor_loss(self, batch: Any, actions: th.Tensor) -> th.Tensor:
-        loss = super()._actor_loss(batch, actions)
-        n_demonstrated = self.replay_buffer.n_demonstrated(len(actions))  # type: ignore[union-attr]
-        if not (n_demonstrated and self.cloning_weight):
-            return loss
-        shown = slice(len(actions) - n_demonstrated, None)
-        distances = (actions[shown] - batch.actions[shown]).square().sum(dim=1, keepdim=True)
-        worth_it = self._worth_cloning(batch, actions, shown)
-        self._losses["cloned_share"].append(worth_it.mean().item())
-        return self.policy_gradient_weight * loss + self.cloning_weight * (distances * worth_it).mean()
-
-    def _worth_cloning(self, batch: Any, actions: th.Tensor, shown: slice) -> th.Tensor:
-        """The Q-filter: 1 where the critic values the demonstrated action above the actor's, (n_demonstrated, 1)."""
-        if not self.q_filter:
-            return th.ones_like(batch.rewards[shown])
-        rows = map_observations(lambda part: part[shown], batch.observations)
-        with th.no_grad():
-            theirs = self.critic.q1_forward(rows, batch.actions[shown])
-            return (theirs > self.critic.q1_forward(rows, actions[shown])).float()
+        sb3s_ddpg = {"policy_delay": 1, "target_policy_noise": 0.1, "target_noise_clip": 0.0}
+        super().__init__(
+            *args,
+            policy_gradient_weight=policy_gradient_weight,
+            cloning_weight=cloning_weight,
+            q_filter=q_filter,
+            demonstration_fraction=demonstration_fraction,
+            policy_kwargs={"n_critics": 1, **(policy_kwargs or {})},
+            **{**sb3s_ddpg, **options},
+        )

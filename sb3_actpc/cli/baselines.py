@@ -10,11 +10,11 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
     install = commands.add_parser(
         "install",
         help="make the virtual environment of a package",
-        description="Make a virtual environment for a package that pins other versions: d3rlpy (bcq, cql) or robomimic (hbc, "
-        "iris). One that is whole stays as it is. The environment variable SB3_ACTPC_BASELINES says where they are "
+        description="Make a virtual environment for a package that pins other versions: d3rlpy (bcq, cql). "
+        "One that is whole stays as it is. The environment variable SB3_ACTPC_BASELINES says where they are "
         "(default: ~/.cache/sb3_actpc/baselines).",
     )
-    install.add_argument("package", help="d3rlpy or robomimic")
+    install.add_argument("package", help="d3rlpy")
     install.add_argument("--dir", metavar="DIR", help="folder of the environments (default: as above)")
 
 

@@ -37,7 +37,11 @@ def _algos() -> Iterator[tuple[str, str]]:
     from sb3_actpc.experiments.runs.algorithms import ALGORITHMS, load_algorithm
 
     for name in ALGORITHMS:
-        yield name, (load_algorithm(name).__doc__ or "").strip().partition("\n")[0]
+        try:
+            about = (load_algorithm(name).__doc__ or "").strip().partition("\n")[0]
+        except ImportError as error:  # an extra that is not installed
+            about = str(error)
+        yield name, about
 
 
 def _variants() -> Iterator[tuple[str, str]]:

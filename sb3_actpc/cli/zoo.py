@@ -19,7 +19,7 @@ import os
 import sys
 import tempfile
 from collections.abc import Callable, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
 
@@ -78,10 +78,11 @@ def register_algorithms() -> None:
     if "actpc" in zoo.ALGOS:
         return
     for name in ALGORITHMS:
-        zoo.ALGOS[name] = load_algorithm(name)
+        with suppress(ImportError):  # of an extra that is not installed
+            zoo.ALGOS[name] = load_algorithm(name)
     samplers, converters = hyperparams.HYPERPARAMS_SAMPLER, hyperparams.HYPERPARAMS_CONVERTER
     samplers["actpc"], converters["actpc"] = sample_actpc_params, convert_actpc_params
-    for name, like in (("her", "td3"), ("sac_rlpd", "sac"), ("logo", "trpo")):
+    for name, like in (("her", "td3"), ("logo", "trpo")):
         samplers.setdefault(name, samplers[like])
         converters.setdefault(name, converters[like])
     for name in ("td3", "ddpg", "her"):

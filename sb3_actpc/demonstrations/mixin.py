@@ -4,11 +4,13 @@ import os
 from pathlib import Path
 from typing import Any
 
+from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv
 
 from sb3_actpc.demonstrations.dataset import Demonstrations
 from sb3_actpc.demonstrations.fitting import fit_demonstrations
+from sb3_actpc.utils.arguments import check_actions
 
 
 class LearnsFromDemonstrations(BaseAlgorithm):
@@ -19,7 +21,7 @@ class LearnsFromDemonstrations(BaseAlgorithm):
     :param demonstrations: a path, or a :class:`~sb3_actpc.demonstrations.dataset.Demonstrations`; None learns without
     :param n_demonstrations: use only this many episodes, the first ones
     :param n_demonstration_transitions: use only this many transitions, the first ones
-    :param options: keywords of the algorithm
+    :param options: keywords of the algorithm; dictionaries among them are copied, since SB3 adds keys to some
     """
 
     def __init__(
@@ -36,7 +38,12 @@ class LearnsFromDemonstrations(BaseAlgorithm):
         self.demonstrations = os.fspath(demonstrations) if isinstance(demonstrations, Path) else demonstrations
         self.n_demonstrations = n_demonstrations
         self.n_demonstration_transitions = n_demonstration_transitions
-        super().__init__(policy, env, **options)
+        super().__init__(policy, env, **_copied(options))
+
+    def _check_actions(self) -> None:
+        """:raises ValueError: for actions that cannot be scaled to [-1, 1], or that are whole numbers"""
+        if isinstance(self.action_space, spaces.Box):
+            check_actions(self.action_space, getattr(self, "action_noise", None))
 
     def _fitted_demonstrations(self) -> Demonstrations:
         """The demonstrations as the environment would have recorded them.
@@ -50,3 +57,8 @@ class LearnsFromDemonstrations(BaseAlgorithm):
             return fit_demonstrations(self.demonstrations, self.env, self.observation_space, self.action_space, *limits)
         except FileNotFoundError as error:
             raise FileNotFoundError(f"{error}; or pass demonstrations=, which load(path, env=env, ...) takes too") from error
+
+
+def _copied(settings: dict[str, Any]) -> dict[str, Any]:
+    """The same settings in new dictionaries, at every depth."""
+    return {name: _copied(value) if isinstance(value, dict) else value for name, value in settings.items()}

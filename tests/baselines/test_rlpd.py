@@ -1,75 +1,83 @@
-"""SAC in the way of RLPD: layer-normalised critics, two of them drawn for each target, half of the batch demonstrated."""
+"""RLPD on SBX's SAC: half of every batch demonstrated, normalized observations, layer-normalized critics."""
+
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
 import pytest
-import torch as th
-from torch import nn
+
+pytest.importorskip("sbx", reason="sbx is an extra")
 
 from sb3_actpc.baselines import RLPD
-from tests.checkpoints.runs import assert_same, learn_in_two, learn_straight
 from tests.recordings import record
 
-SMALL = {"learning_starts": 10, "batch_size": 16, "seed": 1, "gradient_steps": 2}
+ENV = "Pendulum-v1"
+SMALL = {"learning_starts": 10, "batch_size": 16, "gradient_steps": 2, "buffer_size": 500, "seed": 1}
 
 
-def make(**policy_kwargs: object) -> RLPD:
-    policy_kwargs = {"net_arch": [8], "n_critics": 4, **policy_kwargs}
-    return RLPD("MlpPolicy", "Pendulum-v1", demonstrations=record("Pendulum-v1"), policy_kwargs=policy_kwargs, **SMALL)
+def make(**options: object) -> RLPD:
+    options = {"demonstrations": record(ENV), "policy_kwargs": {"net_arch": [8], "n_critics": 3}, **SMALL, **options}
+    return RLPD("MlpPolicy", ENV, **options)
 
 
-def test_every_hidden_layer_of_every_critic_is_normalised_before_its_activation() -> None:
-    for network in make(net_arch=[8, 6]).critic.q_networks:
-        assert [type(layer) for layer in network] == [
-            *[nn.Linear, nn.LayerNorm, nn.ReLU] * 2,
-            nn.Linear,
-        ]
+def weights(tree: object) -> list[np.ndarray]:
+    if hasattr(tree, "items"):
+        return [array for _, part in sorted(tree.items()) for array in weights(part)]
+    return [np.array(tree)]
 
 
-def test_the_target_is_of_two_drawn_critics_and_the_critics_all_learn() -> None:
+@pytest.mark.parametrize("n_steps", [1, 3])
+def test_every_critic_learns_and_the_actor_does(n_steps: int) -> None:
+    model = make(n_steps=n_steps)
+    critics, actor = weights(model.policy.qf_state.params), weights(model.policy.actor_state.params)
+    model.learn(30)
+    for before, after in zip(critics, weights(model.policy.qf_state.params), strict=True):
+        assert np.isfinite(after).all()
+        assert all((before[critic] != after[critic]).any() for critic in range(3))
+    assert any((before != after).any() for before, after in zip(actor, weights(model.policy.actor_state.params), strict=True))
+
+
+def test_critics_are_layer_normalized() -> None:
+    assert "LayerNorm" in str(make().policy.qf_state.params.keys()) + str(make().policy.qf_state.params)
+
+
+def test_there_is_one_actor_update_for_the_updates_of_one_step() -> None:
+    model = make(gradient_steps=5)
+    model.learn(14)
+    assert model._n_updates == 20
+    assert int(model.policy.qf_state.step) == 20
+    assert int(model.policy.actor_state.step) == 4
+
+
+def test_actions_are_chosen_from_observations_in_units_of_the_demonstrations() -> None:
     model = make()
-    observations, actions = th.randn(5, 3), th.rand(5, 1)
-    every = model.critic_target.__class__.__mro__[1].forward(model.critic_target, observations, actions)
-    assert len(every) == 4 and len(model.critic(observations, actions)) == 4
-    seen = set()
-    for _ in range(50):
-        drawn = model.critic_target(observations, actions)
-        assert len(drawn) == 2
-        seen.add(tuple(next(i for i, one in enumerate(every) if th.equal(one, value)) for value in drawn))
-    assert len({frozenset(pair) for pair in seen}) == 6  # every pair of four
-    before = [network[0].weight.clone() for network in model.critic.q_networks]
+    shown = record(ENV).observations
+    rows, _ = model.policy.prepare_obs(shown)
+    np.testing.assert_allclose(rows.mean(axis=0), 0, atol=1e-4)
+    np.testing.assert_allclose(rows.std(axis=0), 1, atol=1e-4)
+
+
+def test_it_plays_the_same_after_loading_and_goes_on_learning(tmp_path: Path) -> None:
+    model = make(n_steps=3).learn(15)
+    model.save(tmp_path / "model.zip")
+    rows = record(ENV).observations[:4]
+    loaded = RLPD.load(tmp_path / "model.zip", env=gym.make(ENV), demonstrations=record(ENV))
+    np.testing.assert_array_equal(model.predict(rows, deterministic=True)[0], loaded.predict(rows, deterministic=True)[0])
+    played = RLPD.load(tmp_path / "model.zip", demonstrations=None)
+    np.testing.assert_array_equal(model.predict(rows, deterministic=True)[0], played.predict(rows, deterministic=True)[0])
+    loaded.learn(15, reset_num_timesteps=False)
+    assert loaded.num_timesteps == 30
+
+
+def test_goal_tasks_have_demonstrations_too() -> None:
+    demonstrations = record("SparseReacher-v5")
+    model = RLPD("MultiInputPolicy", "GoalReacher-v5", demonstrations=demonstrations, policy_kwargs={"net_arch": [8]}, **SMALL)
     model.learn(12)
     assert model._n_updates == 4
-    assert not any(th.equal(old, now[0].weight) for old, now in zip(before, model.critic.q_networks, strict=True))
 
 
-def test_it_plays_the_same_after_loading_and_resumes_bit_for_bit(tmp_path) -> None:
-    straight = learn_straight(make, tmp_path / "straight", 24)
-    assert_same(straight, learn_in_two(make, tmp_path / "two", 24, 15))
-    straight.save(tmp_path / "model.zip")
-    loaded = RLPD.load(tmp_path / "model.zip")
-    observation = straight.env.reset()
-    assert (straight.predict(observation, deterministic=True)[0] == loaded.predict(observation, deterministic=True)[0]).all()
-    assert loaded.critic_target.n_drawn == 2
-
-
-class InRows(gym.ActionWrapper):
-    """Takes its actions in a matrix."""
-
-    def __init__(self, env: gym.Env) -> None:
-        super().__init__(env)
-        self.action_space = gym.spaces.Box(-2.0, 2.0, (1, 2), np.float32)
-
-    def action(self, action: np.ndarray) -> np.ndarray:
-        return action.ravel()[:1]
-
-
-def test_actions_of_any_shape_are_taken_whole() -> None:
-    model = RLPD("MlpPolicy", InRows(gym.make("Pendulum-v1")), policy_kwargs={"net_arch": [8]}, **SMALL).learn(12)
-    assert model.critic.q_networks[0][0].in_features == 3 + 2
-    assert model._n_updates == 4
-
-
-def test_more_target_critics_than_critics_are_refused() -> None:
-    with pytest.raises(ValueError, match="n_target_critics=5 must be between 1 and n_critics=4"):
-        make(n_target_critics=5)
+def test_one_critic_is_refused_and_the_callers_settings_stay_as_they_were() -> None:
+    given = {"net_arch": [8], "n_critics": 1}
+    with pytest.raises(ValueError, match="n_critics=1 must be at least 2"):
+        make(policy_kwargs=given)
+    assert given == {"net_arch": [8], "n_critics": 1}

@@ -14,17 +14,17 @@ import numpy as np
 import pytest
 from stable_baselines3.common.evaluation import evaluate_policy
 
-from sb3_actpc.baselines import BCQ, CQL, HBC, IRIS
+from sb3_actpc.baselines import BCQ, CQL
 from sb3_actpc.baselines.offline import installation
 from sb3_actpc.baselines.offline.installation import environment_python, install
 from sb3_actpc.baselines.offline.process import ServerFailed, ServerProcess
-from sb3_actpc.baselines.offline.served import SERVERS, ServedAlgorithm
+from sb3_actpc.baselines.offline.served import SERVER, ServedAlgorithm
 from sb3_actpc.baselines.offline.servers.frames import pack, unpack
 from sb3_actpc.cli import main
 from sb3_actpc.experiments.runs import load_preset, play_episodes
 from tests.recordings import record
 
-# Its action is the number of its gradient steps in hundredths, plus the age of the episode in tenths.
+# Its action is the number of its gradient steps in hundredths.
 FAKE_SERVER = """
 import os, sys, time, types
 sys.path.insert(0, {folder!r})
@@ -58,9 +58,7 @@ def train(values, arrays):
     return {{"loss": 1.0 / n}}, {{}}
 
 def predict(values, arrays):
-    age = np.where(arrays["episode_starts"], 0, arrays.get("state_age", np.zeros(len(arrays["observations"]), np.int64)))
-    actions = np.repeat(0.01 * n + 0.1 * age[:, None], 1, axis=1)
-    return {{}}, {{"actions": actions.astype(np.float32), "state_age": age + 1}}
+    return {{}}, {{"actions": np.full((len(arrays["observations"]), 1), 0.01 * n, dtype=np.float32)}}
 
 def save(values, arrays):
     return {{}}, {{"parameters": np.array([n], dtype=np.uint8)}}
@@ -77,7 +75,7 @@ sys.exit(serve(types.SimpleNamespace(build=build, show=show, train=train, predic
 class Fake(ServedAlgorithm):
     """Served by a script that the test has written."""
 
-    package, method, rates = "fake", "count", "rate"
+    package, method = "fake", "count"
     script = ""
 
     def _command(self) -> list[str]:
@@ -88,7 +86,7 @@ class Fake(ServedAlgorithm):
 def fake_server(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
     """Write the script."""
     script = tmp_path_factory.mktemp("fake") / "fake_server.py"
-    script.write_text(FAKE_SERVER.format(folder=str(SERVERS)), encoding="utf-8")
+    script.write_text(FAKE_SERVER.format(folder=str(SERVER.parent)), encoding="utf-8")
     monkeypatch.setattr(Fake, "script", str(script))
 
 
@@ -96,9 +94,9 @@ def make(**options: Any) -> Fake:
     return Fake("MlpPolicy", "Pendulum-v1", demonstrations=record("Pendulum-v1"), seed=0, **options)
 
 
-def scaled_action(model: Fake, state: Any = None) -> float:
+def scaled_action(model: Fake) -> float:
     """What the model does in an arbitrary state of the pendulum, whose torques reach 2."""
-    return float(model.predict(np.zeros(3, dtype=np.float32), state, deterministic=True)[0][0]) / 2
+    return float(model.predict(np.zeros(3, dtype=np.float32), deterministic=True)[0][0]) / 2
 
 
 # ---------------------------------------------------------------------- frames
@@ -199,15 +197,8 @@ def test_a_saved_agent_acts_the_same_and_learns_on(tmp_path: Path) -> None:
     assert scaled_action(Fake.load(again, env=gym.make("Pendulum-v1"))) == pytest.approx(0.08, abs=1e-6)
 
 
-def test_the_state_is_carried_for_each_environment_until_its_episode_ends() -> None:
+def test_it_is_evaluated_as_any_other_algorithm() -> None:
     model = make()
-    observations = np.zeros((3, 3), dtype=np.float32)
-    state, ages = None, []
-    for step in range(4):
-        starts = np.array([step == 0, step in (0, 2), step == 0])
-        actions, state = model.predict(observations, state, starts, deterministic=True)
-        ages.append(np.round(actions[:, 0] / 2 * 10).astype(int).tolist())
-    assert ages == [[0, 0, 0], [1, 1, 1], [2, 0, 2], [3, 1, 3]]
     played = play_episodes(model, [gym.make("Pendulum-v1", max_episode_steps=5)], 2, seed=0)
     assert played.lengths.tolist() == [5, 5]
     evaluate_policy(model, model.get_env(), n_eval_episodes=1)
@@ -284,7 +275,7 @@ def test_a_python_without_wheels_is_refused_before_anything_is_compiled(
     monkeypatch.setattr(installation.sys, "version_info", (3, 13, 0))
     monkeypatch.setattr(installation, "_make", make_nothing)
     with pytest.raises(ValueError, match=r"no wheels for Python 3\.13: install it from Python 3\.10 to 3\.12"):
-        install("robomimic", tmp_path / "none")
+        install("d3rlpy", tmp_path / "none")
     assert not (tmp_path / "none").exists()
 
 
@@ -292,23 +283,23 @@ def test_a_python_without_wheels_is_refused_before_anything_is_compiled(
 def test_an_environment_is_made_once_and_half_of_one_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(installation, "_make", make_nothing)
     monkeypatch.setattr(installation, "NUMPY_1_PYTHON", sys.version_info[:2])
-    with pytest.raises(ImportError, match=r"robomimic is not installed in .*: run sb3-actpc baselines install robomimic"):
-        environment_python("robomimic", tmp_path)
-    place = install("robomimic", tmp_path)
-    assert environment_python("robomimic", tmp_path) == place / "bin" / "python"
+    with pytest.raises(ImportError, match=r"d3rlpy is not installed in .*: run sb3-actpc baselines install d3rlpy"):
+        environment_python("d3rlpy", tmp_path)
+    place = install("d3rlpy", tmp_path)
+    assert environment_python("d3rlpy", tmp_path) == place / "bin" / "python"
     (place / "mine").touch()
-    install("robomimic", tmp_path)
+    install("d3rlpy", tmp_path)
     assert (place / "mine").exists()
     (place / installation.COMPLETE).unlink()  # as if it had been stopped
-    abandoned, at_work = tmp_path / ".robomimic.1234.tmp", tmp_path / ".robomimic.5678.tmp"
+    abandoned, at_work = tmp_path / ".d3rlpy.1234.tmp", tmp_path / ".d3rlpy.5678.tmp"
     abandoned.mkdir()
     at_work.mkdir()
     os.utime(abandoned, (0, 0))
     with pytest.raises(ImportError):
-        environment_python("robomimic", tmp_path)
-    install("robomimic", tmp_path)
+        environment_python("d3rlpy", tmp_path)
+    install("d3rlpy", tmp_path)
     assert not (place / "mine").exists()
-    assert sorted(path.name for path in tmp_path.iterdir()) == [at_work.name, "robomimic"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [at_work.name, "d3rlpy"]
 
 
 def test_a_failing_step_is_one_line_and_leaves_nothing(
@@ -322,14 +313,14 @@ def test_a_failing_step_is_one_line_and_leaves_nothing(
     assert error.count("\n") == 1 and "No module named 'no_such_module'" in error
     assert list(tmp_path.iterdir()) == []
     assert main(["baselines", "install", "tensorflow", "--dir", str(tmp_path)]) == 2
-    assert "choose one of d3rlpy, robomimic" in capsys.readouterr().err
+    assert "choose one of d3rlpy" in capsys.readouterr().err
 
 
 # ---------------------------------------------------------------------- the packages themselves
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("algorithm", [BCQ, CQL, HBC, IRIS])
+@pytest.mark.parametrize("algorithm", [BCQ, CQL])
 def test_the_packages_learn_and_are_loaded_again(algorithm: type[ServedAlgorithm], tmp_path: Path) -> None:
     """Where they are installed, with the shipped settings but for small batches: the losses fall from the first steps on."""
     try:
@@ -339,7 +330,7 @@ def test_the_packages_learn_and_are_loaded_again(algorithm: type[ServedAlgorithm
     settings = load_preset(algorithm.method, "default")["method_kwargs"]
     shown = replace(record("Pendulum-v1", 4, 40), actions=np.ones((160, 1)))  # one action, whatever is observed
     model = algorithm("MlpPolicy", "Pendulum-v1", demonstrations=shown, seed=0, batch_size=16, method_kwargs=settings)
-    falling = {BCQ: "vae_loss", CQL: "critic_loss", HBC: "actor_loss", IRIS: "actor_loss"}[algorithm]
+    falling = {BCQ: "vae_loss", CQL: "critic_loss"}[algorithm]
     losses = [model._server().ask("train")[0][falling] for _ in range(60)]
     assert np.mean(losses[-10:]) < 0.8 * np.mean(losses[:10])
     model.learn(2)
@@ -347,10 +338,9 @@ def test_the_packages_learn_and_are_loaded_again(algorithm: type[ServedAlgorithm
     observations = np.random.default_rng(0).normal(size=(4, 3)).astype(np.float32)
     loaded = algorithm.load(tmp_path / "model.zip")
     for one in (model, loaded):
-        actions, state = one.predict(observations, None, np.ones(4, dtype=bool), deterministic=True)
+        actions, _ = one.predict(observations, deterministic=True)
         assert actions.shape == (4, 1) and np.isfinite(actions).all() and (np.abs(actions) <= 2).all()
-        one.predict(observations, state, np.array([True, False, False, True]), deterministic=True)
-    if algorithm is CQL:  # the others sample: actions, or subgoals
+    if algorithm is CQL:  # BCQ samples actions
         np.testing.assert_array_equal(model.predict(observations)[0], loaded.predict(observations)[0])
     loaded.set_env(gym.make("Pendulum-v1"))
     loaded.learn(2, reset_num_timesteps=False)

@@ -127,3 +127,26 @@ def test_the_number_of_demonstrations_can_be_limited() -> None:
     model = demonstrating(n_demonstration_transitions=7)
     assert model.replay_buffer.demonstrated.buffer_size == 7
     assert np.array_equal(model.replay_buffer.demonstrated.observations[:, 0], record("Pendulum-v1").observations[:7])
+
+
+def test_a_start_from_behavior_cloning_acts_as_demonstrated() -> None:
+    shown = record("Pendulum-v1")
+
+    def error(bc_steps: int) -> float:
+        options = {**SMALL, "learning_starts": 1000, "policy_kwargs": {"net_arch": [64]}}
+        model = TD3Demo("MlpPolicy", "Pendulum-v1", demonstrations=shown, bc_steps=bc_steps, **options).learn(1)
+        return float(np.square(model.predict(shown.observations, deterministic=True)[0] - shown.actions).mean())
+
+    assert error(500) < 0.7 * error(0)
+
+
+def test_normalized_values_make_the_loss_independent_of_the_scale_of_rewards() -> None:
+    model = demonstrating(policy_gradient_weight=2.5, normalize_values=True, q_filter=False)
+    fill(model)
+    batch = model.replay_buffer.sample(16)
+    actions = model.actor(batch.observations)
+    loss = model._actor_loss(batch, actions).item()
+    for network in model.critic.q_networks:
+        for parameter in network[-1].parameters():
+            parameter.data *= 10.0
+    assert model._actor_loss(batch, actions).item() == pytest.approx(loss, rel=1e-4)

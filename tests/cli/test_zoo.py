@@ -128,7 +128,7 @@ def test_help_is_rl_zoo3s_with_our_algorithms() -> None:
     pytest.importorskip("rl_zoo3")
     command = [sys.executable, "-m", "sb3_actpc", "zoo", "train", "--help"]
     shown = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=120, check=True).stdout
-    assert "--optimize-hyperparameters" in shown and "actpc" in shown and "sac_rlpd" in shown
+    assert "--optimize-hyperparameters" in shown and "actpc" in shown and "logo" in shown
 
 
 def test_a_continued_run_does_not_begin_with_random_actions_again(ran: tuple[Path, dict[str, str]]) -> None:

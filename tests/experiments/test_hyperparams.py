@@ -22,20 +22,26 @@ from tests.recordings import record_file
 pytestmark = pytest.mark.filterwarnings("ignore:.*out of date.*", "ignore:.*infinity.*", "ignore:.*mini-batch size.*")
 FOLDER = next(folder for folder in HYPERPARAMS_FOLDERS if folder.is_dir())
 # settings of a preset that is no algorithm's
-ALGO_OF = {"actpc_paper": "actpc", "actpc_faithful": "actpc", "ppo_demonstrator": "ppo", "td3_demonstrator": "td3"}
+ALGO_OF = {
+    "actpc_paper": "actpc",
+    "actpc_faithful": "actpc",
+    "ppo_demonstrator": "ppo",
+    "rlpd_published": "rlpd",
+    "td3_demonstrator": "td3",
+}
 N_EPISODES = 26  # of 12 steps: the paper's preset asks for 300 transitions
 DEFAULT_ENV = {"her": "GoalHopper-v5", **dict.fromkeys(("ppo", "sac", "trpo"), "Hopper-v5")}
 # what would take long, and nothing else
 OFF_POLICY = {"learning_starts": 0, "buffer_size": 1000, "batch_size": 8}
 FEWER: dict[str, dict[str, Any]] = {
-    **{served: {} for served in ("bcq", "cql", "hbc", "iris")},
+    **{served: {} for served in ("bcq", "cql")},
     "actpc": {**OFF_POLICY, "prior_updates": 2, "actor_warm_start": 2, "critic_warmup": 0},
     "her": {**OFF_POLICY, "demonstration_fraction": 1.0},
     "bc": {"batch_size": 8},
     "bc_rnn": {"batch_size": 8},
     **dict.fromkeys(("sac", "td3"), OFF_POLICY),
     "ddpg": OFF_POLICY,
-    "sac_rlpd": OFF_POLICY,
+    "rlpd": OFF_POLICY,
     "logo": {"n_steps": 16, "batch_size": 8, "n_critic_updates": 1},
     "ppo": {"n_steps": 16, "batch_size": 8, "n_epochs": 1},
     "trpo": {"n_steps": 16, "batch_size": 8, "n_critic_updates": 1},
@@ -66,9 +72,11 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_every_entry_builds_its_agent_which_trains(
     preset: str, key: str, recordings: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # d3rlpy and robomimic are not installed here: a slow test of test_served.py trains with the defaults where they are
+    # d3rlpy is not installed here: a slow test of test_served.py trains with the defaults where they are
     monkeypatch.setattr("sb3_actpc.baselines.offline.served.environment_python", lambda package: sys.executable)
     algo = ALGO_OF.get(preset, preset)
+    if algo == "rlpd":
+        pytest.importorskip("sbx", reason="sbx is an extra")
     env_id = DEFAULT_ENV.get(algo, "SparseHopper-v5") if key == "default" else key
     register_tasks(env_id)
     if env_id not in gym.registry:

@@ -98,7 +98,7 @@ def test_settings_of_sb3s_algorithms_are_checked_before_they_run(algo: str, sett
         resolve(Run(env="Pendulum-v1", algo=algo, demonstrations="none", n_timesteps=100, settings=settings))
 
 
-@pytest.mark.parametrize("algo", ["actpc", "td3", "ppo", "sac_rlpd", "trpo"])
+@pytest.mark.parametrize("algo", ["actpc", "td3", "ppo", "sac", "trpo"])
 def test_an_algorithms_own_defaults_are_allowed(algo: str) -> None:
     kind = load_algorithm(algo)
     keywords = [one for init in constructors(kind) for one in inspect.signature(init).parameters.values()]

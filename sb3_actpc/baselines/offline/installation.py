@@ -30,11 +30,6 @@ class Recipe:
 _TORCH = ("torch==2.13.0", "numpy==1.26.4")
 RECIPES = {
     "d3rlpy": Recipe((_TORCH, ("d3rlpy==2.8.1",)), "import d3rlpy"),
-    # without its dependencies: egl_probe has to be compiled, torchvision must fit torch, and neither is used without images
-    "robomimic": Recipe(
-        (_TORCH, ("matplotlib==3.9.2", "six==1.17.0", "termcolor==2.5.0", "tqdm==4.67.1"), ("--no-deps", "robomimic==0.3.0")),
-        "import robomimic",
-    ),
 }
 
 

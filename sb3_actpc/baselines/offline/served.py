@@ -1,8 +1,8 @@
-"""Offline methods of other packages (BCQ and CQL by d3rlpy, HBC and IRIS by robomimic), evaluated like every other algorithm.
+"""Offline methods of d3rlpy, evaluated as every other algorithm is.
 
-Each trains and acts in a process of its own, in the virtual environment that ``sb3-actpc baselines install`` makes: the
-packages pin other versions than this one. Demonstrations go in and actions come out through a pipe
-(:mod:`sb3_actpc.baselines.offline.servers.frames`), so the episodes are played here, in our environments.
+Each trains and acts in a process of its own, in the virtual environment that ``sb3-actpc baselines install d3rlpy`` makes,
+because d3rlpy pins other versions than this package. Demonstrations go in and actions come out through a pipe
+(:mod:`sb3_actpc.baselines.offline.servers.frames`). The episodes are played here, in our environments.
 """
 
 import json
@@ -15,7 +15,7 @@ from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import Schedule
 
-from sb3_actpc.baselines.bc_policies import LARGEST_INPUT, SMALLEST_SPREAD, State, StatefulPolicy
+from sb3_actpc.baselines.bc_policies import LARGEST_INPUT, SMALLEST_SPREAD
 from sb3_actpc.baselines.offline.installation import environment_python
 from sb3_actpc.baselines.offline.process import ServerProcess
 from sb3_actpc.baselines.offline.servers.frames import Arrays, Values
@@ -23,14 +23,11 @@ from sb3_actpc.baselines.offline_algorithm import OfflineAlgorithm
 from sb3_actpc.demonstrations import Demonstrations, scaled_actions
 from sb3_actpc.utils.arguments import Between, checked
 
-SERVERS = Path(__file__).resolve().parent / "servers"
-D3RLPY_RATES = "actor_learning_rate, critic_learning_rate, ..."
-ROBOMIMIC_RATES = "actor.optim_params.policy.learning_rate.initial, ..."
+SERVER = Path(__file__).resolve().parent / "servers" / "d3rlpy_server.py"
 
 
-class ServedPolicy(StatefulPolicy):
-    """A policy whose actions another process chooses, as its package's own evaluation does; the state is that process's, None
-    where the method has none."""
+class ServedPolicy(BasePolicy):
+    """A policy whose actions another process chooses."""
 
     owner: "ServedAlgorithm"
 
@@ -38,33 +35,28 @@ class ServedPolicy(StatefulPolicy):
         super().__init__(observation_space, action_space, squash_output=True)
 
     def _predict(self, observation: Any, deterministic: bool = False) -> th.Tensor:
-        raise NotImplementedError("the actions are another process's: call predict()")
-
-    def act(self, rows: th.Tensor, begins: np.ndarray, state: State | None) -> tuple[np.ndarray, State | None]:
-        """See :class:`~sb3_actpc.baselines.bc_policies.StatefulPolicy`."""
-        return self.owner.act(rows.cpu().numpy(), begins, state)
+        return th.as_tensor(self.owner.act(observation.float().flatten(1).cpu().numpy()), device=self.device)
 
 
 class ServedAlgorithm(OfflineAlgorithm):
-    """What the four have in common.
+    """What the served methods share.
 
-    Observations are normalised by the demonstrations' mean and standard deviation, actions scaled to [-1, 1], before the other
-    process gets them. It is started when it is first needed, computes on the CPU, and holds the networks; they are fetched to
-    be saved. It ends with :meth:`close`, or when the agent is collected.
+    The other process gets observations normalized by the demonstrations' mean and standard deviation, and actions scaled to
+    [-1, 1]. It starts when it is first needed, computes on the CPU, and holds the networks, which are fetched to be saved. It
+    ends with :meth:`close`, or with the agent.
 
     :param args: policy and env of :class:`~sb3_actpc.baselines.offline_algorithm.OfflineAlgorithm`
     :param batch_size: B
-    :param method_kwargs: the method's own settings, by the names that its package gives them
+    :param method_kwargs: the method's own settings, by d3rlpy's names, and ``net_arch``, the hidden sizes of all networks
     :param timeout: seconds that one gradient step, or the start, may take
     :param options: further keywords as there; the learning rates are among ``method_kwargs``
     :raises ValueError: as there
-    :raises ImportError: when the package's environment has not been made; the message names the command that does it
+    :raises ImportError: when d3rlpy's environment has not been made; the message names the command that does it
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": ServedPolicy}
-    package: ClassVar[str]
+    package: ClassVar[str] = "d3rlpy"
     method: ClassVar[str]
-    rates: ClassVar[str]  # names of the learning rates in ``method_kwargs``, for a message
     policy: ServedPolicy
 
     @checked
@@ -79,7 +71,7 @@ class ServedAlgorithm(OfflineAlgorithm):
         if "learning_rate" in options:
             raise ValueError(
                 f"learning_rate={options['learning_rate']!r} has no effect on {type(self).__name__}: each of its networks has "
-                f"a rate of its own, set them in method_kwargs ({self.rates})"
+                "a rate of its own, set them in method_kwargs (actor_learning_rate, critic_learning_rate, ...)"
             )
         try:
             self.method_kwargs = json.loads(json.dumps(method_kwargs or {}))
@@ -87,7 +79,6 @@ class ServedAlgorithm(OfflineAlgorithm):
             raise ValueError(f"method_kwargs={method_kwargs!r} must hold plain values alone: {error}") from None
         self.timeout = timeout
         self._process: ServerProcess | None = None
-        self._state_names: list[str] = []
         super().__init__(*args, batch_size=batch_size, **options)
 
     def _setup_model(self) -> None:
@@ -96,7 +87,7 @@ class ServedAlgorithm(OfflineAlgorithm):
         n_observations = int(np.prod(self.observation_space.shape))
         self.normalization = th.stack([th.zeros(n_observations), th.ones(n_observations)])  # mean, standard deviation
         self.trained = th.empty(0, dtype=th.uint8)  # the networks as bytes, when they were last fetched
-        self._shown: Arrays = {}
+        self._demonstrated: Arrays = {}
         if self.env is not None:
             self._command()  # before anything of a run is written
         super()._setup_model()
@@ -104,24 +95,18 @@ class ServedAlgorithm(OfflineAlgorithm):
 
     def _take(self, shown: Demonstrations) -> None:
         assert isinstance(self.action_space, spaces.Box)
-        if not len(self.trained):  # a loaded agent keeps the normalisation that its networks learned with
+        if not len(self.trained):  # a loaded agent keeps the normalization that its networks learned with
             spread = np.maximum(shown.observations.std(axis=0), SMALLEST_SPREAD)
             self.normalization = th.from_numpy(np.stack([shown.observations.mean(axis=0), spread]))
-        bounds = shown.episode_bounds
-        self._shown = {
-            "observations": shown.observations,
-            "next_observations": shown.next_observations,
+        self._demonstrated = {
+            "observations": self._normalized(shown.observations),
+            "next_observations": self._normalized(shown.next_observations),
             "actions": scaled_actions(shown, self.action_space),
             "rewards": shown.rewards,
             "terminations": shown.terminations,
-            "last_rows": np.repeat(bounds[:, 1] - 1, bounds[:, 1] - bounds[:, 0]),
         }
         if self._process is not None:
-            self._process.ask("show", self._normalized_demonstrations())
-
-    def _normalized_demonstrations(self) -> Arrays:
-        rows = {name: self._normalized(self._shown[name]) for name in ("observations", "next_observations")}
-        return {**self._shown, **rows}
+            self._process.ask("show", self._demonstrated)
 
     def _normalized(self, rows: np.ndarray) -> np.ndarray:
         mean, spread = self.normalization.cpu().numpy()
@@ -134,28 +119,27 @@ class ServedAlgorithm(OfflineAlgorithm):
 
     def _command(self) -> list[str]:
         """:raises ImportError: as :meth:`check_installed`"""
-        return [str(environment_python(self.package)), "-s", "-u", str(SERVERS / f"{self.package}_server.py")]
+        return [str(environment_python(self.package)), "-s", "-u", str(SERVER)]
 
     def _server(self) -> ServerProcess:
         """The other process, started when it is not running: with the networks as they were last fetched, or new ones."""
         if self._process is None:
-            name = f"{self.package}'s {self.method.upper()}"
-            process = ServerProcess(self._command(), name, self.timeout, th.get_num_threads())
-            assert self.observation_space.shape is not None and self.action_space.shape is not None
+            process = ServerProcess(self._command(), f"{self.package}'s {self.method.upper()}", self.timeout)
+            # without a seed every agent has another; one that goes on does not draw the same batches again
+            seed = int(np.random.randint(2**31)) if self.seed is None else self.seed + self._n_updates
             process.ask(
                 "build",
                 method=self.method,
-                n_observations=int(np.prod(self.observation_space.shape)),
-                n_actions=int(np.prod(self.action_space.shape)),
+                n_observations=self.normalization.shape[1],
+                n_actions=int(np.prod(self.action_space.shape or ())),
                 batch_size=self.batch_size,
-                # as in SB3 no seed is another one each time; an agent that goes on does not draw the same batches again
-                seed=int(np.random.randint(2**31)) if self.seed is None else self.seed + self._n_updates,
+                seed=seed,
                 method_kwargs=self.method_kwargs,
             )
             if len(self.trained):
                 process.ask("load", {"parameters": self.trained.cpu().numpy()})
-            if self._shown:
-                process.ask("show", self._normalized_demonstrations())
+            if self._demonstrated:
+                process.ask("show", self._demonstrated)
             self._process = process
         return self._process
 
@@ -166,21 +150,19 @@ class ServedAlgorithm(OfflineAlgorithm):
             self._process = None
 
     def _gradient_step(self) -> Values:
-        """Of every part of the method."""
         return self._server().ask("train")[0]
 
-    def act(self, observations: np.ndarray, starts: np.ndarray, state: State | None) -> tuple[np.ndarray, State | None]:
-        """Actions (n, A), about in [-1, 1], and the next state, for observations (n, obs_dim); ``starts`` (n,) is true where
-        an episode begins. OSError when the other process has failed."""
-        arrays = {"observations": self._normalized(observations), "episode_starts": starts}
-        if state is not None:
-            arrays |= dict(zip(self._state_names, state, strict=True))
-        _, answer = self._server().ask("predict", arrays)
-        actions = answer.pop("actions", None)
-        if actions is None or actions.shape[0] != len(observations) or not np.isfinite(actions).all():
+    def act(self, observations: np.ndarray) -> np.ndarray:
+        """Actions (n, A), about in [-1, 1], for observations (n, obs_dim).
+
+        :raises OSError: when the other process has failed
+        :raises ValueError: when it has no finite action for every observation
+        """
+        _, answer = self._server().ask("predict", {"observations": self._normalized(observations)})
+        actions = answer.get("actions")
+        if actions is None or len(actions) != len(observations) or not np.isfinite(actions).all():
             raise ValueError(f"{self.package}'s {self.method.upper()} has no finite action for every observation")
-        self._state_names = list(answer)
-        return actions, tuple(answer.values()) or None
+        return np.clip(actions, -1, 1)
 
     def save(self, path: Any, exclude: Any = None, include: Any = None) -> None:
         """As SB3's; the networks are fetched first."""
@@ -189,44 +171,19 @@ class ServedAlgorithm(OfflineAlgorithm):
         super().save(path, exclude, include)
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_process", "_shown", "_state_names"]
+        return [*super()._excluded_save_params(), "_process", "_demonstrated"]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return [], ["trained", "normalization"]
 
 
 class BCQ(ServedAlgorithm):
-    """Batch-constrained Q-learning (Fujimoto et al., arXiv 1812.02900) by d3rlpy, as it is there.
+    """Batch-constrained Q-learning (Fujimoto et al., arXiv 1812.02900) by d3rlpy, as it is there."""
 
-    ``method_kwargs`` are those of d3rlpy's ``BCQConfig``, and ``net_arch``, the hidden sizes of all networks.
-    """
-
-    package, method, rates = "d3rlpy", "bcq", D3RLPY_RATES
+    method = "bcq"
 
 
 class CQL(ServedAlgorithm):
-    """Conservative Q-learning (Kumar et al., arXiv 2006.04779) by d3rlpy, as it is there.
+    """Conservative Q-learning (Kumar et al., arXiv 2006.04779) by d3rlpy, as it is there."""
 
-    ``method_kwargs`` are those of d3rlpy's ``CQLConfig``, and ``net_arch``, the hidden sizes of all networks.
-    """
-
-    package, method, rates = "d3rlpy", "cql", D3RLPY_RATES
-
-
-class HBC(ServedAlgorithm):
-    """Hierarchical behaviour cloning (Mandlekar et al., arXiv 2003.06085) by robomimic: subgoals, and an actor that follows.
-
-    Difference from robomimic's runs: the observation is one key, not one for each of robosuite's parts. ``method_kwargs``
-    are what is to change in the ``algo`` part of robomimic's config.
-    """
-
-    package, method, rates = "robomimic", "hbc", ROBOMIMIC_RATES
-
-
-class IRIS(ServedAlgorithm):
-    """Implicit reinforcement without interaction at scale (Mandlekar et al., arXiv 1911.05321) by robomimic.
-
-    :class:`HBC` with a value function (BCQ) that chooses among sampled subgoals.
-    """
-
-    package, method, rates = "robomimic", "iris", ROBOMIMIC_RATES
+    method = "cql"

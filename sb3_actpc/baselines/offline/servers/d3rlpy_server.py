@@ -53,7 +53,7 @@ class Server:
         return {name: float(loss) for name, loss in self.algorithm.update(batch).items()}, {}
 
     def predict(self, values: Values, arrays: Arrays) -> tuple[Values, Arrays]:
-        """Without a state."""
+        """Actions (n, A)."""
         return {}, {"actions": self.algorithm.predict(arrays["observations"]).astype(np.float32)}
 
     def save(self, values: Values, arrays: Arrays) -> tuple[Values, Arrays]:
