@@ -727,8 +727,8 @@ class ActPC(StoresLastTransition):
         assert isinstance(replay_buffer, SignalReplay)
         next_obs, rewards = self._before_auto_reset(new_obs, reward, dones, infos)
         replay_buffer.add(
-            self._last_original_obs,  # type: ignore[arg-type]
-            next_obs,  # type: ignore[arg-type]
+            self._last_original_obs,
+            next_obs,
             buffer_action,
             rewards,
             dones,

@@ -32,7 +32,7 @@ from sb3_actpc.utils.checks import LARGEST_SIZE, Settings, named_in_errors
 from sb3_actpc.utils.constructors import constructor_keywords
 
 # what circuit_kwargs, actor_kwargs and so on may set; sizes follow from the task
-_SIZES = {"self", "n_inputs", "n_outputs", "hidden", "output_activation", "n_memory", "n_feedback_inputs"}
+_SIZES = {"self", "n_inputs", "n_outputs", "hidden", "output_activation", "n_memory", "n_feedback_inputs", "n_members"}
 CIRCUIT_KEYWORDS = set(inspect.signature(NGCCircuit.__init__).parameters) - _SIZES
 OBSERVATION_CLIP = 10.0
 # standard deviations at least, of a feature that has changed: of its largest size, and at all; a smaller one may be rounding
@@ -374,7 +374,12 @@ class ActPCPolicy(BasePolicy):
         """The circuits of the deployment gate: deployed, average, challenger and previous; None without a gate."""
         if self.actor.deployed is None:
             return None
-        return {"deployed": self.actor.deployed, **dict(self.selection.items())}  # type: ignore[dict-item]
+        circuits: dict[str, NGCCircuit] = {"deployed": self.actor.deployed}
+        for name in self.selection:
+            circuit = self.selection[name]
+            assert isinstance(circuit, NGCCircuit)
+            circuits[name] = circuit
+        return circuits
 
     def _settings_of(self, name: str) -> dict[str, Any]:
         return dict(self.kwargs_of[name] or {})

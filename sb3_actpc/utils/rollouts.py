@@ -1,6 +1,6 @@
 """Rollouts that store their last transition, whoever stops them."""
 
-from typing import Any
+from typing import Any, cast
 
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
@@ -64,12 +64,12 @@ class StoresLastTransition(OffPolicyAlgorithm):
         deferred = _Deferred(callback, frequency)
         rollout = super().collect_rollouts(
             env,
-            deferred,
-            frequency,
+            cast(BaseCallback, deferred),
+            cast(TrainFreq, frequency),
             replay_buffer,
             action_noise,
             learning_starts,
-            log_interval,  # type: ignore[arg-type]
+            log_interval,
         )
         if deferred.error is not None:
             raise deferred.error

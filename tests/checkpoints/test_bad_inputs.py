@@ -31,7 +31,7 @@ from tests.checkpoints.runs import ACTPC, SHORT_WARM_UP
 
 HUGE = 10**30
 # these mean "go on for so long" or "from so late on": nothing is wrong with a large one
-LONG = {"prior_updates", "actor_warm_start", "gradient_steps", "n_settling_steps", "learning_starts", "critic_warmup"}
+LONG = {"prior_updates", "bc_updates", "gradient_steps", "n_settling_steps", "learning_starts", "critic_warmup"}
 
 
 def generated(n_examples: int) -> Callable[[Any], Any]:

@@ -111,7 +111,7 @@ def test_a_stopped_run_goes_on_as_if_it_never_was(
 def test_a_run_stopped_in_its_pretraining_goes_on_as_if_it_never_was(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    write_preset(n_timesteps=90, alpha_in=0.5, prior_updates=6, actor_warm_start=4, critic_warmup=9)
+    write_preset(n_timesteps=90, alpha_in=0.5, prior_updates=6, guidance_kwargs={"bc_updates": 4, "critic_warmup": 9})
     rows = np.random.default_rng(0).uniform(-1.0, 1.0, (30, 10))
     nothing = np.zeros(30)
     Demonstrations(rows, rows[:, :2], rows, nothing, nothing, np.array([0]), "SparseReacher-v5").save("demonstrations.npz")

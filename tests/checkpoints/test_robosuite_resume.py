@@ -86,7 +86,7 @@ def test_the_command_trains_with_the_shipped_settings(n_envs: int, tmp_path: Pat
         eval_episodes=1,
         eval_freq=60,
         env_kwargs={"horizon": 25},
-        settings={"actor_warm_start": 5, "prior_updates": 5, "critic_warmup": 10},
+        settings={"guidance_kwargs": {"bc_updates": 5, "critic_warmup": 10}, "prior_updates": 5},
         output=str(tmp_path / "run"),
         progress=False,
     )

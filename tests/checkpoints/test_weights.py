@@ -74,7 +74,7 @@ def test_weights_are_loaded_without_running_code(tmp_path: Path, request: pytest
 
 
 def test_weights_that_have_not_imitated_yet_are_taught(tmp_path: Path) -> None:
-    untaught = make_actpc(CountingEnv, demonstrations=demonstrations(), actor_warm_start=3)
+    untaught = make_actpc(CountingEnv, demonstrations=demonstrations())
     path = untaught.save_weights(tmp_path / "untaught")
     loaded = ActPC.from_weights(path, make_vec_env(CountingEnv), demonstrations=demonstrations())
     assert not loaded.pretrained
