@@ -283,6 +283,8 @@ def _plot(script: str, arguments: Sequence[str]) -> int:
     parser = argparse.ArgumentParser(prog="sb3-actpc zoo plot", add_help=False, allow_abbrev=False)
     parser.add_argument("--output", type=Path)
     ours, rest = parser.parse_known_args(list(arguments))
+    if script.endswith(":plot_train"):
+        rest = _plotted_runs(rest)
     if ours.output is None:
         return _run(script, rest)
     import matplotlib
@@ -299,6 +301,34 @@ def _plot(script: str, arguments: Sequence[str]) -> int:
     pyplot.savefig(ours.output)
     print(f"written to {ours.output}")
     return 0
+
+
+def _plotted_runs(arguments: Sequence[str]) -> list[str]:
+    """The arguments, with the folder and name by which rl_zoo3 finds the runs of an id such as ``ns/Line-v0``.
+
+    :raises FileNotFoundError: when there is no run, where rl_zoo3 would draw an empty figure
+    """
+    parser = argparse.ArgumentParser(prog="sb3-actpc zoo plot", add_help=False, allow_abbrev=False)
+    parser.add_argument("-a", "--algo")
+    parser.add_argument("-e", "--env", nargs="+", default=[])
+    parser.add_argument("-f", "--exp-folder", default=LOG_FOLDER)
+    ours, rest = parser.parse_known_args(list(arguments))
+    if not ours.algo or not ours.env:
+        return list(arguments)
+    folders, names = set(), []
+    for env_id in ours.env:
+        *parents, name = env_id.rpartition(":")[2].split("/")
+        folder = Path(ours.exp_folder, ours.algo, *parents)
+        if not list(folder.glob(f"{name}_*/*monitor.csv")):
+            raise FileNotFoundError(
+                f"no runs of {ours.algo} on {env_id} in {ours.exp_folder}: make one with sb3-actpc zoo train"
+            )
+        folders.add(folder)
+        names.append(name)
+    if len(folders) > 1:
+        raise ValueError(f"--env {' '.join(ours.env)}: plot ids of one namespace at a time")
+    folder = folders.pop()
+    return ["-a", folder.name, "-f", str(folder.parent), "-e", *names, *rest]
 
 
 def _run(script: str, arguments: Sequence[str]) -> int:

@@ -118,7 +118,7 @@ def run_measures(env_id: str, curve: pd.DataFrame, chosen_steps: Sequence[int] =
         values["normalized"] = float(reference.normalize(values[reference.measure]))
     else:
         values["normalized"] = values["success"]
-    last = curve.iloc[-1] if len(curve) else {}
+    last: Any = curve.iloc[-1] if len(curve) else {}
     values["updates"] = last.get("updates", math.nan)
     values["seconds"] = last.get("seconds", math.nan) - last.get("evaluation_seconds", math.nan)
     return values
