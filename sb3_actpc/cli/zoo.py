@@ -304,7 +304,7 @@ def _plot(script: str, arguments: Sequence[str]) -> int:
 
 
 def _plotted_runs(arguments: Sequence[str]) -> list[str]:
-    """The arguments, with the folder and name by which rl_zoo3 finds the runs of an id such as ``ns/Line-v0``.
+    """The arguments, with ids such as ``ns/Line-v0`` written as rl_zoo3 names their run folders.
 
     :raises FileNotFoundError: when there is no run, where rl_zoo3 would draw an empty figure
     """
@@ -315,20 +315,14 @@ def _plotted_runs(arguments: Sequence[str]) -> list[str]:
     ours, rest = parser.parse_known_args(list(arguments))
     if not ours.algo or not ours.env:
         return list(arguments)
-    folders, names = set(), []
-    for env_id in ours.env:
-        *parents, name = env_id.rpartition(":")[2].split("/")
-        folder = Path(ours.exp_folder, ours.algo, *parents)
-        if not list(folder.glob(f"{name}_*/*monitor.csv")):
+    naming = import_extra("huggingface_sb3", "zoo")
+    names = [str(naming.EnvironmentName(env_id)) for env_id in ours.env]
+    for env_id, name in zip(ours.env, names, strict=True):
+        if not list(Path(ours.exp_folder, ours.algo).glob(f"*{name}*/*monitor.csv")):
             raise FileNotFoundError(
                 f"no runs of {ours.algo} on {env_id} in {ours.exp_folder}: make one with sb3-actpc zoo train"
             )
-        folders.add(folder)
-        names.append(name)
-    if len(folders) > 1:
-        raise ValueError(f"--env {' '.join(ours.env)}: plot ids of one namespace at a time")
-    folder = folders.pop()
-    return ["-a", folder.name, "-f", str(folder.parent), "-e", *names, *rest]
+    return ["-a", ours.algo, "-f", ours.exp_folder, "-e", *names, *rest]
 
 
 def _run(script: str, arguments: Sequence[str]) -> int:
