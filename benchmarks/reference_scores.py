@@ -13,8 +13,8 @@ import numpy as np
 import pandas as pd
 
 from sb3_actpc.demonstrations import Demonstrations
-from sb3_actpc.envs import SPARSE_MUJOCO_IDS
-from sb3_actpc.experiments.report.references import SCORES_FILE, paper_results
+from sb3_actpc.envs import ROBOSUITE_IDS, SPARSE_MUJOCO_IDS
+from sb3_actpc.experiments.report.references import SCORES_FILE
 from sb3_actpc.experiments.runs import play_episodes
 from sb3_actpc.experiments.runs.presets import find_demonstrations
 from sb3_actpc.experiments.runs.run import make_eval_envs
@@ -56,13 +56,13 @@ def measure_scores(env_id: str, n_episodes: int = N_EPISODES, seed: int = 0) -> 
     finally:
         for env in envs:
             env.close()
-    is_success = bool(paper_results(env_id)["is_success"].any())
+    is_success = env_id in ROBOSUITE_IDS
     path = find_demonstrations(env_id, "shipped")
     scores: dict[str, Any] = {"random": played.successes if is_success else played.dense_returns}
     if path is not None:
         shown = Demonstrations.load(path)
         scores["demonstrators"] = (shown.episode_returns > 0).astype(float) if is_success else shown.dense_returns
-    row: dict[str, Any] = {"env": env_id, "measure": "success_rate" if is_success else "dense_return"}
+    row: dict[str, Any] = {"env": env_id, "measure": "success" if is_success else "dense_return"}
     for who, values in scores.items():
         spread = round(float(values.std(ddof=1)), 3)
         row |= {f"{who}_score": round(float(values.mean()), 3), f"{who}_score_std": spread, f"{who}_episodes": len(values)}

@@ -16,5 +16,5 @@ model.learn(total_timesteps=15_000, progress_bar=True)
 # the reward is sparse; the dense one is what info["dense_reward"] reports
 episodes = play_episodes(model, [gym.make(ENV_ID) for _ in range(5)], n_episodes=5, seed=1000)
 print(f"dense return {episodes.dense_returns.mean():.0f} ± {episodes.dense_returns.std():.0f}")
-print(f"sparse return {episodes.sparse_returns.mean():.0f}, success rate {episodes.successes.mean():.2f}")
+print(f"sparse return {episodes.returns.mean():.0f}, success rate {episodes.successes.mean():.2f}")
 model.save("actpc_sparse_halfcheetah")

@@ -16,7 +16,7 @@ from sb3_actpc.demonstrations import Demonstrations
 from sb3_actpc.experiments.comparison import plan_runs, read_comparison
 
 ROOT = Path(__file__).parents[1]
-PAGES = ["README.md", "RESULTS.md", *(f"docs/{path.name}" for path in sorted((ROOT / "docs").glob("*.md")))]
+PAGES = ["README.md", *(f"docs/{path.name}" for path in sorted((ROOT / "docs").glob("*.md")))]
 
 
 def blocks(page: str, language: str) -> list[str]:
@@ -44,8 +44,7 @@ def test_every_command_is_one_that_the_command_line_takes(page: str) -> None:
 
 
 def test_the_commands_are_found() -> None:
-    assert len(commands("README.md")) >= 10 and len(commands("RESULTS.md")) >= 15
-    assert any(command.startswith("sb3-actpc compare --output runs/first") for command in commands("RESULTS.md"))
+    assert len(commands("README.md")) >= 1
 
 
 @pytest.mark.parametrize("page", PAGES)

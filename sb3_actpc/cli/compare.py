@@ -21,7 +21,6 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
     add("file", nargs="?", metavar="FILE", help=file)
     add("--envs", nargs="+", metavar="ID", help="tasks, such as SparseHopper-v5")
     add("--algos", nargs="+", metavar="NAME", help="algorithms or named variants, also FILE's own, such as actpc td3")
-    add("--ablate", action="store_true", default=None, help="ActPC with every part, and without each in turn")
     add("--seeds", type=int, metavar="N", help="how many seeds (default: 3)")
     add("--first-seed", type=int, metavar="N", help="the first of them (default: 0)")
     add("--output", metavar="DIR", help="folder of the comparison (default: runs/comparison)")

@@ -284,6 +284,8 @@ def _plot(script: str, arguments: Sequence[str]) -> int:
     parser = argparse.ArgumentParser(prog="sb3-actpc zoo plot", add_help=False, allow_abbrev=False)
     parser.add_argument("--output", type=Path)
     ours, rest = parser.parse_known_args(list(arguments))
+    if script.endswith(":plot_train"):
+        rest = _plotted_runs(rest)
     if ours.output is None:
         return _run(script, rest)
     import matplotlib
@@ -300,6 +302,28 @@ def _plot(script: str, arguments: Sequence[str]) -> int:
     pyplot.savefig(ours.output)
     print(f"written to {ours.output}")
     return 0
+
+
+def _plotted_runs(arguments: Sequence[str]) -> list[str]:
+    """The arguments, with ids such as ``ns/Line-v0`` written as rl_zoo3 names their run folders.
+
+    :raises FileNotFoundError: when there is no run, where rl_zoo3 would draw an empty figure
+    """
+    parser = argparse.ArgumentParser(prog="sb3-actpc zoo plot", add_help=False, allow_abbrev=False)
+    parser.add_argument("-a", "--algo")
+    parser.add_argument("-e", "--env", nargs="+", default=[])
+    parser.add_argument("-f", "--exp-folder", default=LOG_FOLDER)
+    ours, rest = parser.parse_known_args(list(arguments))
+    if not ours.algo or not ours.env:
+        return list(arguments)
+    naming = import_extra("huggingface_sb3", "zoo")
+    names = [str(naming.EnvironmentName(env_id)) for env_id in ours.env]
+    for env_id, name in zip(ours.env, names, strict=True):
+        if not list(Path(ours.exp_folder, ours.algo).glob(f"*{name}*/*monitor.csv")):
+            raise FileNotFoundError(
+                f"no runs of {ours.algo} on {env_id} in {ours.exp_folder}: make one with sb3-actpc zoo train"
+            )
+    return ["-a", ours.algo, "-f", ours.exp_folder, "-e", *names, *rest]
 
 
 def _run(script: str, arguments: Sequence[str]) -> int:

@@ -23,7 +23,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from sb3_actpc.actpc import ActPC
 from sb3_actpc.actpc.buffers import CombinedReplayBuffer
 from sb3_actpc.envs.robosuite_layouts import ROBOSUITE_TASKS
-from sb3_actpc.experiments.report.page import markdown
+from sb3_actpc.experiments.report.tables import markdown
 from sb3_actpc.experiments.runs.presets import preset, with_changes
 from sb3_actpc.ngc import NGCCircuit
 from sb3_actpc.ngc.products import has_bfloat16

@@ -13,8 +13,8 @@ from sb3_actpc.cli import main
 EPISODE_LENGTH = 10
 ENV_ID = "SparseLine-v0"
 TRAIN = ["train", "--env", ENV_ID, "--algo", "td3", "--preset", "small.yml"]
-RESULTS = {"dense_return": 20.0, "dense_return_std": 0.0, "sparse_return": 10.0, "sparse_return_std": 0.0}
-RESULTS |= {"success_rate": 1.0, "episode_length": 10.0}
+RESULTS = {"dense_return": 20.0, "dense_return_std": 0.0, "return": 10.0, "return_std": 0.0}
+RESULTS |= {"success": 1.0, "episode_length": 10.0}
 
 
 class LineEnv(gym.Env[np.ndarray, np.ndarray]):

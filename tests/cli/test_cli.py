@@ -117,7 +117,7 @@ def test_every_training_episode_is_recorded() -> None:
     assert [int(row["episode"]) for row in rows] == [1, 2, 3, 4, 5, 6]
     assert [int(row["timesteps"]) for row in rows] == [10, 20, 30, 40, 50, 60]
     for row in rows:
-        values = [float(row[name]) for name in ("length", "sparse_return", "dense_return", "success")]
+        values = [float(row[name]) for name in ("length", "return", "dense_return", "success")]
         assert values == [10.0, 10.0, 30.0, 1.0]
     assert len({row["actions_crc32"] for row in rows}) == 6
 
@@ -151,8 +151,8 @@ def test_the_result_is_the_last_evaluation() -> None:
         )
     )
     assert result["dense_return"] == 60.0
-    assert result["sparse_return"] == 10.0
-    assert result["success_rate"] == 1.0
+    assert result["return"] == 10.0
+    assert result["success"] == 1.0
     assert result["timesteps"] == 30
     assert result["demonstrators_return"] is None
     assert result["steps_per_second"] > 0
@@ -332,8 +332,8 @@ def test_failed_episodes_are_counted_by_their_farthest_stage() -> None:
 def test_success_is_unknown_where_the_environment_does_not_report_it() -> None:
     model = TD3("MlpPolicy", "Pendulum-v1", policy_kwargs={"net_arch": [4]}, buffer_size=10)
     episodes = play_episodes(model, [gym.make("Pendulum-v1")], n_episodes=1, seed=0)
-    assert episodes.summary()["success_rate"] is None
-    assert episodes.dense_returns == episodes.sparse_returns
+    assert episodes.summary()["success"] is None
+    assert episodes.dense_returns == episodes.returns
 
 
 def test_evaluate_replays_a_run_and_writes_a_video(capsys: pytest.CaptureFixture[str]) -> None:

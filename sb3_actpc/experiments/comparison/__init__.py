@@ -2,11 +2,11 @@
 
 from sb3_actpc.experiments.comparison.engines import Engine, LocalEngine
 from sb3_actpc.experiments.comparison.plan import Comparison, plan_runs, read_comparison
-from sb3_actpc.experiments.comparison.variants import ablation_variants, find_variant, variant_names
+from sb3_actpc.experiments.comparison.variants import find_variant, variant_names
 
 ENGINES = ("local", "ray")
 
-__all__ = ["Comparison", "ablation_variants", "find_variant", "make_engine", "plan_runs", "read_comparison", "variant_names"]
+__all__ = ["Comparison", "find_variant", "make_engine", "plan_runs", "read_comparison", "variant_names"]
 
 
 def make_engine(name: str, n_workers: int | None, threads: int, address: str | None = None) -> Engine:

@@ -9,7 +9,6 @@ from sb3_actpc.demonstrations import fit_demonstrations
 from sb3_actpc.experiments.comparison.variants import (
     OF_TASKS,
     OF_VARIANTS,
-    ablation_variants,
     find_variant,
     parse_variant,
     part_of_run,
@@ -18,10 +17,9 @@ from sb3_actpc.experiments.runs import Run, resolve
 from sb3_actpc.experiments.runs.environments import check_env_id, make_train_env
 from sb3_actpc.experiments.runs.presets import CAN_BE_NONE, read_yaml
 from sb3_actpc.experiments.runs.schema import MAX_SEED, Count, Schema, Seed, merged
-from sb3_actpc.utils.checks import check_kind
 from sb3_actpc.utils.files import folder_name
 
-OWN_KEYS = ("envs", "algos", "ablate", "seeds", "first_seed", "output")
+OWN_KEYS = ("envs", "algos", "seeds", "first_seed", "output")
 
 
 class Comparison(Schema):
@@ -37,24 +35,21 @@ class Comparison(Schema):
 
 def read_comparison(given: Mapping[str, Any]) -> Comparison:
     """:param given: ``envs`` (ids, or mappings with ``env`` and other keys of a :class:`~sb3_actpc.experiments.runs.Run`),
-        ``algos`` (names, or mappings: see :func:`~sb3_actpc.experiments.comparison.variants.parse_variant`), ``ablate`` (true
-        adds the ablations), ``seeds``, ``first_seed``, ``output``, and keys of a run that hold for all. Values of None count
+        ``algos`` (names, or mappings: see :func:`~sb3_actpc.experiments.comparison.variants.parse_variant`), ``seeds``,
+        ``first_seed``, ``output``, and keys of a run that hold for all. Values of None count
         as not given, but for ``noise_type`` and ``normalize``, where they leave the preset's out
     :return: the comparison
     :raises ValueError: when a key is unknown or a value is wrong
     """
     given = {str(key): value for key, value in given.items() if value is not None or key in CAN_BE_NONE}
     own = {key: given.pop(key) for key in OWN_KEYS if key in given}
-    check_kind("ablate", own.get("ablate", False), bool)
     shared = part_of_run({"continuable": False, **given}, OWN_KEYS, (*OF_TASKS, *OF_VARIANTS))
     variants = [parse_variant(entry) for entry in _list(own, "algos")]
-    if own.get("ablate"):
-        variants += [variant for variant in ablation_variants() if variant not in variants]
     tasks = [_parse_task(entry) for entry in _list(own, "envs")]
     if not tasks:
         raise ValueError("no task to compare on: give at least one, such as --envs SparseHopper-v5")
     if not variants:
-        raise ValueError("no algorithm to compare: give at least one, such as --algos actpc, or --ablate")
+        raise ValueError("no algorithm to compare: give at least one, such as --algos actpc")
     _check_names([task.env for task in tasks])
     _check_names([str(variant.name) for variant in variants])
     rest = {key: own[key] for key in ("seeds", "first_seed", "output") if key in own}

@@ -62,14 +62,6 @@ def part_of_run(entry: Mapping[str, Any], also: Sequence[str] = (), elsewhere: S
     return Run(**{key: value for key, value in entry.items() if value is not None or key in CAN_BE_NONE})
 
 
-def ablation_variants() -> list[Run]:
-    """ActPC with every part at work, then without each in turn."""
-    content = _read()
-    [(name, entry)] = content["ablation_base"].items()
-    base = Run(name=name, **entry)
-    return [base, *(Run(**merged(base, Run(name=part, **own))) for part, own in content["ablations"].items())]
-
-
 def variant_names() -> list[str]:
     """Every name that ``--algos`` takes."""
     return sorted(_variants())
@@ -82,7 +74,6 @@ def _read() -> dict[str, Any]:
 
 def _variants() -> dict[str, Run]:
     """By name; a shipped variant comes before an algorithm of its name."""
-    ablations = {str(one.name): one for one in ablation_variants()}
     algorithms = {name: Run(name=name, algo=name) for name in ALGORITHMS}
     shipped = {name: Run(name=name, **entry) for name, entry in _read()["variants"].items() if entry["algo"] in ALGORITHMS}
-    return {**ablations, **algorithms, **shipped}
+    return {**algorithms, **shipped}

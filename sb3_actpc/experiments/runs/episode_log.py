@@ -61,7 +61,7 @@ class CsvCallback(BaseCallback):
 class EpisodeLog(CsvCallback):
     """Appends a row to ``episodes.csv`` when a training episode ends, exploration noise and all.
 
-    ``sparse_return`` is the sum of the environment's rewards, ``dense_return`` that of ``info["dense_reward"]`` (the
+    ``return`` is the sum of the environment's rewards, ``dense_return`` that of ``info["dense_reward"]`` (the
     same again where the environment does not report it), ``success`` is ``info["is_success"]`` at the end (empty where it is
     not reported), ``timesteps`` and ``seconds`` are those of the training until then. ``actions_crc32`` is the CRC-32 of all
     actions of the training so far: two runs that have the same number have taken the same actions. ``clock`` gives the seconds
@@ -73,7 +73,7 @@ class EpisodeLog(CsvCallback):
         "timesteps",
         "seconds",
         "length",
-        "sparse_return",
+        "return",
         "dense_return",
         "success",
         "actions_crc32",
@@ -110,7 +110,7 @@ class EpisodeLog(CsvCallback):
             "timesteps": self.num_timesteps,
             "seconds": round(self.clock(), 2),
             "length": info["episode"]["l"],  # of SB3's Monitor, as the next: before any normalisation
-            "sparse_return": round(info["episode"]["r"], 6),
+            "return": round(info["episode"]["r"], 6),
             "dense_return": round(dense_return, 6),
             "success": None if success is None else float(success),
             "actions_crc32": self.actions,

@@ -84,20 +84,20 @@ class EpisodeStatistics:
     """What happened in n episodes; each array is (n,) float64."""
 
     dense_returns: np.ndarray  # sums of ``info["dense_reward"]`` (of the reward, where the environment does not report it)
-    sparse_returns: np.ndarray  # sums of the reward
+    returns: np.ndarray  # sums of the reward
     successes: np.ndarray  # 1 where ``info["is_success"]`` was true at the end, NaN where the environment does not report it
     lengths: np.ndarray  # steps
     stages: list[str]  # ``info["stage"]`` at the end of each, "" where the environment does not report it
 
     def summary(self) -> dict[str, float | None]:
-        """Means and standard deviations over the episodes; ``success_rate`` is None where it is not reported."""
-        success_rate = float(self.successes.mean())
+        """Means and standard deviations over the episodes; ``success`` is None where it is not reported."""
+        success = float(self.successes.mean())
         return {
             "dense_return": float(self.dense_returns.mean()),
             "dense_return_std": float(self.dense_returns.std()),
-            "sparse_return": float(self.sparse_returns.mean()),
-            "sparse_return_std": float(self.sparse_returns.std()),
-            "success_rate": None if np.isnan(success_rate) else success_rate,
+            "return": float(self.returns.mean()),
+            "return_std": float(self.returns.std()),
+            "success": None if np.isnan(success) else success,
             "episode_length": float(self.lengths.mean()),
         }
 
@@ -109,7 +109,7 @@ class EpisodeStatistics:
 
 def says_one_return(summary: Mapping[str, Any]) -> bool:
     """Whether the dense returns of a summary are the sparse ones: of an environment that reports none, or is paid densely."""
-    return all(summary[f"dense_{name}"] == summary[f"sparse_{name}"] for name in ("return", "return_std"))
+    return all(summary[f"dense_{name}"] == summary[name] for name in ("return", "return_std"))
 
 
 def play_episodes(model: Predictor, envs: Sequence[gym.Env[Any, Any]], n_episodes: int, seed: int) -> EpisodeStatistics:
@@ -120,8 +120,8 @@ def play_episodes(model: Predictor, envs: Sequence[gym.Env[Any, Any]], n_episode
     episode or environment."""
     if n_episodes < 1 or not envs:
         raise ValueError(f"expected at least one episode and one environment, found {n_episodes} and {len(envs)}")
-    dense_returns, sparse_returns, successes, lengths = np.zeros((4, n_episodes))
-    played = EpisodeStatistics(dense_returns, sparse_returns, successes, lengths, [""] * n_episodes)
+    dense_returns, returns, successes, lengths = np.zeros((4, n_episodes))
+    played = EpisodeStatistics(dense_returns, returns, successes, lengths, [""] * n_episodes)
     for first in range(0, n_episodes, len(envs)):
         _play_side_by_side(model, envs[: n_episodes - first], seed, first, played)
     return played
@@ -140,7 +140,7 @@ def _play_side_by_side(
         for i in np.flatnonzero(playing):
             observations[i], reward, terminated, truncated, info = envs[i].step(actions[i])
             played.dense_returns[first + i] += dense_reward(info, reward)
-            played.sparse_returns[first + i] += float(reward)
+            played.returns[first + i] += float(reward)
             played.successes[first + i] = info.get("is_success", np.nan)
             played.lengths[first + i] += 1
             played.stages[first + i] = info.get("stage", "")
@@ -176,9 +176,9 @@ class EvaluationCallback(CsvCallback):
         "evaluation_seconds",
         "dense_return",
         "dense_return_std",
-        "sparse_return",
-        "sparse_return_std",
-        "success_rate",
+        "return",
+        "return_std",
+        "success",
         "episode_length",
     )
     kept = ("evaluation_seconds", "best_return", "last_summary", "last_timesteps")
@@ -268,14 +268,14 @@ class EvaluationCallback(CsvCallback):
             "evaluation_seconds": round(self.evaluation_seconds, 2),
         }
         self.append(row)
-        for name in ("dense_return", "sparse_return", "success_rate"):
+        for name in ("dense_return", "return", "success"):
             if self.last_summary[name] is not None:
                 self.logger.record(f"eval/{name}", self.last_summary[name])
         self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
         self.logger.dump(self.num_timesteps)  # a row of the agent's own figures beside each evaluation
-        summary, success = self.last_summary, self.last_summary["success_rate"]
+        summary, success = self.last_summary, self.last_summary["success"]
         shown = [f"return {summary['dense_return']:9.1f} ± {summary['dense_return_std']:<7.1f}"]
         if not says_one_return(summary):
-            shown = [f"dense {shown[0]}", f"sparse return {summary['sparse_return']:7.1f} "]
+            shown = [f"dense {shown[0]}", f"sparse return {summary['return']:7.1f} "]
         shown += [] if success is None else [f"success {success:.2f}"]
         self.report(f"step {self.num_timesteps:>8}  {' '.join(shown)}")

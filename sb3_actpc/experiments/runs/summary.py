@@ -12,16 +12,16 @@ from sb3_actpc.utils.files import atomic_write
 
 def result_table(result: Mapping[str, Any]) -> str:
     """The result of ``train_run`` or ``evaluate_run`` as aligned text, a line per quantity."""
-    dense, sparse = (f"{result[f'{kind}_return']:.1f} ± {result[f'{kind}_return_std']:.1f}" for kind in ("dense", "sparse"))
-    rows = [("return", sparse)]
+    dense, own = (f"{result[f'{kind}return']:.1f} ± {result[f'{kind}return_std']:.1f}" for kind in ("dense_", ""))
+    rows = [("return", own)]
     if not says_one_return(result):
         rows = [
             ("dense return", dense),
             ("demonstrators' dense return", _number(result.get("demonstrators_return"), ".1f")),
-            ("sparse return", sparse),
+            ("return", own),
         ]
     rows += [
-        ("success rate", _number(result["success_rate"], ".2f")),
+        ("success rate", _number(result["success"], ".2f")),
         ("episode length", f"{result['episode_length']:.1f}"),
     ]
     if result.get("failed_after"):
@@ -41,15 +41,15 @@ def plot_learning_curve(progress: Path, output: Path, title: str, demonstrators_
     rows = pd.read_csv(progress)
     steps, dense, spread = (rows[name].to_numpy() for name in ("timesteps", "dense_return", "dense_return_std"))
     figure = Figure(figsize=(6.4, 6.4), layout="constrained")
-    dense_axes, sparse_axes = figure.subplots(2, 1, sharex=True)
+    dense_axes, return_axes = figure.subplots(2, 1, sharex=True)
     dense_axes.plot(steps, dense, marker="o", label="policy")
     dense_axes.fill_between(steps, dense - spread, dense + spread, alpha=0.2)
     if demonstrators_return is not None:
         dense_axes.axhline(demonstrators_return, color="black", linestyle="--", label="demonstrators")
     dense_axes.legend()
     dense_axes.set(title=title, ylabel="dense return (mean ± std)")
-    sparse_axes.plot(steps, rows["sparse_return"], marker="o", color="tab:orange")
-    sparse_axes.set(xlabel="environment steps", ylabel="sparse return (mean)")
+    return_axes.plot(steps, rows["return"], marker="o", color="tab:orange")
+    return_axes.set(xlabel="environment steps", ylabel="return (mean)")
     with atomic_write(output) as image:
         figure.savefig(image, format="png", dpi=120)
 

@@ -10,7 +10,7 @@ import yaml
 
 from sb3_actpc.cli import main
 from sb3_actpc.demonstrations import Demonstrations, shipped_demonstrations
-from sb3_actpc.experiments.comparison import ablation_variants, find_variant, plan_runs, read_comparison, variant_names
+from sb3_actpc.experiments.comparison import find_variant, plan_runs, read_comparison, variant_names
 from sb3_actpc.experiments.runs import ALGORITHMS, Run
 from sb3_actpc.experiments.runs.algorithms import check_keywords, load_algorithm
 from sb3_actpc.experiments.runs.presets import with_changes
@@ -32,12 +32,12 @@ def plan(**given: Any) -> list[Run]:
 
 
 def test_every_algorithm_meets_every_task_with_every_seed_and_the_first_seeds_come_first() -> None:
-    runs = plan(envs=["SparseReacher-v5", "SparseHopper-v5"], algos=["actpc", "refresh_alone"], seeds=2)
+    runs = plan(envs=["SparseReacher-v5", "SparseHopper-v5"], algos=["actpc", "no_signals"], seeds=2)
     assert [(run.task, run.name, run.seed) for run in runs[:4]] == [
         ("SparseReacher-v5", "actpc", 0),
-        ("SparseReacher-v5", "refresh_alone", 0),
+        ("SparseReacher-v5", "no_signals", 0),
         ("SparseHopper-v5", "actpc", 0),
-        ("SparseHopper-v5", "refresh_alone", 0),
+        ("SparseHopper-v5", "no_signals", 0),
     ]
     assert len(runs) == 8 and len({run.id for run in runs}) == 8 and len({run.folder for run in runs}) == 8
 
@@ -67,7 +67,7 @@ def test_an_id_follows_the_content_of_a_run_and_nothing_else() -> None:
         plan(steps=500, eval_episodes=3),
         plan(steps=500, target_return=100.0),
         plan(steps=500, keep="best"),
-        plan(steps=500, algos=["refresh_alone"]),
+        plan(steps=500, algos=["no_signals"]),
         plan(steps=500, envs=[{"env": "SparseReacher-v5", "env_kwargs": {"threshold": 0.1}}]),
         plan(steps=500, seeds=2)[1:],
     ]
@@ -89,12 +89,12 @@ def test_a_run_survives_its_trip_to_a_worker() -> None:
 
 
 def test_a_file_says_the_same_as_the_options(capsys: pytest.CaptureFixture[str]) -> None:
-    given = {"envs": ["SparseReacher-v5"], "algos": ["actpc", "no_refresh"], "seeds": 2, "first_seed": 3, "steps": 300}
+    given = {"envs": ["SparseReacher-v5"], "algos": ["actpc", "no_signals"], "seeds": 2, "first_seed": 3, "steps": 300}
     given["output"] = "there"
     Path("c.yml").write_text(yaml.safe_dump(given), encoding="utf-8")
     assert main(["compare", "c.yml", "--dry-run"]) == 0
     of_file = capsys.readouterr().out
-    options = ["--envs", "SparseReacher-v5", "--algos", "actpc", "no_refresh", "--seeds", "2", "--steps", "300"]
+    options = ["--envs", "SparseReacher-v5", "--algos", "actpc", "no_signals", "--seeds", "2", "--steps", "300"]
     options += ["--first-seed", "3"]
     assert main(["compare", *options, "--output", "there", "--dry-run"]) == 0
     assert capsys.readouterr().out == of_file
@@ -105,11 +105,11 @@ def test_a_file_says_the_same_as_the_options(capsys: pytest.CaptureFixture[str])
 def test_variants_and_tasks_of_a_file_have_settings_of_their_own() -> None:
     runs = plan(
         envs=["SparseReacher-v5", {"env": "SparseHopper-v5", "steps": 40}],
-        algos=["actpc", {"base": "refresh_alone", "name": "slow", "settings": {"gamma": 0.5}, "steps": 20}],
+        algos=["actpc", {"base": "no_signals", "name": "slow", "settings": {"gamma": 0.5}, "steps": 20}],
         steps=60,
     )
     assert [run.n_timesteps for run in runs] == [60, 20, 40, 20]
-    assert {key: runs[1].settings[key] for key in ("actor_pressure", "gamma")} == {"actor_pressure": 0.0, "gamma": 0.5}
+    assert {key: runs[1].settings[key] for key in ("alpha_ep", "gamma")} == {"alpha_ep": 0.0, "gamma": 0.5}
 
 
 def test_what_an_entry_leaves_empty_is_not_said() -> None:
@@ -130,14 +130,14 @@ def test_what_a_preset_says_can_be_left_out() -> None:
 
 
 def test_an_algorithm_can_be_chosen_by_the_name_that_a_file_gives_it(capsys: pytest.CaptureFixture[str]) -> None:
-    own = {"base": "refresh_alone", "name": "slow", "steps": 20}
-    unnamed = {"base": "no_habit", "steps": 30}  # goes by the name of its base
+    own = {"base": "no_signals", "name": "slow", "steps": 20}
+    unnamed = {"base": "iterative", "steps": 30}  # goes by the name of its base
     content = {"envs": ["SparseReacher-v5"], "algos": [own, unnamed], "n_timesteps": 70}
     Path("c.yml").write_text(yaml.safe_dump(content), encoding="utf-8")
-    names = ["slow", "actpc", "no_habit"]
+    names = ["slow", "actpc", "iterative"]
     assert main(["compare", "c.yml", "--algos", *names, "--seeds", "1", "--steps", "60", "--dry-run"]) == 0
     rows = [line.split()[2:5:2] for line in capsys.readouterr().out.splitlines()[1:4]]
-    assert rows == [["slow", "20"], ["actpc", "60"], ["no_habit", "30"]]
+    assert rows == [["slow", "20"], ["actpc", "60"], ["iterative", "30"]]
     assert main(["compare", "c.yml", "--algos", "slwo", "--dry-run"]) == 2
     assert "(did you mean 'slow'?)" in capsys.readouterr().err
     Path("c.yml").write_text("{envs: [SparseReacher-v5], algos: }", encoding="utf-8")
@@ -149,17 +149,6 @@ def test_every_named_variant_has_settings_that_its_algorithm_takes() -> None:
         variant = find_variant(name)
         assert variant.algo in ALGORITHMS
         check_keywords(load_algorithm(variant.algo), with_changes({}, variant.settings))
-
-
-def test_every_ablation_differs_from_the_base() -> None:
-    base, *ablations = ablation_variants()
-    assert len(ablations) >= 11
-    assert all(variant.settings != base.settings for variant in ablations)
-    assert len({variant.name for variant in ablations}) == len(ablations)
-
-
-def test_ablate_adds_the_base_and_the_ablations() -> None:
-    assert [run.name for run in plan(algos=[], ablate=True)] == [variant.name for variant in ablation_variants()]
 
 
 def test_a_variant_on_another_version_of_the_task_stands_beside_the_others() -> None:
@@ -235,7 +224,6 @@ def test_mistakes_give_one_line_and_begin_nothing(
         ({"env": "Ant-v5"}, "env='Ant-v5' cannot be given here, where it counts for nothing: give it in an entry of envs"),
         ({"envs": [{"env": "SparseReacher-v5", "algo": "td3"}]}, "algo='td3' cannot be given here"),
         ({"algos": [{"base": "actpc", "env": "Ant-v5"}]}, "env='Ant-v5' cannot be given here"),
-        ({"ablate": "false"}, "ablate='false' must be True or False"),
         ({"algos": [{"base": ["actpc"]}]}, "base=['actpc'] must be a text: the name of the variant"),
         ({"steps": 10, "n_timesteps": 20}, "steps=10 is given under another name too (steps and n_timesteps are one key)"),
     ],
@@ -250,7 +238,7 @@ def test_given_demonstrations_are_read_once_for_all_algorithms_of_a_task(monkeyp
     read: list[str] = []
     original = Demonstrations.load
     monkeypatch.setattr(Demonstrations, "load", lambda path: read.append(str(path)) or original(path))
-    plan(envs=["SparseHopper-v5"], algos=["actpc", "refresh_alone", "td3", "her"], demonstrations=HOPPER, seeds=2)
+    plan(envs=["SparseHopper-v5"], algos=["actpc", "no_signals", "td3", "her"], demonstrations=HOPPER, seeds=2)
     assert read == [HOPPER, HOPPER]
     plan(envs=["SparseHopper-v5"])
     assert len(read) == 2

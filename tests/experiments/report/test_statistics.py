@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 from sb3_actpc.experiments.report import statistics
-from sb3_actpc.experiments.report.references import ReferenceScore, paper_results, reference_score
+from sb3_actpc.experiments.report.references import ReferenceScore, reference_score
 
 SCORES = [np.array([0.1, 0.9, 0.5, 0.3]), np.array([0.7, 0.2, 1.1, 0.6])]
 OTHERS = [np.array([0.2, 0.4, 0.5, 0.1]), np.array([0.9, 0.3, 0.8, 0.7])]
@@ -95,14 +95,3 @@ def test_random_actions_score_nothing_and_the_demonstrators_one() -> None:
         assert committed is not None and committed.demonstrators > committed.random
         assert reference_score(f"sb3_actpc.envs:Sparse{task}-v5") == committed
     assert reference_score("Unknown-v0") is None
-
-
-def test_the_papers_tables_are_whole() -> None:
-    """Five MuJoCo tasks with four algorithms each, two robosuite tasks with eight."""
-    assert len(paper_results()) == 5 * 4 + 2 * 8
-    cheetah = paper_results("SparseHalfCheetah-v5").set_index("algorithm").loc["ActPC"]
-    assert [*cheetah[["score", "score_std", "r_stability", "r_stability_std"]]] == [5757.505, 130.922, 0.088, 0.036]
-    assert cheetah["table"] == "tab:mujoco_metrics" and not cheetah["is_success"]
-    lift = paper_results("SparseLift-v0").set_index("algorithm").loc["BC"]
-    assert lift["score"] == 100.0 and np.isnan(lift["r_stability"]) and lift["is_success"]
-    assert paper_results("Unknown-v0").empty
