@@ -227,8 +227,12 @@ class ActPC(StoresLastTransition):
 
         is_one_step = relabels(replay_buffer_class) or optimize_memory_usage or bootstrap == "literal"
         n_steps = default(n_steps, 1 if is_one_step else 3, 1)
-        self.guidance = _make_guidance(guidance, guidance_kwargs, has_demonstrations)
-        if self.guidance.has_gate:
+        if guidance is None:
+            guidance = "default" if has_demonstrations else "none"
+        self.guidance = guidance
+        self.guidance_kwargs = guidance_kwargs
+        self.actor_guidance = _make_guidance(guidance, guidance_kwargs)
+        if self.actor_guidance.has_gate:
             policy_kwargs = {"is_gated": True, **(policy_kwargs or {})}
         super().__init__(
             policy,
@@ -276,7 +280,6 @@ class ActPC(StoresLastTransition):
         self.observation_normalization: str = default(observation_normalization, "demonstrations", "none")
         self.signal_kwargs = signal_kwargs
         self.signals = InternalSignals()
-        self.guidance_kwargs = guidance_kwargs
         self._is_stepping = False  # between a choice of actions and the storage of what followed
         self._awaits_parameters = not _init_setup_model  # ``load`` sets them
         self._steps_at_pause: list[int] | None = None  # that the environments had made when ``learn`` ended
@@ -292,6 +295,7 @@ class ActPC(StoresLastTransition):
         assert isinstance(self.action_space, spaces.Box)
         check_actions(self.action_space, self.action_noise)
         self._check_together()
+        self.actor_guidance = _make_guidance(self.guidance, self.guidance_kwargs)
         # here, as a loaded agent may be given others; of the same signals it keeps what their normalizers have seen
         with named_in_errors(f"signal_kwargs={self.signal_kwargs!r}"):
             signals = InternalSignals(**(self.signal_kwargs or {}))
@@ -462,7 +466,7 @@ class ActPC(StoresLastTransition):
         """As in SB3. Returns of another environment are forgotten; ValueError where demonstrations do not fit."""
         super().set_env(env, force_reset)
         self._steps_at_pause = None
-        self.guidance.load_state_dict({"selection": None})
+        self.actor_guidance.load_state_dict({"selection": None})
         if self.replay_buffer is not None:
             self.replay_buffer.forget_own_episodes()
         if isinstance(self.replay_buffer, HerReplayBuffer):  # SB3 goes on paying by the old one
@@ -508,7 +512,7 @@ class ActPC(StoresLastTransition):
             self._rollout_starts = np.ones(self.n_envs, dtype=bool)
             if self.replay_buffer is not None:
                 self.replay_buffer.cut_running_episodes()
-            self.guidance.on_reset()
+            self.actor_guidance.on_reset()
         result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
         self._check_observations(self._last_obs)
         self._follow_demonstrations()
@@ -517,7 +521,7 @@ class ActPC(StoresLastTransition):
         self.replay_buffer.set_returns(self.n_steps, self.gamma)
         memory = self.replay_buffer.self_imitation
         if memory is not None:
-            memory.takes_all = self.guidance.stores == "positive" and self.expert is not None
+            memory.takes_all = self.actor_guidance.stores == "positive" and self.expert is not None
         self._warn_of_idle_settings()
         if self.verbose:
             print(self.describe(), flush=True)
@@ -589,7 +593,7 @@ class ActPC(StoresLastTransition):
         return (
             f"reward: {ext:g} x task (alpha_ext) + {ep:g} x epistemic (alpha_ep) + {inst:g} x instrumental signal (alpha_in)\n"
             f"demonstrations: {'none' if self.expert is None else self.expert.demonstrations!r}\n"
-            f"{self.guidance.describe()}\n"
+            f"{self.actor_guidance.describe()}\n"
             f"off: {', '.join(name for name, value in parts.items() if not value) or 'nothing'}"
         )
 
@@ -616,7 +620,7 @@ class ActPC(StoresLastTransition):
             before_update()
             self._update_prior(self.policy.batch_size_of("prior", self.batch_size))
             self.policy.n_prior_updates.add_(1)
-        self.guidance.on_training_start(self._context(), self.pretrained)
+        self.actor_guidance.on_training_start(self._context(), self.pretrained)
         if self.expert is not None:
             self.policy.has_imitated.fill_(1.0)
 
@@ -640,7 +644,7 @@ class ActPC(StoresLastTransition):
 
     def sample_imitated(self, n: int) -> ImitationBatch:
         """Features (n, n_features), actions (n, A) and working memory of ``n`` imitated steps."""
-        samples = sample_union(self._imitated_parts(), n, self.memory_history, self.guidance.weighting)
+        samples = sample_union(self._imitated_parts(), n, self.memory_history, self.actor_guidance.weighting)
         arrays = self.inputs.normalized(samples.observations), samples.actions.astype(np.float32, copy=False)
         observed, actions = to_device(arrays, self.inputs.device)
         memory = self.inputs.memory(*self.inputs.past(samples.history, samples.history_mask))
@@ -691,7 +695,7 @@ class ActPC(StoresLastTransition):
         warming_up = self.num_timesteps < learning_starts
         context = self._context()
         if self.memory_history or not warming_up:  # the working memory follows random actions too
-            circuits = self.guidance.acting_circuits(context)
+            circuits = self.actor_guidance.acting_circuits(context)
             scaled, self._rollout_state = self.actor.roll_out(
                 self._last_obs, self._rollout_state, self._rollout_starts, circuits
             )
@@ -700,13 +704,13 @@ class ActPC(StoresLastTransition):
         check_finite("actor", "actions", scaled, self.num_timesteps)
         if action_noise is not None or self.exploration_noise:
             noise = self._exploration_noise(context, scaled.shape) if action_noise is None else action_noise()
-            explores = np.array([self.guidance.explores(env) for env in range(n_envs)])
+            explores = np.array([self.actor_guidance.explores(env) for env in range(n_envs)])
             scaled = np.clip(scaled + explores.reshape(-1, *[1] * (scaled.ndim - 1)) * noise, -1.0, 1.0).astype(np.float32)
         return self.policy.unscale_action(scaled), scaled
 
     def _exploration_noise(self, context: GuidanceContext, shape: tuple[int, ...]) -> np.ndarray:
         """Gaussian noise in ``shape``, (n_envs, *action_shape)."""
-        scale = self.guidance.exploration_scale(context, float(self.exploration_noise)).reshape(shape[1:])
+        scale = self.actor_guidance.exploration_scale(context, float(self.exploration_noise)).reshape(shape[1:])
         return np.random.normal(size=shape).astype(np.float32) * scale
 
     def _store_transition(
@@ -743,7 +747,7 @@ class ActPC(StoresLastTransition):
         if self.expert is not None and np.any(dones):
             self.expert.check_scale(replay_buffer.rewards[: replay_buffer.size()])
         if self.num_timesteps >= self.learning_starts + self.n_envs:  # the step that was just made was no random one
-            self.guidance.on_step(self._context(), rewards, dones, self._n_updates)
+            self.actor_guidance.on_step(self._context(), rewards, dones, self._n_updates)
         if ENDLESS in replay_buffer.running_lengths:
             self._warn_of_endless_episodes()
 
@@ -771,7 +775,7 @@ class ActPC(StoresLastTransition):
         return next_obs, rewards
 
     def _warn_of_endless_episodes(self) -> None:
-        waits = ["the deployed policy changes with whole episodes"] if self.guidance.has_gate else []
+        waits = ["the deployed policy changes with whole episodes"] if self.actor_guidance.has_gate else []
         waits += ["hindsight learns from episodes that have ended"] if isinstance(self.replay_buffer, HerReplayBuffer) else []
         if waits:
             warnings.warn(
@@ -903,14 +907,14 @@ class ActPC(StoresLastTransition):
         actor = self.actor.circuit
         changes = None
         # Imitation: settle on demonstrated actions and those of good episodes, ΔW_i = e φ(z)ᵀ
-        imitation_weight = self.refresh_weight * self.guidance.imitation_weight(self._n_updates)
+        imitation_weight = self.refresh_weight * self.actor_guidance.imitation_weight(self._n_updates)
         if imitation_weight and self._imitated_parts():
             state = actor.settle(*self.sample_imitated(len(batch.features)))
             changes = actor.hebbian_update(state).scale_(imitation_weight)
             self.diagnostics.settled("actor", state)
             self.diagnostics.change_norms("imitation", changes)
         # Critic term: actor and critic settle as one under the critic's output error +1/A, ΔW_c = e φ(z)ᵀ
-        critic_weight = self.critic_weight * self.guidance.critic_weight(self._n_updates)
+        critic_weight = self.critic_weight * self.actor_guidance.critic_weight(self._n_updates)
         if critic_weight:
             coupled = settle_coupled(actor, self.critic, batch.features, batch.memory, self.policy.nudge)
             improvement = actor.hebbian_update(coupled.actor)
@@ -923,7 +927,7 @@ class ActPC(StoresLastTransition):
             changes = improvement if changes is None else changes.add_(improvement)
         if changes is not None:
             actor.apply_changes(changes)
-            self.guidance.after_update(self._context())
+            self.actor_guidance.after_update(self._context())
 
     def update_critic(self, batch: Batch) -> None:
         """All members settle on the same targets."""
@@ -981,7 +985,7 @@ class ActPC(StoresLastTransition):
         if memory is not None:
             self.logger.record("train/self_imitation_size", len(memory))
             self.logger.record("train/self_imitation_best_return", memory.best_return)
-        for key, value in self.guidance.logs().items():
+        for key, value in self.actor_guidance.logs().items():
             self.logger.record(f"train/{key}", value)
 
     def learn(
@@ -1035,7 +1039,7 @@ class ActPC(StoresLastTransition):
             if self.demonstrations is not None and not self.pretrained:
                 self._setup_demonstrations()
             return
-        self.guidance.load_state_dict({"selection": None})
+        self.actor_guidance.load_state_dict({"selection": None})
 
     def checkpoint_state(self) -> dict[str, Any]:
         """What a checkpoint (:mod:`sb3_actpc.checkpoints`) keeps beside SB3's state: plain values and arrays."""
@@ -1046,7 +1050,7 @@ class ActPC(StoresLastTransition):
             "signals": self.signals.checkpoint_state(),
             "expert_signals": None if expert is None else [expert.epistemic, expert.instrumental, expert.has_signals],
             "diagnostics": dict(self.diagnostics.values),
-            "guidance": self.guidance.state_dict(),
+            "guidance": self.actor_guidance.state_dict(),
         }
 
     def restore_checkpoint_state(self, state: dict[str, Any]) -> None:
@@ -1066,7 +1070,7 @@ class ActPC(StoresLastTransition):
         self._rollout_state, self._rollout_starts = state["rollout_state"], state["rollout_starts"]
         self.signals.restore_checkpoint_state(state["signals"])
         self.diagnostics.values = dict(state["diagnostics"])
-        self.guidance.load_state_dict(state["guidance"])
+        self.actor_guidance.load_state_dict(state["guidance"])
 
     @classmethod
     def load_checkpoint(cls: type[SelfActPC], path: str | PathLike[str], env: GymEnv | str, **keywords: Any) -> Restored:
@@ -1125,7 +1129,7 @@ class ActPC(StoresLastTransition):
 
     def _excluded_save_params(self) -> list[str]:
         aliases = ["actor", "critic", "generator", "prior", "actor_target", "critic_target"]
-        derived = ["expert", "_followed", "diagnostics"]
+        derived = ["expert", "_followed", "diagnostics", "actor_guidance"]
         derived += ["_awaits_parameters", "_steps_at_pause", "_is_stepping"]
         return [*super()._excluded_save_params(), *aliases, *derived]
 
@@ -1153,12 +1157,10 @@ def _named_errors(path: str | PathLike[str]) -> Iterator[None]:
         raise ValueError(_OF_ANOTHER_VERSION.format(path=path, why="its policy has other parts")) from error
 
 
-def _make_guidance(given: ActorGuidance | str | None, settings: Settings | None, has_demonstrations: bool) -> ActorGuidance:
+def _make_guidance(given: ActorGuidance | str, settings: Settings | None) -> ActorGuidance:
     """:raises ValueError: for another name, or keywords that the guidance has not"""
     if isinstance(given, ActorGuidance):
         return given
-    if given is None:
-        given = "default" if has_demonstrations else "none"
     if given not in ("default", "none"):
         raise ValueError(f"guidance={given!r} must be None, 'default', 'none' or an ActorGuidance")
     if given == "none":

@@ -287,7 +287,7 @@ class ActPCPolicy(BasePolicy):
         action_space: spaces.Box,
         lr_schedule: Schedule,
         net_arch: Annotated[list[int] | dict[str, list[int]] | None, check_net_arch] = None,
-        n_critics: Annotated[int, Between(1, MAX_CRITICS)] = 5,
+        n_critics: Annotated[int, Between(1, MAX_CRITICS)] = 2,
         circuit_kwargs: Settings | None = None,
         actor_kwargs: Annotated[Settings | None, check_circuit] = None,
         critic_kwargs: Annotated[Settings | None, check_circuit] = None,
