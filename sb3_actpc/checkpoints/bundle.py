@@ -15,10 +15,10 @@ from typing import Any
 
 import numpy as np
 
-from sb3_actpc.utils.files import file_hash
+from sb3_actpc.utils.files import file_hash, named_errors
 
 FORMAT = "sb3_actpc checkpoint"
-VERSION = 7
+VERSION = 8
 MANIFEST = "manifest.json"
 _NAME = re.compile(r"(\d{6,})_step_(\d+)")
 _TEMPORARY = ".writing-"
@@ -47,7 +47,8 @@ class BundleWriter:
 
     def add_bytes(self, name: str, data: bytes) -> None:
         """Write a file."""
-        (self.folder / name).write_bytes(data)
+        with named_errors(self.folder / name):
+            (self.folder / name).write_bytes(data)
         self._sealed[name] = self.workers.submit(_seal, self.folder / name)
 
     def add_json(self, name: str, value: Any) -> None:
@@ -56,12 +57,13 @@ class BundleWriter:
 
     def add_array(self, name: str, array: np.ndarray) -> None:
         """Write numbers, as ``.npy``, straight from their memory where that is C-contiguous; ValueError for Python objects."""
-        np.save(self.folder / name, array, allow_pickle=False)
+        with named_errors(self.folder / name):
+            np.save(self.folder / name, array, allow_pickle=False)
         self._sealed[name] = self.workers.submit(_seal, self.folder / name)
 
 
 def _seal(path: Path) -> str:
-    with open(path, "rb+") as file:
+    with named_errors(path), open(path, "rb+") as file:
         os.fsync(file.fileno())
     return file_hash(path)
 

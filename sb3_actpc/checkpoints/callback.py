@@ -24,6 +24,7 @@ from sb3_actpc.checkpoints.state import (
     describe_model,
     restore_learning,
     restore_model,
+    restore_tensorboard,
 )
 from sb3_actpc.utils.checks import check_finite
 
@@ -159,7 +160,7 @@ class CheckpointCallback(BaseCallback):
             self.save()
         except OSError as error:
             self._last_saved = self.model.num_timesteps  # not again at every step
-            self.report(f"no checkpoint at step {self.num_timesteps}: {error.strerror or error}; those written before stay")
+            self.report(f"no checkpoint at step {self.num_timesteps}: {error}; those written before stay")
 
 
 def why_no_checkpoints(algorithm: type[BaseAlgorithm]) -> str:
@@ -213,6 +214,7 @@ def continue_learning(restored: Restored, callback: MaybeCallback = None, **opti
         raise ValueError(f"callback={callback!r} has no CheckpointCallback: add one, it puts back what learn() itself sets up")
     savers[0].restored = restored
     model = restored.model
+    restore_tensorboard(restored)
     left = model._total_timesteps - model.num_timesteps
     try:
         return model.learn(max(0, left), callback=callback, reset_num_timesteps=False, **options)

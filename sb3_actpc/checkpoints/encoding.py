@@ -1,5 +1,7 @@
 """Plain values to JSON and arrays, and back: what a checkpoint can hold without running code when it is read."""
 
+import dis
+import functools
 import math
 import random
 import sys
@@ -26,14 +28,18 @@ _ARRAY_KINDS = "biuf"
 _BIT_GENERATORS = ("MT19937", "PCG64", "Philox")
 # what a value of these types holds is made anew by the constructors, or never changes
 _LEFT_ALONE: tuple[type, ...] = (type, np.dtype, th.device, EnvSpec, ResultsWriter)
-_LEFT_ALONE += (types.FunctionType, types.MethodType, types.BuiltinFunctionType, types.ModuleType)
+_LEFT_ALONE += (types.BuiltinFunctionType, types.ModuleType)
+_METHODS = (types.MethodType, types.BuiltinFunctionType)
+_RANDOM = (np.random.Generator, np.random.RandomState, random.Random)
+# functions and classes of these, and of Python itself, remember nothing
+_LIBRARIES = ("gymnasium", "stable_baselines3", "sb3_contrib", "sb3_actpc", "numpy", "torch", "mujoco", "robosuite")
 _LEFT_ALONE_NAMES = ("mujoco._structs.MjModel", "gymnasium.envs.mujoco.mujoco_rendering.MujocoRenderer")
 # objects whose attributes are written one by one into an object of the same class that is there already
 _TRANSPARENT: tuple[type, ...] = (RunningMeanStd, gymnasium_utils.RunningMeanStd, StackedObservations, ActionNoise)
 _DICTS: dict[type, str] = {dict: "dict", OrderedDict: "ordered", Counter: "counter", defaultdict: "default"}
 # of an environment: two attributes may hold one of these, and what changes in one then changes in the other
 _SHARED: tuple[type, ...] = (np.ndarray, th.Tensor, list, dict, deque, set, *_TRANSPARENT)
-_SHARED += (np.random.Generator, np.random.RandomState, random.Random)
+_SHARED += _RANDOM
 _FACTORIES: dict[str, Any] = {f"builtins.{kind.__name__}": kind for kind in (int, float, bool, str, list, dict, set, tuple)}
 
 
@@ -204,6 +210,19 @@ class Encoder:
             owner, name = value.__self__, getattr(value, "__name__", "")
             if self._place(owner) is not None and getattr(type(owner), name, None) is value.__func__:
                 return {"method": name, "of": self._place(owner)}
+        if isinstance(value, _METHODS) and not isinstance(value.__self__, (type, types.ModuleType, types.NoneType)):
+            return {"bound": value.__name__, "of": self.encode(value.__self__, f"{where}.__self__")}
+        if isinstance(value, functools.partial):
+            parts = {"args": value.args, "keywords": value.keywords}
+            return {"partial": self.encode(value.func, f"{where}.func"), "with": self.encode(parts, where)}
+        if isinstance(value, types.FunctionType) and id(value) not in self._open:  # which may hold itself
+            self._open.add(id(value))
+            try:
+                return {"function": _name_of(value), "state": self.encode(function_state(value), where)}
+            finally:
+                self._open.discard(id(value))
+        if isinstance(value, (types.FunctionType, types.MethodType)):
+            return {"left": type(value).__qualname__, "name": _name_of(value)}
         if isinstance(value, _LEFT_ALONE) or f"{type(value).__module__}.{type(value).__qualname__}" in _LEFT_ALONE_NAMES:
             return {"left": type(value).__qualname__, "name": _name_of(value)}
         raise OpaqueValue(where, value)
@@ -291,6 +310,29 @@ class Decoder:
             return existing
         stored = node.get("name") or f"a {node['left']}"
         return self._lose(f"it was {stored}, and is {name or f'a {kind}'} when made anew", existing)
+
+    def _decode_function(self, node: dict[str, Any], existing: Any) -> Any:
+        if not isinstance(existing, types.FunctionType) or _name_of(existing) != node["function"]:
+            return self._decode_left({"left": "function", "name": node["function"]}, existing)
+        state = self.decode(node["state"], function_state(existing))
+        for name, cell in zip(existing.__code__.co_freevars, existing.__closure__ or (), strict=True):
+            if name in state["variables"]:
+                cell.cell_contents = state["variables"][name]
+        if not is_library(existing.__module__):
+            existing.__defaults__, existing.__kwdefaults__ = state["defaults"], state["keywords"]
+        vars(existing).update(state["attributes"])
+        existing.__globals__.update(state["globals"])
+        return existing
+
+    def _decode_bound(self, node: dict[str, Any], existing: Any) -> Any:
+        if not isinstance(existing, _METHODS) or existing.__name__ != node["bound"]:
+            return self._decode_left({"left": "method", "name": node["bound"]}, existing)
+        return getattr(self.decode(node["of"], existing.__self__), node["bound"])
+
+    def _decode_partial(self, node: dict[str, Any], existing: Any) -> Any:
+        held = existing if isinstance(existing, functools.partial) else functools.partial(lambda: None)
+        parts = self.decode(node["with"], {"args": held.args, "keywords": held.keywords})
+        return functools.partial(self.decode(node["partial"], held.func), *parts["args"], **parts["keywords"])
 
     def _decode_layer(self, node: dict[str, Any], existing: Any) -> Any:
         layer = dict(enumerate(self._layers or ())).get(node["layer"])
@@ -389,6 +431,62 @@ def _subspaces(space: spaces.Space) -> list[spaces.Space]:
     parts: Any = space.spaces if isinstance(space, (spaces.Dict, spaces.Tuple, spaces.OneOf)) else ()
     parts = parts.values() if isinstance(space, spaces.Dict) else parts
     return [space, *(inner for part in parts for inner in _subspaces(part))]
+
+
+def is_library(module: str | None) -> bool:
+    """Whether functions and classes of a module remember nothing: those of Python and of a few known packages."""
+    root = (module or "").partition(".")[0]
+    return root in _LIBRARIES or root in sys.stdlib_module_names
+
+
+def function_state(function: types.FunctionType) -> dict[str, Any]:
+    """What a function can remember between two calls: variables of the functions around it, defaults, its attributes, and of
+    its module's variables the random generators and those that it assigns."""
+    state: dict[str, Any] = {"variables": {}, "defaults": None, "keywords": None, "attributes": {}, "globals": {}}
+    if is_library(function.__module__):
+        return state
+    variables = state["variables"]
+    for name, cell in zip(function.__code__.co_freevars, function.__closure__ or (), strict=True):
+        with suppress(ValueError):  # not assigned yet
+            variables[name] = cell.cell_contents
+    variables.pop("__class__", None)
+    state |= {"defaults": function.__defaults__, "keywords": function.__kwdefaults__}
+    return state | {"attributes": dict(vars(function)), "globals": _module_variables(function)}
+
+
+def class_state(kind: type) -> dict[str, Any]:
+    """What a class holds itself: its plain attributes, and those functions that remember something."""
+    held = {}
+    for name, value in vars(kind).items():
+        function = getattr(value, "__func__", value)
+        if name.startswith(("__", "_abc_")):
+            continue
+        if isinstance(function, types.FunctionType):
+            state = function_state(function)
+            changing = [
+                one for one in (*(state["defaults"] or ()), *(state["keywords"] or {}).values()) if not _is_constant(one)
+            ]
+            if changing or state["variables"] or state["attributes"] or state["globals"]:
+                held[name] = function
+        elif not hasattr(type(value), "__get__"):
+            held[name] = value
+    return held
+
+
+def _is_constant(value: Any) -> bool:
+    return value is None or isinstance(value, (bool, int, float, str, bytes, type))
+
+
+def _module_variables(function: types.FunctionType) -> dict[str, Any]:
+    found, codes = {}, [function.__code__]
+    for code in codes:
+        codes += [one for one in code.co_consts if isinstance(one, types.CodeType)]  # functions within it
+        assigned = {one.argval for one in dis.get_instructions(code) if one.opname == "STORE_GLOBAL"}
+        for name in (*code.co_names, *assigned):
+            value = function.__globals__.get(name)
+            if name in function.__globals__ and (name in assigned or isinstance(value, _RANDOM)):
+                found[name] = value
+    return found
 
 
 def _name_of(thing: Any) -> str | None:

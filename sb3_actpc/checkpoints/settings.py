@@ -28,7 +28,7 @@ _NOISES: dict[str, tuple[Any, dict[str, str]]] = {
     "ornstein-uhlenbeck": (OrnsteinUhlenbeckActionNoise, {"mean": "_mu", "sigma": "_sigma", "theta": "_theta", "dt": "_dt"}),
 }
 # chosen anew by whoever loads, or stored otherwise
-_NOT_STORED = {"env", "policy", "device", "verbose", "tensorboard_log"}
+_NOT_STORED = {"env", "policy", "device", "verbose"}
 _ATTRIBUTE_OF = {"stats_window_size": "_stats_window_size"}
 
 

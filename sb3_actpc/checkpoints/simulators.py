@@ -8,7 +8,7 @@ import numpy as np
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper
 
-from sb3_actpc.checkpoints.encoding import Decoder, Encoder, LostValue, OpaqueValue
+from sb3_actpc.checkpoints.encoding import Decoder, Encoder, LostValue, OpaqueValue, class_state, is_library
 from sb3_actpc.utils.tasks import task_id
 
 # what the constructors make anew, and the time of the clock
@@ -17,6 +17,7 @@ _SKIPPED |= {"t_start"}
 _SKIPPED_WITHIN = {"metadata", "spec"}  # of an environment that is no wrapper, which may keep its state under the other names
 # under this name, what an environment's own checkpoint_state() returned
 _OWN_STATE = "checkpoint_state()"
+_OF_CLASS = "class "  # before the names of a class's own attributes
 _GENERATORS = {"generator", "random_state", "random", "space"}  # kinds of stored values
 # of MuJoCo's data: made anew in each step, and where there are none their memory belongs to something else
 _IN_ARENA = ("efc_", "contact", "iefc_", "iM", "iLD", "iacc", "ifrc_")
@@ -134,6 +135,9 @@ def _layer_values(layer: gym.Env[Any, Any]) -> dict[str, Any]:
     made_anew = _SKIPPED if isinstance(layer, gym.Wrapper) else _SKIPPED_WITHIN
     skipped = {*made_anew, *getattr(layer, "checkpoint_skipped", ())}
     own = {_OWN_STATE: layer.checkpoint_state()} if hasattr(layer, "checkpoint_state") else {}
+    for kind in type(layer).__mro__:
+        if not is_library(kind.__module__):
+            own |= {f"{_OF_CLASS}{kind.__qualname__}.{name}": value for name, value in class_state(kind).items()}
     return own | {name: value for name, value in vars(layer).items() if name not in skipped}
 
 
@@ -180,11 +184,24 @@ def _restore_layers(env: gym.Env[Any, Any], entry: dict[str, Any], decoder: Deco
 def _restore_attribute(layer: Any, name: str, node: Any, decoder: Decoder) -> None:
     if name == _OWN_STATE:
         layer.restore_checkpoint_state(decoder.decode(node))
+    elif name.startswith(_OF_CLASS):
+        _restore_class_attribute(layer, name.removeprefix(_OF_CLASS), node, decoder)
     elif isinstance(node, dict) and "physics" in node:
         data = getattr(layer, name)
         restore_physics(data.model, data, decoder.decode(node["physics"]))
     else:
         set_attribute(layer, name, node, decoder)
+
+
+def _restore_class_attribute(layer: Any, name: str, node: Any, decoder: Decoder) -> None:
+    class_name, _, attribute = name.rpartition(".")
+    kind = next((one for one in type(layer).__mro__ if one.__qualname__ == class_name), None)
+    if kind is None or is_library(kind.__module__):
+        raise LostValue(f"it was of the class {class_name}, which is not there now")
+    existing = class_state(kind).get(attribute)
+    value = decoder.decode(node, existing)
+    if value is not existing:
+        setattr(kind, attribute, value)
 
 
 def set_attribute(owner: Any, name: str, node: Any, decoder: Decoder) -> None:

@@ -17,7 +17,7 @@ import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.logger import CSVOutputFormat
+from stable_baselines3.common.logger import CSVOutputFormat, TensorBoardOutputFormat, configure
 from stable_baselines3.common.noise import VectorizedActionNoise
 from stable_baselines3.common.save_util import recursive_getattr
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
@@ -293,7 +293,16 @@ def _capture_logger(model: BaseAlgorithm, encoder: Encoder) -> dict[str, Any] | 
     for output in _csv_formats(model):
         output.file.flush()
         texts.append(Path(output.file.name).read_text(encoding="utf-8"))
-    return {"values": values, "csv": texts}
+    boards = [one.writer.log_dir for one in model.logger.output_formats if isinstance(one, TensorBoardOutputFormat)]
+    return {"values": values, "csv": texts, "tensorboard": Path(boards[0]).name if boards else None}
+
+
+def restore_tensorboard(restored: Restored) -> None:
+    """Let the curves go on in the folder of the stopped run, unless the agent has its own logger or no folder for them."""
+    model, name = restored.model, (restored.state["logger"] or {}).get("tensorboard")
+    if name is not None and model.tensorboard_log is not None and not model._custom_logger:
+        shown = ["stdout"] if model.verbose else []
+        model.set_logger(configure(str(Path(model.tensorboard_log) / name), [*shown, "tensorboard"]))
 
 
 def _restore_logger(model: BaseAlgorithm, record: dict[str, Any], decoder: Decoder) -> None:

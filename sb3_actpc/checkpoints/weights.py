@@ -61,6 +61,7 @@ def save_weights(model: OffPolicyAlgorithm, path: str | os.PathLike[str]) -> Pat
     """
     check_weights(model)
     settings = constructor_settings(model)
+    settings["keywords"].pop("tensorboard_log", None)  # a folder of this machine
     if callable(getattr(model, "learning_rate", None)) and "learning_rate" in settings["unnamed"]:
         settings["unnamed"].remove("learning_rate")
         settings["keywords"]["learning_rate"] = float(model.lr_schedule(1.0))

@@ -1,5 +1,6 @@
 """Writing files so that a reader never meets half of one, telling whether one is what was written, and holding folders."""
 
+import errno
 import hashlib
 import os
 import re
@@ -32,6 +33,17 @@ def folder_name(env_id: str) -> str:
 
 
 @contextmanager
+def named_errors(path: str | os.PathLike[str]) -> Iterator[None]:
+    """An OSError without a file name, such as that of a full disk, is raised again with this one."""
+    try:
+        yield
+    except OSError as error:
+        if error.filename is not None:
+            raise
+        raise OSError(error.errno or errno.EIO, error.strerror or str(error), str(path)) from error
+
+
+@contextmanager
 def atomic_write(path: str | os.PathLike[str], mode: Literal["wb", "w"] = "wb") -> Iterator[IO[Any]]:
     """Open ``path`` for writing, as bytes (``"wb"``) or UTF-8 text with ``\\n`` line ends (``"w"``); the file appears, or
     replaces the old one, only when the block ends without an error. The data goes to a temporary name in the same folder, is
@@ -47,7 +59,7 @@ def atomic_write(path: str | os.PathLike[str], mode: Literal["wb", "w"] = "wb") 
     temporary = target.parent / f".{target.name[:32]}.{uuid.uuid4().hex[:12]}.tmp"
     text_options = {} if mode == "wb" else {"encoding": "utf-8", "newline": "\n"}
     try:
-        with open(temporary, mode.replace("w", "x"), **text_options) as file:  # type: ignore[call-overload]
+        with named_errors(target), open(temporary, mode.replace("w", "x"), **text_options) as file:  # type: ignore[call-overload]
             yield file
             file.flush()
             os.fsync(file.fileno())

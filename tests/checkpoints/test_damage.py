@@ -4,7 +4,12 @@ import errno
 import json
 import os
 import random
+import re
+import resource
 import shutil
+import signal
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -99,6 +104,54 @@ def test_a_full_disk_leaves_the_old_checkpoints_and_the_training_alone(
     assert lines and all("No space left" in line for line in lines)
     assert list(tmp_path.iterdir()) == before
     find_bundle(tmp_path)
+
+
+def limit_files(n_bytes: int) -> None:
+    """Files may not grow beyond this, as on a full disk; for a process that has just been made."""
+    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (n_bytes, n_bytes))
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="limits of Unix")
+@pytest.mark.parametrize("n_bytes", [100, 1000, 4000, 20_000])
+def test_a_file_for_which_there_is_no_room_is_named(tmp_path: Path, n_bytes: int) -> None:
+    """One of the checkpoint's, whichever is the first that is too large."""
+    script = (
+        "from tests.checkpoints.test_damage import CheckpointCallback, CountingEnv, limit_files, make_actpc\n"
+        "lines = []\n"
+        f"callback = CheckpointCallback({str(tmp_path)!r}, 20, report=lines.append)\n"
+        "model = make_actpc(CountingEnv)\n"
+        f"limit_files({n_bytes})\n"
+        "model.learn(20, callback)\n"
+        "print(lines[0])\n"
+        "callback.save()\n"
+    )
+    result = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    told = rf"File too large: '{tmp_path}/\.writing-\w+/\w+\.\w+'"
+    assert re.search(f"no checkpoint at step 20: .*{told}", result.stdout), result.stdout + result.stderr
+    assert result.returncode == 1 and re.search(told, result.stderr.splitlines()[-1])
+    assert list_bundles(tmp_path) == []
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="limits of Unix")
+def test_weights_for_which_there_is_no_room_are_named(tmp_path: Path) -> None:
+    script = (
+        "from sb3_actpc.checkpoints import save_weights\n"
+        "from tests.checkpoints.test_damage import CountingEnv, limit_files, make_actpc\n"
+        "model = make_actpc(CountingEnv)\n"
+        "limit_files(1000)\n"
+        f"save_weights(model, {str(tmp_path / 'agent')!r})\n"
+    )
+    result = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert f"File too large: '{tmp_path / 'agent.safetensors'}'" in result.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_newest_is_the_last_written_whatever_the_clock_says(tmp_path: Path) -> None:
+    make_actpc(CountingEnv).learn(45, CheckpointCallback(tmp_path, 15))
+    for age, path in enumerate(list_bundles(tmp_path)):
+        os.utime(path, (1e9 - 1e6 * age, 1e9 - 1e6 * age))
+    assert find_bundle(tmp_path).num_timesteps == 45
 
 
 def test_a_folder_that_cannot_be_written_is_refused_before_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

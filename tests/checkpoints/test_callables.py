@@ -1,0 +1,213 @@
+"""Everything that a callable or a class of an environment remembers is stored, or named."""
+
+import functools
+import random
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, ClassVar
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.wrappers import TransformObservation, TransformReward
+
+from tests.actpc.envs import CountingEnv
+from tests.checkpoints.runs import assert_same, learn_in_two, learn_straight, make_actpc
+
+RNG = np.random.default_rng(0)
+CALLS = 0
+
+
+class ShiftedEnv(CountingEnv):
+    """Adds to each reward what a callable returns."""
+
+    def __init__(self, shift: Callable[[], float]) -> None:
+        super().__init__()
+        self.shift = shift
+
+    def step(self, action: Any) -> Any:
+        observation, reward, *rest = super().step(action)
+        return observation, reward + self.shift(), *rest
+
+
+def of_a_closure() -> gym.Env:
+    rng = np.random.default_rng(1)
+    return ShiftedEnv(lambda: rng.normal())
+
+
+def of_a_counter() -> gym.Env:
+    calls = 0
+
+    def shift() -> float:
+        nonlocal calls
+        calls += 1
+        return 0.01 * calls
+
+    return ShiftedEnv(shift)
+
+
+def of_a_closure_in_a_closure() -> gym.Env:
+    seen: list[float] = []
+
+    def mean() -> float:
+        seen.append(0.1 * len(seen))
+        return float(np.mean(seen))
+
+    return ShiftedEnv(lambda: 2.0 * mean())
+
+
+def of_a_recursive_function() -> gym.Env:
+    seen = [0]
+
+    def shift(depth: int = 2) -> float:
+        seen[0] += 1
+        return shift(depth - 1) if depth else 0.01 * seen[0]
+
+    return ShiftedEnv(shift)
+
+
+def of_a_default() -> gym.Env:
+    def shift(seen: list[int] = [0], *, rng: Any = np.random.default_rng(2)) -> float:  # noqa: B006, B008
+        seen[0] += 1
+        return rng.normal() + 0.01 * seen[0]
+
+    return ShiftedEnv(shift)
+
+
+def of_its_attribute() -> gym.Env:
+    def shift() -> float:
+        shift.calls += 1  # type: ignore[attr-defined]
+        return 0.01 * shift.calls  # type: ignore[attr-defined]
+
+    shift.calls = 0  # type: ignore[attr-defined]
+    return ShiftedEnv(shift)
+
+
+def of_a_partial() -> gym.Env:
+    return ShiftedEnv(functools.partial(lambda rng, scale: scale * rng.random(), np.random.RandomState(3), scale=0.5))
+
+
+def of_a_bound_method() -> gym.Env:
+    return ShiftedEnv(np.random.default_rng(4).random)
+
+
+def of_pythons_bound_method() -> gym.Env:
+    return ShiftedEnv(random.Random(5).random)
+
+
+def of_the_module() -> gym.Env:
+    global CALLS, RNG
+    CALLS, RNG = 0, np.random.default_rng(6)
+
+    def shift() -> float:
+        global CALLS
+        CALLS += 1
+        return RNG.normal() + 0.01 * CALLS
+
+    return ShiftedEnv(shift)
+
+
+def of_a_transformed_observation() -> gym.Env:
+    last = np.zeros(3)
+
+    def smooth(observation: np.ndarray) -> np.ndarray:
+        nonlocal last
+        last = 0.5 * last + 0.5 * observation
+        return last.astype(np.float32)
+
+    env = CountingEnv()
+    return TransformObservation(env, smooth, env.observation_space)
+
+
+class CountingClass(CountingEnv):
+    """Counts its steps, and draws, in the class."""
+
+    n_steps: ClassVar[int] = 0
+    rng: ClassVar[np.random.Generator] = np.random.default_rng(7)
+
+    def step(self, action: Any) -> Any:
+        observation, reward, *rest = super().step(action)
+        type(self).n_steps += 1
+        return observation, reward + 0.01 * self.n_steps + self.rng.normal(), *rest
+
+
+def of_the_class() -> gym.Env:
+    CountingClass.n_steps, CountingClass.rng = 0, np.random.default_rng(7)
+    return CountingClass()
+
+
+def of_a_class_in_a_function() -> gym.Env:
+    rng = np.random.default_rng(8)
+
+    class Inner(CountingEnv):
+        def step(self, action: Any) -> Any:
+            observation, reward, *rest = super().step(action)
+            return observation, reward + rng.normal(), *rest
+
+    return Inner()
+
+
+STORED = [
+    of_a_closure, of_a_counter, of_a_closure_in_a_closure, of_a_recursive_function, of_a_default, of_its_attribute,
+    of_a_partial, of_a_bound_method, of_pythons_bound_method, of_the_module, of_a_transformed_observation, of_the_class,
+    of_a_class_in_a_function,
+]  # fmt: skip
+
+
+@pytest.mark.filterwarnings("error:.*cannot be restored within its episode")
+@pytest.mark.parametrize("stop_at", [34, 41])
+@pytest.mark.parametrize("make_env", STORED)
+def test_what_a_callable_remembers_goes_on(tmp_path: Path, make_env: Callable[[], gym.Env], stop_at: int) -> None:
+    """34 is the end of an episode, 41 is not."""
+    make = lambda: make_actpc(make_env)  # noqa: E731
+    straight = learn_straight(make, tmp_path / "straight", 70)
+    assert_same(straight, learn_in_two(make, tmp_path / "resumed", 70, stop_at))
+
+
+class Scale:
+    """A callable object."""
+
+    def __init__(self) -> None:
+        self.calls = 0
+
+    def __call__(self, reward: Any) -> float:
+        self.calls += 1
+        return float(reward) + 0.01 * self.calls
+
+    def scaled(self, reward: Any) -> float:
+        return self(reward)
+
+
+class OfScale(CountingEnv):
+    """Holds one in the class."""
+
+    scale = Scale()
+
+
+def numbers() -> Iterator[float]:
+    n = 0
+    while True:
+        n += 1
+        yield 0.01 * n
+
+
+def over_an_iterator() -> gym.Env:
+    drawn = numbers()
+    return ShiftedEnv(lambda: next(drawn))
+
+
+NAMED = {
+    "callable object": (lambda: TransformReward(CountingEnv(), Scale()), "Scale cannot be stored"),
+    "bound method": (lambda: TransformReward(CountingEnv(), Scale().scaled), "Scale cannot be stored"),
+    "partial": (lambda: TransformReward(CountingEnv(), functools.partial(Scale())), "Scale cannot be stored"),
+    "iterator in a closure": (over_an_iterator, "generator cannot be stored"),
+    "next of an iterator": (lambda: ShiftedEnv(numbers().__next__), "method-wrapper cannot be stored"),
+    "of a class": (OfScale, "OfScale.scale: a .*Scale cannot be stored"),
+}
+
+
+@pytest.mark.parametrize("kind", NAMED)
+def test_what_cannot_be_stored_is_named(tmp_path: Path, kind: str) -> None:
+    make_env, reason = NAMED[kind]
+    with pytest.warns(UserWarning, match=f"environment 0 cannot be restored within its episode.*{reason}"):
+        learn_in_two(lambda: make_actpc(make_env), tmp_path, 60, 33)
