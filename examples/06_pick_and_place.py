@@ -48,7 +48,7 @@ print(shown)
 hindsight = {"replay_buffer_class": "HerReplayBuffer"}
 model = ActPC("MultiInputPolicy", ENV_ID, demonstrations=shown, gamma=0.95, seed=SEED, **hindsight)
 model.learn(1)
-print(f"success of the first clone: {success(model):.2f}")
+print(f"success of the BC policy: {success(model):.2f}")
 for _ in range(6):
     model.learn(5_000, reset_num_timesteps=False)
-    print(f"after {model.num_timesteps} steps: {success(model):.2f}, clones left to try: {model.trials.n_clones}", flush=True)
+    print(f"after {model.num_timesteps} steps: {success(model):.2f}", flush=True)

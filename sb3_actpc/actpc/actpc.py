@@ -63,8 +63,8 @@ from sb3_actpc.utils.constructors import constructor_keywords
 from sb3_actpc.utils.rollouts import StoresLastTransition
 
 SelfActPC = TypeVar("SelfActPC", bound="ActPC")
-# of the mean absolute action-value that the critic term is divided by: where no reward was seen yet, the critic's noise must not
-# be scaled up to full strength
+# of the mean absolute action-value that the critic term is divided by: before any reward was seen, the critic's noise must not be
+# scaled up to full strength
 SMALLEST_VALUE_SCALE = 1.0
 _OF_ANOTHER_VERSION = "{path} is of another version of sb3_actpc ({why}): load it with that one"
 NEED_DEMONSTRATIONS = ("demonstration_fraction", "n_demonstrations", "n_demonstration_transitions")
@@ -81,7 +81,7 @@ class ActPC(StoresLastTransition):
     The actor acts; the critic values its actions; the generator's surprise is an epistemic reward; the prior, learned from
     demonstrations and then frozen, gives an instrumental one. Paper: https://arxiv.org/abs/2209.09174.
 
-    Defaults are one recipe for anybody's demonstrations, measured in RESULTS.md; the paper's own values are in
+    Defaults are one setting for all demonstrations (README has its results); the paper's own values are in
     ``hyperparams/actpc_paper.yml``. Keywords whose default is None have one value with demonstrations and one without:
 
     ====================================== ============== =======
@@ -145,8 +145,9 @@ class ActPC(StoresLastTransition):
         and none without, "default", "none" for the paper's agent, or an
         :class:`~sb3_actpc.guidance.base.ActorGuidance`
     :param guidance_kwargs: keywords of :class:`~sb3_actpc.guidance.guidance.GuidanceConfig`
-    :param policy_kwargs: keywords of :class:`~sb3_actpc.actpc.policies.ActPCPolicy`: ``net_arch``, ``n_critics``, ``nudge``, ``memory_history`` (the working memory), ``circuit_kwargs`` (of every
-        :class:`~sb3_actpc.ngc.NGCCircuit`: ``n_settling_steps``, ``feedback``, ``dynamics``, ``normalization``,
+    :param policy_kwargs: keywords of :class:`~sb3_actpc.actpc.policies.ActPCPolicy`: ``net_arch``, ``n_critics``, ``nudge``,
+        ``memory_history`` (the working memory), ``circuit_kwargs`` (of every :class:`~sb3_actpc.ngc.NGCCircuit`:
+        ``n_settling_steps``, ``feedback``, ``dynamics``, ``normalization``,
         ``synaptic_scaling``, ...), ``actor_kwargs``, ``critic_kwargs``, ``generator_kwargs`` and ``prior_kwargs`` (of one, and
         its ``net_arch``, ``learning_rate`` and ``batch_size``)
     :param stats_window_size: as in SB3
@@ -480,6 +481,11 @@ class ActPC(StoresLastTransition):
     def pretrained(self) -> bool:
         """Whether the actor has imitated the demonstrations (:meth:`pretrain`), or was given synapses that have."""
         return bool(self.policy.has_imitated)
+
+    @property
+    def imitates_first(self) -> bool:
+        """Whether ``learn`` begins with BC, so that an evaluation before it says nothing."""
+        return self.demonstrations is not None and self.guidance != "none" and not self.pretrained
 
     @property
     def inputs(self) -> CircuitInputs:
@@ -1026,8 +1032,8 @@ class ActPC(StoresLastTransition):
         return model
 
     def set_parameters(self, *args: Any, **kwargs: Any) -> None:
-        """As in SB3. Returns of the deployed policy say nothing of another one, and how a circuit's learning rate goes with the
-        agent's is a setting, not a parameter."""
+        """As in SB3. Returns of the deployed policy say nothing of another one, and a circuit's own learning
+        rate is a setting, not a parameter."""
         groups = [group for _, circuit in self.policy.named_circuits() for group in circuit.optimizer.param_groups]
         scales = [group["lr_scale"] for group in groups]
         super().set_parameters(*args, **kwargs)

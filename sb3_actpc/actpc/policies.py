@@ -254,8 +254,8 @@ class ActPCPolicy(BasePolicy):
         keep its ratio to the schedule's start
     :param net_arch: hidden sizes of all circuits, or a dict with the keys ``pi``, ``qf``, ``generator`` and ``prior`` (sizes
         left out stay at their defaults: 256 and 256, the prior's 512 and 256)
-    :param n_critics: members of the critic ensemble; the smaller value of two, drawn anew for every update, bootstraps, and the
-        actor follows the mean of all. 1 for the paper's single critic
+    :param n_critics: members of the critic ensemble; the smaller value of two, drawn anew for every update, bootstraps, and
+        the actor follows the mean of all. 1 for the paper's single critic
     :param circuit_kwargs: keywords of every :class:`~sb3_actpc.ngc.NGCCircuit`
     :param actor_kwargs: the same for the actor alone, and ``net_arch``, ``learning_rate``, ``batch_size``
     :param critic_kwargs: the same for the critic

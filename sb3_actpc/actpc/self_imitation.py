@@ -262,8 +262,8 @@ def is_by_return(parts: list[Episodes], weighting: Weighting) -> bool:
 
 
 def sample_union(parts: list[Episodes], n: int, history: int = 0, weighting: Weighting = "uniform") -> ImitationSamples:
-    """``n`` rows drawn from the union of ``parts`` (global NumPy generator, as SB3's buffers), each as often as another or, with
-    "returns", by its episode's return."""
+    """``n`` rows drawn from the union of ``parts`` (global NumPy generator, as SB3's buffers), uniformly or, with
+    "returns", by their episode's return."""
     parts = [part for part in parts if len(part)]
     by_return = is_by_return(parts, weighting)
     if by_return:

@@ -13,7 +13,6 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument("--threads", type=int, default=None, help="torch threads (default: torch's own choice)")
     parser.add_argument("--device", default="cpu", help="torch device")
     parser.add_argument("--batch-size", type=int, default=256, help="of the updates and the settling alone")
-    parser.add_argument("--compiled", action="store_true", help="also the compiled update (compiling takes minutes)")
     parser.add_argument("--training", action="store_true", help="also steps of training, and acting (SBX's with sbx-rl)")
     parser.add_argument("--growth", action="store_true", help="also growth with K, width, batch and number of environments")
     parser.add_argument("--output", type=Path, default=None, help="write the ratios to this JSON file")
@@ -43,9 +42,9 @@ def run(args: argparse.Namespace) -> int:
         for line in timing.robosuite(args.rounds):
             print(line)
         return 0
-    groups = [timing.updates(args.device, args.compiled, args.batch_size), timing.settling(args.device, args.batch_size)]
+    groups = [timing.updates(args.device, args.batch_size), timing.settling(args.device, args.batch_size)]
     if args.training:
-        groups += [*timing.training(args.device, args.compiled), timing.acting()]
+        groups += [*timing.training(args.device), timing.acting()]
     if args.growth:
         groups += timing.growth()
     ratios = timing.measure(groups, args.rounds, args.device)

@@ -145,13 +145,11 @@ def sample_actpc_params(trial: Any, n_actions: int, n_envs: int, additional_args
     trial.suggest_float("tau", 1e-3, 0.15, log=True)
     trial.suggest_int("batch_size_pow", 6, 9)
     trial.suggest_categorical("net_arch", list(NET_ARCHS))
-    trial.suggest_float("actor_pressure", 0.01, 3.0, log=True)
+    trial.suggest_float("critic_weight", 0.01, 3.0, log=True)
     trial.suggest_float("refresh_weight", 0.1, 3.0, log=True)
     trial.suggest_categorical("alpha_ep", [0.0, 0.1, 1.0])
     trial.suggest_categorical("alpha_in", [0.0, 0.1, 1.0])
     trial.suggest_categorical("weight_decay", [0.0, 0.1, 0.3, 1.0])
-    trial.suggest_categorical("refresh_noise", [None, 0.0, 0.5, 1.0])
-    trial.suggest_categorical("refresh_weighting", ["returns", "uniform"])
     params = convert_actpc_params(trial.params)
     trial.set_user_attr("gamma", params["gamma"])
     trial.set_user_attr("batch_size", params["batch_size"])
@@ -160,10 +158,9 @@ def sample_actpc_params(trial: Any, n_actions: int, n_envs: int, additional_args
 
 def convert_actpc_params(sampled: dict[str, Any]) -> dict[str, Any]:
     """Keywords of ActPC from the parameters of a trial, as :func:`sample_actpc_params` named them."""
-    as_they_are = ("learning_rate", "tau", "actor_pressure", "refresh_weight", "alpha_ep", "alpha_in")
+    as_they_are = ("learning_rate", "tau", "critic_weight", "refresh_weight", "alpha_ep", "alpha_in")
     return {
         **{name: sampled[name] for name in as_they_are},
-        "refresh_kwargs": {"noise": sampled["refresh_noise"], "weighting": sampled["refresh_weighting"]},
         "gamma": 1.0 - sampled["one_minus_gamma"],
         "batch_size": 2 ** sampled["batch_size_pow"],
         "policy_kwargs": {

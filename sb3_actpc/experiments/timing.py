@@ -26,7 +26,6 @@ from sb3_actpc.envs.robosuite_layouts import ROBOSUITE_TASKS
 from sb3_actpc.experiments.report.tables import markdown
 from sb3_actpc.experiments.runs.presets import preset, with_changes
 from sb3_actpc.ngc import NGCCircuit
-from sb3_actpc.ngc.products import has_bfloat16
 
 TASKS = ("SparseHopper-v5", "SparseHalfCheetah-v5")
 TASK = TASKS[1]
@@ -35,10 +34,8 @@ N_STEPS = 50  # environment steps of one measurement of training
 N_ENV_STEPS = 20  # of one measurement of robosuite
 N_WARM_UP = 3  # rounds that do not count
 SWEEP = {"feedback": "learned", "feedback_start": "mirrored"}
-BFLOAT16 = {"policy_kwargs.circuit_kwargs.matmul_precision": "bfloat16"}
-QUICK = {"prior_updates": 1, "actor_warm_start": 0, "critic_warmup": 0}
+QUICK = {"prior_updates": 1}
 TD3_SIZES: dict[str, Any] = {"policy_kwargs": {"net_arch": [WIDTH, WIDTH]}, "batch_size": BATCH_SIZE}
-EAGER = ", every kernel by itself"  # on a GPU, where an update is a CUDA graph otherwise
 
 Entries = dict[str, Callable[[], object]]
 # what is timed in turns, and which of it the others (that follow) are divided by -> what their ratio is called then
@@ -94,28 +91,19 @@ def table(files: list[Path]) -> str:
     return markdown(pd.DataFrame(rows, columns=heads))
 
 
-def updates(device: str, compiled: bool, batch_size: int = BATCH_SIZE) -> Group:
-    """TD3's; the bare agent's and the shipped one's with every kind of settling, the paper's preset, and all three with
-    products in bfloat16 where the processor has them; on a GPU also without a CUDA graph."""
+def updates(device: str, batch_size: int = BATCH_SIZE) -> Group:
+    """TD3's; ActPC's with every kind of settling, and with the paper's preset."""
     kinds: dict[str, tuple[str, dict[str, Any]]] = {
         "tied sweep": ("scheduled", {"feedback": "tied"}),
         "learned sweep": ("scheduled", SWEEP),
         "iterative, default tolerance": ("iterative", SWEEP),
     }
-    bare, shipped, paper = "bare, learned sweep", "shipped, learned sweep", "paper preset"
+    default = preset(TASK, "actpc")
     settings = {
-        f"{name}, {kind}": with_changes(keywords, {"settling": settling, "policy_kwargs.circuit_kwargs": circuits})
-        for name, keywords in {"bare": {}, "shipped": preset(TASK, "actpc")}.items()
+        f"default, {kind}": with_changes(default, {"settling": settling, "policy_kwargs.circuit_kwargs": circuits})
         for kind, (settling, circuits) in kinds.items()
     }
-    settings[paper] = preset(TASK, "actpc_paper")
-    if has_bfloat16():
-        settings |= {f"{name}, bfloat16": with_changes(settings[name], BFLOAT16) for name in (bare, shipped, paper)}
-    if device != "cpu":
-        settings |= {name + EAGER: {**settings[name], "compile": False} for name in (bare, shipped)}
-    if compiled:
-        presets = [name for name in settings if name.startswith((shipped, paper))]
-        settings |= {f"{name}, compiled": {**settings[name], "compile": True} for name in presets}
+    settings["paper preset"] = preset(TASK, "actpc_paper")
     shared: dict[str, Any] = {"learning_starts": 10 * N_FILLED, "buffer_size": 10 * N_FILLED, "device": device, "seed": 0}
     entries = {"SB3 TD3 train()": _updater(TD3("MlpPolicy", TASK, **{**TD3_SIZES, "batch_size": batch_size}, **shared))}
     for name, keywords in settings.items():
@@ -159,32 +147,26 @@ def _products(circuit: NGCCircuit, batch: int, of_update: bool = False) -> Calla
     return products
 
 
-def training(device: str, compiled: bool) -> list[Group]:
+def training(device: str) -> list[Group]:
     """Every task's learners, one update for each environment step, batch and layers alike (SBX's where ``sbx-rl`` is
     installed); then TD3 and ActPC as each comes."""
     groups: list[Group] = []
     for task in TASKS:
-        groups.append((_learners(task, device, compiled), {f"SB3 TD3, {task}": f"SB3 TD3's time for a step of {task}"}))
+        groups.append((_learners(task, device), {f"SB3 TD3, {task}": f"SB3 TD3's time for a step of {task}"}))
         own = f"SB3 TD3's own defaults, {task}"
         groups.append((_learners_as_they_come(task, device, own), {own: f"their time for a step of {task}"}))
     return groups
 
 
-def _learners(task: str, device: str, compiled: bool) -> Entries:
+def _learners(task: str, device: str) -> Entries:
     shared: dict[str, Any] = {"learning_starts": 100, "buffer_size": 100 * N_FILLED, "seed": 0}
     same: dict[str, Any] = {"train_freq": 1, "gradient_steps": 1, **shared}
-    bare: dict[str, Any] = {"policy_kwargs": {"circuit_kwargs": SWEEP}, "batch_size": BATCH_SIZE, **same}
-    shipped: dict[str, Any] = {**preset(task, "actpc"), **QUICK, "batch_size": BATCH_SIZE, **shared}
+    shipped: dict[str, Any] = {**preset(task, "actpc"), **QUICK, **shared, "gradient_steps": 1, "policy_delay": 2}
+    shipped["batch_size"] = BATCH_SIZE
     models: dict[str, OffPolicyAlgorithm] = {
         f"SB3 TD3, {task}": TD3("MlpPolicy", task, device=device, **TD3_SIZES, **same),
-        f"bare, learned sweep, {task}": ActPC("MlpPolicy", task, device=device, compile=False, **bare),
-        f"shipped, {task}": ActPC(env=task, device=device, compile=False, **shipped),
+        f"ActPC, {task}": ActPC(env=task, device=device, **shipped),
     }
-    if has_bfloat16():
-        low = with_changes(shipped, BFLOAT16)
-        models[f"shipped, bfloat16, {task}"] = ActPC(env=task, device=device, compile=False, **low)
-        if compiled:
-            models[f"shipped, bfloat16, compiled, {task}"] = ActPC(env=task, device=device, compile=True, **low)
     if find_spec("sbx"):
         import sbx
 
@@ -195,7 +177,7 @@ def _learners(task: str, device: str, compiled: bool) -> Entries:
 def _learners_as_they_come(task: str, device: str, own: str) -> Entries:
     shared: dict[str, Any] = {"learning_starts": 100, "buffer_size": 100 * N_FILLED, "seed": 0, "device": device}
     shipped = {**preset(task, "actpc"), **QUICK, **shared}
-    ours: ActPC = ActPC(env=task, compile=False, **shipped)
+    ours: ActPC = ActPC(env=task, **shipped)
     return {own: _learner(TD3("MlpPolicy", task, **shared)), f"ActPC's own defaults, {task}": _learner(ours)}
 
 
@@ -250,7 +232,7 @@ def _circuit_update(circuit: NGCCircuit, batch: int) -> Callable[[], object]:
 
 
 def _environments(n: int) -> Callable[[], object]:
-    keywords: dict[str, Any] = {"batch_size": BATCH_SIZE, "buffer_size": 100 * N_FILLED, "compile": False, "seed": 0}
+    keywords: dict[str, Any] = {"batch_size": BATCH_SIZE, "buffer_size": 100 * N_FILLED, "seed": 0}
     return _learner(ActPC("MlpPolicy", make_vec_env(TASK, n), device="cpu", gradient_steps=1, **keywords), n)
 
 

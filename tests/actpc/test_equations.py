@@ -76,7 +76,10 @@ def test_the_bootstrapped_action_is_that_of_the_next_observation_with_the_memory
 
 def test_the_target_actor_begins_where_the_warm_start_ends():
     model = make(
-        learning_starts=20, guidance="default", guidance_kwargs={"bc_updates": 3, "gate": False}, demonstrations=demonstrations()
+        learning_starts=20,
+        guidance="default",
+        guidance_kwargs={"bc_updates": 3, "gate": False},
+        demonstrations=demonstrations(),
     )
     before = model.actor.circuit.weights[0].clone()
     model.learn(1)

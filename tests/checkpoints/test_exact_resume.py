@@ -3,7 +3,6 @@
 import os
 import signal
 from copy import deepcopy
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -62,7 +61,7 @@ def test_actpc(tmp_path: Path, n_envs: int, normalize: bool, stop_at: int) -> No
     "keywords",
     [
         {"policy_kwargs": {"net_arch": [16, 16], "memory_history": 3}},
-        {"policy_kwargs": {"net_arch": [16, 16], "n_critics": 1}, "guidance": "none", "guidance_kwargs": None, "policy_delay": 1},
+        {"guidance": "none", "guidance_kwargs": None, "policy_kwargs": {"net_arch": [16, 16], "n_critics": 1}},
         {"buffer_size": 20},
         {
             "settling": "iterative",

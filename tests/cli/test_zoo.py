@@ -21,7 +21,7 @@ ROOT = Path(__file__).resolve().parents[2]
 FEWER = {"learning_starts": 60, "batch_size": 8, "buffer_size": 500, "policy_kwargs": {"net_arch": [8]}}
 NOISE = {"noise_type": "normal", "noise_std": 0.1}
 PRESETS: dict[str, dict[str, Any]] = {
-    "actpc": {**FEWER, **NOISE, "actor_warm_start": 2, "critic_warmup": 5, "learning_rate": "lin_1e-3", "n_timesteps": 120},
+    "actpc": {**FEWER, **NOISE, "learning_rate": "lin_1e-3", "n_timesteps": 120},
     "her": {**FEWER, "policy": "MultiInputPolicy", "n_timesteps": 110},
     "logo": {"n_steps": 64, "batch_size": 32, "n_timesteps": 64, "discriminator_net_arch": [8]},
 }
@@ -167,19 +167,17 @@ def test_the_best_trial_of_a_search_is_a_preset(ran: tuple[Path, dict[str, str]]
 
 def test_sampled_parameters_become_keywords() -> None:
     sampled = {
-        **dict.fromkeys(("learning_rate", "tau", "actor_pressure", "refresh_weight", "alpha_ep", "alpha_in"), 0.5),
+        **dict.fromkeys(("learning_rate", "tau", "critic_weight", "refresh_weight", "alpha_ep", "alpha_in"), 0.5),
         "one_minus_gamma": 0.01,
         "batch_size_pow": 7,
         "net_arch": "small",
         "weight_decay": 0.3,
-        "refresh_noise": 0.1,
-        "refresh_weighting": "uniform",
     }
     params = convert_actpc_params(sampled)
     assert (params["gamma"], params["batch_size"]) == (0.99, 128)
     circuits = {"circuit_kwargs": {"weight_decay": 0.3}}
     assert params["policy_kwargs"] == {"net_arch": NET_ARCHS["small"], **circuits}
-    assert params["refresh_kwargs"] == {"noise": 0.1, "weighting": "uniform"}
+    assert params["critic_weight"] == 0.5
 
 
 @pytest.mark.parametrize(

@@ -35,7 +35,7 @@ DEFAULT_ENV = {"her": "GoalHopper-v5", **dict.fromkeys(("ppo", "sac", "trpo"), "
 OFF_POLICY = {"learning_starts": 0, "buffer_size": 1000, "batch_size": 8}
 FEWER: dict[str, dict[str, Any]] = {
     **{served: {} for served in ("bcq", "cql")},
-    "actpc": {**OFF_POLICY, "prior_updates": 2, "actor_warm_start": 2, "critic_warmup": 0},
+    "actpc": {**OFF_POLICY, "prior_updates": 2},
     "her": {**OFF_POLICY, "demonstration_fraction": 1.0},
     "bc": {"batch_size": 8},
     "bc_rnn": {"batch_size": 8},
@@ -89,7 +89,6 @@ def test_every_entry_builds_its_agent_which_trains(
     settings = dict(FEWER[algo])
     if algo in ("her", "actpc") and demonstrations == "none":  # nothing to learn from but an episode of its own
         settings["learning_starts"], n_steps = 50, 52
-        settings.pop("actor_warm_start", None)
     run = resolve(Run(env=env_id, algo=algo, preset=preset, demonstrations=demonstrations, settings=settings))
     env = make_train_env(env_id, run.env_kwargs, run.n_envs, 0, run.normalize)
     try:

@@ -31,7 +31,6 @@ _OPTION_OF = {
     "seed": "--seed",
     "device": "--device",
     "demonstrations": "--demonstrations",
-    "refresh_noise": "--set refresh_kwargs.noise",
     "action_noise": "--set noise_type=normal --set noise_std=0.1",
 }
 

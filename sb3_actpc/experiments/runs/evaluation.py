@@ -213,7 +213,7 @@ class EvaluationCallback(CsvCallback):
         self.begin_file()
         if getattr(model, "is_offline", False):
             self.last_timesteps = 0
-        elif not getattr(model, "actor_warm_start", 0):
+        elif not getattr(model, "imitates_first", False):
             self._evaluate(min(self.eval_episodes, UNTRAINED_EPISODES))
 
     @property

@@ -127,10 +127,10 @@ def test_a_command_that_is_killed_or_stopped_goes_on_where_it_was(number: int) -
 
 @pytest.mark.slow
 def test_a_command_that_is_killed_ten_times_ends_as_if_it_never_was() -> None:
-    """SIGKILL at random moments, to the command alone or to its workers too; one run has a warm start and a habit."""
+    """SIGKILL at random moments, to the command alone or to its workers too; one run has BC and a deployment gate."""
     write_demonstrations()
     shown = {"name": "shown", "algo": "actpc", "preset": "small.yml", "demonstrations": "demonstrations.npz"}
-    shown["settings"] = {"actor_warm_start": 40, "critic_warmup": 10}
+    shown["settings"] = {"guidance_kwargs": {"bc_updates": 40, "critic_warmup": 10}}
     write_comparison(["first", shown], pause=0.1)
     moments, n_kills, finished = random.Random(0), 0, False
     while not finished:
