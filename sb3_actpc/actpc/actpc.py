@@ -63,8 +63,8 @@ from sb3_actpc.utils.constructors import constructor_keywords
 from sb3_actpc.utils.rollouts import StoresLastTransition
 
 SelfActPC = TypeVar("SelfActPC", bound="ActPC")
-# of the mean absolute action-value that the critic term is divided by: before any reward was seen, the critic's noise must not be
-# scaled up to full strength
+# of the mean absolute action-value that divides the critic term: before any reward was seen, the critic's noise must not
+# be scaled up to full strength
 SMALLEST_VALUE_SCALE = 1.0
 _OF_ANOTHER_VERSION = "{path} is of another version of sb3_actpc ({why}): load it with that one"
 NEED_DEMONSTRATIONS = ("demonstration_fraction", "n_demonstrations", "n_demonstration_transitions")

@@ -1,8 +1,8 @@
 """The deployment gate: which policy ``predict`` uses, decided by evaluation episodes without noise during learning.
 
 An *incumbent* is deployed. A *challenger*, a frozen copy of the actor's moving average, plays evaluation episodes next to it.
-A sequential test on the difference of mean returns promotes or rejects the challenger. An incumbent that turns out worse than
-the one before it is rolled back.
+The arms take turns, and a sequential test on the difference of mean returns promotes or rejects the challenger. An incumbent
+that turns out worse than the one before it is rolled back.
 """
 
 from dataclasses import asdict, dataclass, field
@@ -38,6 +38,8 @@ class PolicySelection:
     incumbent_returns: list[float] = field(default_factory=list)
     challenger_returns: list[float] = field(default_factory=list)
     previous_returns: list[float] = field(default_factory=list)
+    worst: float | None = None  # return of any episode, exploration episodes included
+    turns: int = 0  # of the incumbent since the present challenger began
     roles: list[Role] = field(default_factory=list)
     running: list[float] = field(default_factory=list)
     n_promoted: int = 0
@@ -66,8 +68,10 @@ class PolicySelection:
         episode_return = self.running[env]
         self.running[env] = 0.0
         self.roles[env] = "actor"
+        self.worst = episode_return if self.worst is None else min(self.worst, episode_return)
         if role == "incumbent":
-            self.incumbent_returns.append(episode_return)
+            self.incumbent_returns = [*self.incumbent_returns, episode_return][-2 * self.budget :]
+            self.turns += 1
         if role == "challenger" and self.has_challenger:
             self.challenger_returns.append(episode_return)
         return self._decide() if role != "actor" else None
@@ -86,23 +90,25 @@ class PolicySelection:
         if begins:
             self.has_challenger = True
             self.challenger_returns = []
-        plays_challenger = self.has_challenger and len(self.challenger_returns) <= len(self.incumbent_returns)
+            self.turns = 0
+        plays_challenger = self.has_challenger and len(self.challenger_returns) <= self.turns
         self.roles[env] = "challenger" if plays_challenger else "incumbent"
         return begins
 
     def _decide(self) -> Decision | None:
         if self.has_challenger and len(self.challenger_returns) >= self.min_episodes:
-            gain, error = compare(self.challenger_returns, self.incumbent_returns)
+            gain, error = compare(self.challenger_returns, self.incumbent_returns, self.worst)
             is_last = len(self.challenger_returns) >= self.budget
             if gain > self.promote * error or (is_last and gain > 0.0):
                 return self._promote()
-            if gain < -self.reject * error or is_last:
+            loss, error = compare(self.incumbent_returns, self.challenger_returns)
+            if loss > self.reject * error or is_last:
                 self.has_challenger = False
                 self.n_rejected += 1
                 return "rejected"
         if self.previous_returns and len(self.incumbent_returns) >= self.min_episodes:
-            gain, error = compare(self.incumbent_returns, self.previous_returns)
-            if gain < -self.promote * error:
+            loss, error = compare(self.previous_returns, self.incumbent_returns)
+            if loss > self.promote * error:
                 self.incumbent_returns = self.previous_returns
                 self.previous_returns = []
                 self.has_challenger = False
@@ -125,20 +131,19 @@ class PolicySelection:
         return asdict(self)
 
 
-def compare(ours: list[float], theirs: list[float]) -> tuple[float, float]:
+def compare(ours: list[float], theirs: list[float], worst: float | None = None) -> tuple[float, float]:
     """
     Difference of mean returns and its standard error.
 
-    Both samples get one pseudo-episode at the worst observed return: a policy with few episodes may not have failed yet.
-
     :param ours: returns of one policy, at least one
     :param theirs: returns of the other, at least one
+    :param worst: return of a pseudo-episode that both samples get: a policy with few episodes may not have failed yet; or None
     :return: mean(ours) - mean(theirs), and the standard error from the pooled variance
     """
-    worst = min(min(ours), min(theirs))
-    samples = [[*ours, worst], [*theirs, worst]]
+    pseudo = [] if worst is None else [worst]
+    samples = [[*ours, *pseudo], [*theirs, *pseudo]]
     means = [fmean(sample) for sample in samples]
     squares = sum((one - mean) ** 2 for sample, mean in zip(samples, means, strict=True) for one in sample)
-    degrees = len(samples[0]) + len(samples[1]) - 2
+    degrees = max(len(samples[0]) + len(samples[1]) - 2, 1)
     error = (squares / degrees * (1 / len(samples[0]) + 1 / len(samples[1]))) ** 0.5
     return means[0] - means[1], error

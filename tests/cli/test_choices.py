@@ -92,7 +92,8 @@ def test_a_minari_dataset_is_named_by_its_id(monkeypatch: pytest.MonkeyPatch, ca
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(Path("sets").absolute()))
     shown = Demonstrations.record(lambda _: np.zeros(1), ENV_ID, 2, only_successes=False)
     shown.to_minari("line/still-v0")
-    quick = ["train", "--env", ENV_ID, "--steps", "20", "--set", "guidance_kwargs.bc_updates=3", "--no-progress", "--output", "mine"]
+    quick = ["train", "--env", ENV_ID, "--steps", "20", "--no-progress", "--output", "mine"]
+    quick += ["--set", "guidance_kwargs.bc_updates=3"]
     assert main([*quick, "--demonstrations", "line/moving-v0"]) == 2
     assert "fetch it with `minari download line/moving-v0`" in capsys.readouterr().err
     assert main([*quick, "--demonstrations", "line/still-v0"]) == 0

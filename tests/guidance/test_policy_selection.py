@@ -1,0 +1,115 @@
+"""The deployment gate, played with policies whose returns are known."""
+
+import numpy as np
+import pytest
+
+from sb3_actpc.guidance.policy_selection import PolicySelection, compare
+
+LENGTH = 20  # steps of an episode
+
+
+class Game:
+    """Plays episodes of one environment until ``n_steps``; returns are drawn as the roles' samplers say."""
+
+    def __init__(self, seed: int, incumbent, challenger, **keywords) -> None:
+        self.rng = np.random.default_rng(seed)
+        self.selection = PolicySelection(1, **keywords)
+        self.deployed, self.challenger, self.previous = incumbent, challenger, None
+        self.decisions: list[str] = []
+
+    def play(self, n_steps: int) -> None:
+        candidate = self.challenger
+        for _ in range(n_steps // LENGTH):
+            role = self.selection.roles[0]
+            policy = {"incumbent": self.deployed, "challenger": candidate, "actor": lambda rng: 0.0}[role]
+            episode_return = policy(self.rng)
+            for _ in range(LENGTH):
+                self.selection.step(0, episode_return / LENGTH)
+            decision = self.selection.end_episode(0)
+            if decision is not None:
+                self.decisions.append(decision)
+            if decision == "promoted":
+                self.previous, self.deployed = self.deployed, candidate
+            elif decision == "rolled back":
+                self.deployed = self.previous
+            self.selection.begin_episode(0, challenger_is_ready=True)
+
+
+def noisy(mean: float, std: float):
+    return lambda rng: float(rng.normal(mean, std))
+
+
+def rate(incumbent, challenger, n_steps: int = 4000) -> float:
+    """How often the challenger is deployed in the end, of 200 games."""
+    games = [Game(seed, incumbent, challenger) for seed in range(200)]
+    for game in games:
+        game.play(n_steps)
+    return float(np.mean([game.deployed is challenger for game in games]))
+
+
+def test_a_better_policy_is_deployed_and_a_worse_one_is_not():
+    assert rate(noisy(100.0, 10.0), noisy(150.0, 10.0)) > 0.98
+    assert rate(noisy(100.0, 10.0), noisy(50.0, 10.0)) < 0.02
+
+
+def test_a_policy_that_fails_in_one_of_three_episodes_seldom_replaces_one_that_never_fails():
+    risky = lambda rng: 0.0 if rng.random() < 1 / 3 else 101.0  # noqa: E731
+    assert rate(noisy(100.0, 1.0), risky) < 0.15
+
+
+def test_evaluation_takes_a_quarter_of_the_steps_at_most():
+    game = Game(0, noisy(100.0, 10.0), noisy(100.0, 10.0))
+    game.play(20_000)
+    share = game.selection.evaluation_steps / game.selection.steps
+    assert 0.2 < share <= 0.25 + LENGTH / 20_000
+
+
+def test_a_share_of_zero_never_evaluates_after_the_first_step():
+    game = Game(0, noisy(1.0, 0.0), noisy(2.0, 0.0), share=0.0)
+    game.play(2000)
+    assert game.selection.evaluation_steps <= LENGTH
+
+
+def test_a_lucky_promotion_is_rolled_back():
+    """The challenger's first episodes are lucky; later ones are far worse than the incumbent's."""
+
+    class Lucky:
+        def __init__(self) -> None:
+            self.n = 0
+
+        def __call__(self, rng) -> float:
+            self.n += 1
+            return 200.0 + rng.normal() if self.n <= 3 else 10.0 + rng.normal()
+
+    incumbent = noisy(100.0, 5.0)
+    game = Game(1, incumbent, Lucky())
+    game.play(20_000)
+    assert game.decisions[0] == "promoted"
+    assert "rolled back" in game.decisions
+    assert game.deployed is incumbent
+
+
+def test_equal_returns_of_zero_change_nothing():
+    game = Game(0, noisy(0.0, 0.0), noisy(0.0, 0.0))
+    game.play(20_000)
+    assert set(game.decisions) == {"rejected"}
+
+
+def test_the_comparison_adds_one_episode_at_the_worst_return_to_both():
+    gain, error = compare([4.0, 6.0], [2.0, 2.0], worst=2.0)
+    ours, theirs = np.array([4.0, 6.0, 2.0]), np.array([2.0, 2.0, 2.0])
+    pooled = (ours.var(ddof=1) + theirs.var(ddof=1)) / 2
+    assert gain == pytest.approx(ours.mean() - theirs.mean())
+    assert error == pytest.approx(np.sqrt(pooled * 2 / 3))
+
+
+def test_a_gate_that_is_stored_in_the_middle_goes_on_as_one_that_is_not():
+    straight = Game(3, noisy(100.0, 20.0), noisy(110.0, 20.0))
+    stored = Game(3, straight.deployed, straight.challenger)
+    straight.play(3000)
+    stored.play(3000)
+    stored.selection = PolicySelection(**stored.selection.state_dict())
+    straight.play(3000)
+    stored.play(3000)
+    assert straight.decisions == stored.decisions
+    assert straight.selection == stored.selection
