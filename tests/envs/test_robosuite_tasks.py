@@ -321,12 +321,13 @@ def test_making_one_says_nothing_and_leaves_the_gl_variable_alone() -> None:
     assert "robosuite" not in result.stderr
 
 
-def test_rendering_gives_an_image_of_the_moving_arm() -> None:
+@pytest.mark.parametrize("env_id", ROBOSUITE_IDS)
+def test_rendering_gives_an_image_of_the_moving_arm(env_id: str) -> None:
     code = (
         "from sb3_actpc.experiments.runs.video import choose_gl_backend\n"
         "print(choose_gl_backend())\n"
         "import gymnasium, numpy as np, sb3_actpc\n"
-        "env = gymnasium.make('SparseLift-v0', render_mode='rgb_array'); env.reset(seed=0)\n"
+        f"env = gymnasium.make('{env_id}', render_mode='rgb_array'); env.reset(seed=0)\n"
         "first = env.render()\n"
         "for _ in range(5): env.step(np.ones(7, dtype=np.float32))\n"
         "second = env.render(); env.close()\n"

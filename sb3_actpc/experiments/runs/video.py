@@ -18,6 +18,8 @@ VIDEO_SUFFIXES = (".mp4", ".gif", ".png")
 STRIP_LENGTH = 6
 # of one episode; software rendering takes a twentieth of a second for each
 MAX_FRAMES = 300
+# with one of these the user has chosen the view
+CAMERA_KEYWORDS = {"camera_id", "camera_name", "default_camera_config"}
 # in a process of its own: a broken graphics driver may end the process
 _PROBE = "import mujoco; context = mujoco.GLContext(64, 64); context.make_current(); context.free()"
 
@@ -103,9 +105,26 @@ def _rendering(env_id: str, env_kwargs: dict[str, Any]) -> Iterator[Any]:
         with contextlib.closing(env):
             if env.render_mode is None:
                 raise NotImplementedError(f"{env_id} takes render_mode and does not keep it")
+            if not CAMERA_KEYWORDS & env_kwargs.keys():
+                _follow_robot(env.unwrapped)
             yield env
     except (FatalError, gym.error.Error, ImportError, OSError, RuntimeError, AttributeError) as error:
         raise RenderingUnavailable(f"{type(error).__name__}: {error}") from error
+
+
+def _follow_robot(simulator: Any) -> None:
+    """Let the camera of a Gymnasium MuJoCo task move with the robot; Gymnasium's own default camera stays at the start."""
+    import mujoco
+
+    renderer = getattr(simulator, "mujoco_renderer", None)
+    if renderer is None:
+        return
+    tracking = mujoco.mj_name2id(simulator.model, mujoco.mjtObj.mjOBJ_CAMERA, "track")
+    if tracking >= 0:
+        renderer.camera_id = tracking
+    elif renderer.default_cam_config is None:  # the task chooses no view
+        renderer.camera_id = None
+        renderer.default_cam_config = {"type": mujoco.mjtCamera.mjCAMERA_TRACKING, "trackbodyid": 1}
 
 
 def _replay(demonstrations: Demonstrations, env: Any, n_frames: int) -> list[Any]:
