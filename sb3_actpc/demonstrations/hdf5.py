@@ -39,8 +39,35 @@ def open_hdf5(path: str | os.PathLike[str]) -> Iterator[Any]:
 
 
 def demo_names(data: Any) -> list[str]:
-    """``demo_0``, ``demo_1``, ... of a group, by their numbers."""
-    return sorted((name for name in data if re.fullmatch(r"demo_\d+", name)), key=lambda name: int(name[5:]))
+    """The demonstrations of a group, sorted by the numbers in their names (``demo_2`` before ``demo_10``): every group called
+    ``demo_<number>``, and every other group that holds ``actions``."""
+    names = [name for name in data if re.fullmatch(r"demo_\d+", name) or "actions" in _members(data, name)]
+    return sorted(names, key=lambda name: [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", name)])
+
+
+def mask_names(data: Any, key: str, source: str) -> list[str]:
+    """The demonstrations that robomimic's ``mask/<key>`` lists, each once, sorted as in :func:`demo_names`. ValueError when the
+    file has no such mask, or it lists anything else."""
+    masks = data.file.get("mask", {})
+    if key not in masks:
+        known = ", ".join(sorted(masks)) or "none, the file has no masks"
+        raise ValueError(f"{source}: no mask {key!r}: choose one of {known}")
+    try:
+        listed = np.asarray(masks[key][()]).ravel().tolist()
+    except _READ_ERRORS as error:
+        raise ValueError(f"{source}: mask {key!r} cannot be read ({error})") from None
+    texts = [name.decode() if isinstance(name, bytes) else str(name) for name in listed]
+    names = {text.strip(" \t\n\0") for text in texts} - {""}  # fixed-width texts are padded
+    known_names = demo_names(data)
+    unknown = sorted(names - set(known_names))
+    if unknown or not names:
+        raise ValueError(f"{source}: mask {key!r} must name demonstrations, found {', '.join(unknown) or 'none'}")
+    return [name for name in known_names if name in names]
+
+
+def _members(data: Any, name: str) -> Any:
+    """What a member of an ``h5py.Group`` holds, if it is a group."""
+    return data[name] if hasattr(data[name], "keys") else ()
 
 
 def read_array(group: Any, key: str, source: str, size: int | None = None, length: int | None = None) -> np.ndarray:

@@ -7,6 +7,7 @@ and ``mask/<filter key>``, the names of some of the demonstrations.
 import io
 import json
 import os
+import warnings
 from collections import defaultdict
 from pathlib import Path
 from typing import Any
@@ -28,6 +29,7 @@ ROBOSUITE_TYPE = 1  # robomimic's EnvType
 ROBOSUITE_VERSION = "1.5.2"  # whose observations and controller these are
 # metres: the median over an episode of how much an object's two recorded distances from the gripper differ
 OBJECT_TOLERANCE = 0.005
+SUCCESS_LAG = 2  # steps between the recorded and the observed success; robosuite's observations lag behind by up to one
 
 
 def read_robomimic(
@@ -36,7 +38,9 @@ def read_robomimic(
     """Read a robomimic file.
 
     Episodes end where they first succeed, as they do in the environment. Rewards that are missing or not 0 and 1 are
-    computed from the observed object (the latter are kept as dense rewards). The object's state is built from its recorded
+    computed from the observed object (the latter are kept as dense rewards), and so are rewards that are 0 throughout an
+    episode that succeeds by its observations. Warns of that, and where rewards and observations disagree by more than
+    ``SUCCESS_LAG`` steps. The object's state is built from its recorded
     pose as the environment builds it, whether robosuite 1.4 or 1.5 recorded it. Where the file has no ``next_obs``, the last
     observation of an episode follows itself.
 
@@ -57,7 +61,7 @@ def read_robomimic(
         hdf5.check_recorded_task(
             {**(arguments.get("env_kwargs") or {}), "env_name": arguments.get("env_name")}, task.name, source
         )
-        names = hdf5.demo_names(data) if filter_key is None else _filtered(data, filter_key, source)
+        names = hdf5.demo_names(data) if filter_key is None else hdf5.mask_names(data, filter_key, source)
         episodes = [_read_episode(data[name], task, obs, f"{source}: {name}") for name in names]
     metadata = {"source": "robomimic", "env_version": str(arguments.get("env_version", "unknown")), "demos": names}
     if filter_key is not None:
@@ -140,18 +144,6 @@ def _fetch(url: str, path: Path, env_id: str, report: Report) -> None:
     report(f"wrote {path} ({path.stat().st_size / 1e6:.1f} MB)")
 
 
-def _filtered(data: Any, filter_key: str, source: str) -> list[str]:
-    masks = data.file.get("mask", {})
-    if filter_key not in masks:
-        known = ", ".join(sorted(masks)) or "none, the file has no masks"
-        raise ValueError(f"{source}: no mask {filter_key!r}: choose one of {known}")
-    names = [name.decode() if isinstance(name, bytes) else str(name) for name in masks[filter_key][()]]
-    unknown = [name for name in names if name not in data]
-    if unknown or not names:
-        raise ValueError(f"{source}: mask {filter_key!r} must name demonstrations, found {', '.join(unknown) or 'none'}")
-    return sorted(names, key=hdf5.demo_names(data).index)
-
-
 def _read_episode(group: Any, task: RobosuiteTask, obs: str, source: str) -> Columns:
     actions = hdf5.read_array(group, "actions", source, size=ACTION_DIM)
     length = len(actions)
@@ -167,7 +159,9 @@ def _read_episode(group: Any, task: RobosuiteTask, obs: str, source: str) -> Col
     successes = task.is_success(next_parts["object"], next_parts["robot0_eef_pos"])
     recorded = hdf5.read_array(group, "rewards", source, length=length) if "rewards" in group else None
     is_sparse = recorded is not None and bool(np.isin(recorded, (0.0, 1.0)).all())
-    rewards = recorded if recorded is not None and is_sparse else successes.astype(np.float64)
+    rewards = successes.astype(np.float64)
+    if recorded is not None and is_sparse and _is_trusted(recorded, successes, source):
+        rewards = recorded
     end = int(np.argmax(rewards)) + 1 if rewards.any() else length
     columns = {
         "observations": np.concatenate([parts[name] for name in OBSERVATIONS[obs]], axis=1),
@@ -179,6 +173,30 @@ def _read_episode(group: Any, task: RobosuiteTask, obs: str, source: str) -> Col
     if recorded is not None and not is_sparse:
         columns["dense_rewards"] = recorded
     return {name: column[:end] for name, column in columns.items()}
+
+
+def _is_trusted(recorded: np.ndarray, successes: np.ndarray, source: str) -> bool:
+    """Whether recorded rewards (N,) of 0 and 1 are taken, rather than the observed successes (N,); warns when they disagree."""
+    if not successes.any():
+        if recorded.any():
+            warnings.warn(f"{source}: key 'rewards' has a success, the observed object none: check the file", stacklevel=2)
+        return True
+    observed = int(np.argmax(successes))
+    if not recorded.any():
+        rule = "the observations are taken"
+        warnings.warn(
+            f"{source}: key 'rewards' is 0 throughout, the observed object is where it should be at step {observed}: {rule}",
+            stacklevel=2,
+        )
+        return False
+    first = int(np.argmax(recorded))
+    if abs(first - observed) > SUCCESS_LAG:
+        warnings.warn(
+            f"{source}: key 'rewards' has its first success at step {first}, the observed object at step {observed}: check the "
+            "file; the rewards are taken",
+            stacklevel=2,
+        )
+    return True
 
 
 def _read_parts(group: Any, kind: str, task: RobosuiteTask, obs: str, length: int, source: str) -> dict[str, np.ndarray]:

@@ -106,6 +106,51 @@ def test_filter_keys_select(lift_file: Path) -> None:
         read_robomimic(lift_file, LIFT, filter_key="okay")
 
 
+@pytest.mark.parametrize(
+    ("listed", "read"),
+    [
+        (np.array([b"demo_2", b"demo_0", b"demo_2"]), ["demo_0", "demo_2"]),
+        (np.array([b"demo_0  ", b"demo_2\0\0", b"        "], dtype="S8"), ["demo_0", "demo_2"]),
+        (np.array([b"demo_1 ", b"demo_1"]), ["demo_1"]),
+        (np.array(["demo_1", "demo_1 "], dtype=h5py.string_dtype()), ["demo_1"]),
+        (np.array([[b"demo_1"], [b"demo_2"]]), ["demo_1", "demo_2"]),
+    ],
+)
+def test_a_mask_lists_every_demonstration_once_whatever_its_padding(
+    listed: np.ndarray, read: list[str], lift_file: Path
+) -> None:
+    edit(lift_file, lambda file: file.create_dataset("mask/mine", data=listed))
+    found = read_robomimic(lift_file, LIFT, filter_key="mine")
+    assert found.metadata["demos"] == read
+    lengths = dict(zip(("demo_0", "demo_1", "demo_2"), (4, 3, 5), strict=True))
+    assert len(found) == sum(lengths[name] for name in read)
+
+
+@pytest.mark.parametrize("listed", [np.array([b"demo_7"]), np.array([1, 2]), np.array([b" "]), np.array([b"demo_0", b"mask"])])
+def test_a_mask_of_something_else_is_named(listed: np.ndarray, lift_file: Path) -> None:
+    edit(lift_file, lambda file: file.create_dataset("mask/mine", data=listed))
+    with pytest.raises(ValueError, match="mask 'mine' must name demonstrations, found"):
+        read_robomimic(lift_file, LIFT, filter_key="mine")
+    edit(lift_file, lambda file: file.create_group("mask/group"))
+    with pytest.raises(ValueError, match="mask 'group' cannot be read"):
+        read_robomimic(lift_file, LIFT, filter_key="group")
+
+
+def test_groups_with_actions_are_demonstrations_whatever_they_are_called(lift_file: Path) -> None:
+    original = made_up(LIFT)
+
+    def rename(file: h5py.File) -> None:
+        file.move("data/demo_1", "data/failed_try")
+        file.move("data/demo_2", "data/demo_10_retry")
+        file["data/statistics/mean"] = np.zeros(3)
+        file["data/total"] = 12
+
+    edit(lift_file, rename)
+    read = read_robomimic(lift_file, LIFT)
+    assert read.metadata["demos"] == ["demo_0", "demo_10_retry", "failed_try"]
+    np.testing.assert_allclose(read.actions, original.actions[[*range(4), *range(7, 12), *range(4, 7)]])
+
+
 def test_demonstrations_are_in_the_order_of_their_numbers(tmp_path: Path) -> None:
     original = made_up(LIFT, lengths=tuple(range(2, 14)))
     write_robomimic(original, tmp_path / "many.hdf5")
@@ -177,6 +222,45 @@ def test_missing_rewards_are_computed_and_dense_ones_kept_apart(lift_file: Path)
     np.testing.assert_allclose(read.dense_rewards[4:7], [0.1, 0.5, 0.9])
 
 
+@pytest.mark.parametrize("env_id", ROBOSUITE_IDS)
+def test_observed_success_wins_over_rewards_that_are_zero_throughout(env_id: str, tmp_path: Path) -> None:
+    """The second episode is recorded as it should be: it keeps its rewards, without a warning."""
+    original = made_up(env_id)
+    write_robomimic(original, tmp_path / "zero.hdf5")
+    for name, n in (("demo_0", 4), ("demo_2", 5)):
+        edit(tmp_path / "zero.hdf5", lambda file, name=name, n=n: replace(file, f"data/{name}/rewards", np.zeros(n)))  # type: ignore[misc]
+    with pytest.warns(UserWarning, match="key 'rewards' is 0 throughout") as warned:
+        read = read_robomimic(tmp_path / "zero.hdf5", env_id)
+    assert read.rewards.tolist() == original.rewards.tolist()
+    assert read.terminations.tolist() == original.terminations.tolist()
+    assert [str(one.message).split(": ")[1] for one in warned] == ["demo_0", "demo_2"]
+
+
+def never_lifted(file: h5py.File) -> None:
+    for kind in ("obs", "next_obs"):
+        file[f"data/demo_0/{kind}/object"][:, 2] = 0.82
+        offset = file[f"data/demo_0/{kind}/object"][:, :3] - file[f"data/demo_0/{kind}/robot0_eef_pos"][()]
+        file[f"data/demo_0/{kind}/object"][:, 7:] = offset
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_failed_episode_stays_a_failed_one(lift_file: Path) -> None:
+    edit(lift_file, never_lifted)
+    edit(lift_file, lambda file: replace(file, "data/demo_0/rewards", np.zeros(4)))
+    read = read_robomimic(lift_file, LIFT)
+    assert read.episode_returns.tolist() == [0, 1, 1] and not read.terminations[:4].any()
+
+
+def test_a_recorded_success_that_is_not_observed_is_warned_of(lift_file: Path) -> None:
+    edit(lift_file, never_lifted)
+    with pytest.warns(UserWarning, match="demo_0: key 'rewards' has a success, the observed object none"):
+        assert read_robomimic(lift_file, LIFT).episode_returns.tolist() == [1, 1, 1]
+    edit(lift_file, lambda file: replace(file, "data/demo_2/rewards", np.ones(5)))
+    with pytest.warns(UserWarning, match="demo_2: .* first success at step 0, the observed object at step 4"):
+        read_robomimic(lift_file, LIFT)
+
+
+@pytest.mark.filterwarnings("ignore:.*first success at step 1")
 def test_an_episode_ends_at_its_first_success(lift_file: Path) -> None:
     edit(lift_file, lambda file: replace(file, "data/demo_2/rewards", np.array([0.0, 1.0, 1.0, 0.0, 1.0])))
     read = read_robomimic(lift_file, LIFT)

@@ -81,7 +81,7 @@ def test_the_robot_is_in_view_at_the_last_frame_however_far_it_goes(env_id: str,
 class DriftingEnv(MujocoEnv):
     """A ball that moves 10 cm a step, in a model without a camera."""
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 500}
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 500}  # type: ignore[misc]
 
     def __init__(self, folder: str, **options: Any) -> None:
         model = Path(folder) / "ball.xml"
