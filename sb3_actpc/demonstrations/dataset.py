@@ -19,7 +19,7 @@ from gymnasium import spaces
 from sb3_actpc.demonstrations.minari import read_minari, write_minari
 from sb3_actpc.demonstrations.npz import read_npz, write_npz
 from sb3_actpc.demonstrations.recording import env_name, record_episodes, time_limit, trajectory_columns
-from sb3_actpc.demonstrations.rows import field_error, flat_size, outside_bounds, unchained_indices, whole_columns
+from sb3_actpc.demonstrations.rows import box_paths, field_error, flat_size, outside_bounds, unchained_indices, whole_columns
 from sb3_actpc.envs import SPARSE_IDS
 
 if TYPE_CHECKING:
@@ -253,6 +253,7 @@ class Demonstrations:
         the recorded one (None: not compared)."""
         if env_id is not None and base_name(env_id) != base_name(self.env_id):
             raise self._error("env_id", f"{env_id!r} (any version)", repr(self.env_id))
+        box_paths(observation_space)
         obs_dim = flat_size(observation_space)
         if self.observations.shape[1] != obs_dim:
             raise self._error("observations", f"{obs_dim} values a row", f"{self.observations.shape[1]}")

@@ -46,8 +46,8 @@ def demo_names(data: Any) -> list[str]:
 
 
 def mask_names(data: Any, key: str, source: str) -> list[str]:
-    """The demonstrations that robomimic's ``mask/<key>`` lists, each once, sorted as in :func:`demo_names`. ValueError when the
-    file has no such mask, or it lists anything else."""
+    """The demonstrations that robomimic's ``mask/<key>`` lists, each once, sorted as by :func:`demo_names`. ValueError when
+    the file has no such mask, or it lists anything else."""
     masks = data.file.get("mask", {})
     if key not in masks:
         known = ", ".join(sorted(masks)) or "none, the file has no masks"

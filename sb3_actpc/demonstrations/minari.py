@@ -30,7 +30,12 @@ def read_minari(
         paths = box_paths(observation_space)
     if not isinstance(dataset.action_space, spaces.Box):
         raise field_error(source, "actions", "a Box action space", repr(dataset.action_space))
-    episodes = [_columns(episode, paths, source) for episode in dataset.iterate_episodes()]
+    episodes = []
+    for episode in dataset.iterate_episodes():
+        where = f"{source}: episode {episode.id}"
+        _check_stored(episode.observations, dataset.observation_space, "observations", where)
+        _check_stored(episode.actions, dataset.action_space, "actions", where)
+        episodes.append(_columns(episode, paths, source))
     if not episodes:
         raise field_error(source, "observations", "at least one episode", "none")
     n_dense = sum("dense_rewards" in episode for episode in episodes)
@@ -121,6 +126,23 @@ def _has_json_spec(env: gym.Env[Any, Any] | None) -> bool:
         return env is not None and env.spec is not None and bool(env.spec.to_json())
     except (TypeError, ValueError):
         return False
+
+
+def _check_stored(stored: Any, space: spaces.Space[Any], name: str, where: str) -> None:
+    """ValueError when the stored rows of a space have another shape than its elements. Minari writes uint8 vectors and
+    matrices as JPEG, and gives back the compressed bytes unless it takes the space for an image."""
+    if isinstance(space, spaces.Dict | spaces.Tuple):
+        parts = space.items() if isinstance(space, spaces.Dict) else enumerate(space)
+        for key, part in parts:
+            _check_stored(stored[key], part, f"{name}/{key}", where)
+        return
+    shapes = {np.shape(row) for row in stored}
+    if not isinstance(space, spaces.Box) or shapes == {space.shape}:
+        return
+    found = f"shape {', '.join(map(str, sorted(shapes)))}"
+    if space.dtype == np.uint8:
+        found += ": Minari has stored them as JPEG, which changes them; record them again as float32"
+    raise field_error(where, name, f"rows of shape {space.shape}, as the dataset's own {space}", found)
 
 
 def _columns(episode: Any, paths: list[list[str]], source: str) -> dict[str, np.ndarray]:

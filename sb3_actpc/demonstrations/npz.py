@@ -14,6 +14,10 @@ from sb3_actpc.demonstrations.rows import field_error, unchained_indices
 from sb3_actpc.utils.files import atomic_write
 
 FORMAT_VERSION = 1
+FROM_IMITATION = (
+    "if the imitation library wrote it, read it with imitation.data.serialize.load and make "
+    "Demonstrations.from_trajectories of that"
+)
 HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 
 _ARRAYS = ("observations", "actions", "rewards", "terminations", "episode_starts")
@@ -49,7 +53,9 @@ def read_npz(path: str | os.PathLike[str]) -> dict[str, Any]:
     if not os.path.exists(path):
         raise FileNotFoundError(f"no demonstrations file at {source}")
     if not os.path.isfile(path):
-        raise ValueError(f"{source}: expected a demonstrations file, found a folder or device")
+        is_dataset = os.path.isfile(os.path.join(path, "dataset_info.json"))
+        found = f"a folder: {FROM_IMITATION}" if is_dataset else "a folder or device"
+        raise ValueError(f"{source}: expected a demonstrations file, found {found}")
     stored = _read_entries(Path(path).read_bytes(), source)
     dense_rewards = stored["dense_rewards"]
     return {
@@ -76,7 +82,10 @@ def _read_entries(content: bytes, source: str) -> dict[str, np.ndarray]:
     with archive:
         if "format_version.npy" not in archive.namelist():
             expected = "an entry, as Demonstrations.save writes it (for arrays: Demonstrations.from_episodes)"
-            raise field_error(source, "format_version", expected, f"only {', '.join(archive.namelist()) or 'none'}")
+            found = f"only {', '.join(archive.namelist()) or 'none'}"
+            if {"obs.npy", "acts.npy"} <= set(archive.namelist()):
+                found += f": {FROM_IMITATION}"
+            raise field_error(source, "format_version", expected, found)
         version = _read_array(archive, "format_version", source)
         if version.shape != () or version.dtype.kind not in "iu" or version < 1:
             found = f"type {version.dtype}, shape {version.shape}" if version.shape else repr(version.item())

@@ -49,6 +49,7 @@ def record_episodes(
         raise ValueError(f"n_episodes={n_episodes} must be at least 1: give the number of demonstrated episodes")
     if not isinstance(env.action_space, spaces.Box):
         raise ValueError(f"demonstrations need a Box action space, found {env.action_space}")
+    box_paths(env.observation_space)
     if not demonstrators:
         raise ValueError("demonstrator=[] must be at least one: an object with predict, or a function of the observation")
     max_tries = 10 * n_episodes if max_tries is None else max_tries
@@ -99,6 +100,10 @@ def trajectory_columns(
     observations = trajectory.obs.unwrap() if hasattr(trajectory.obs, "unwrap") else trajectory.obs
     if isinstance(observations, Mapping) and observation_space is None:
         raise ValueError("trajectories with dict observations need observation_space: give the environment's")
+    if not isinstance(observations, Mapping) and np.ndim(observations) < 2:
+        raise ValueError(
+            f"trajectories need Box observations, found obs of shape {np.shape(observations)}, as of a Discrete space"
+        )
     rows = join_observations(observations, [[]] if observation_space is None else box_paths(observation_space))
     columns, n_steps = transition_columns(rows, trajectory.acts, "a trajectory"), len(trajectory.acts)
     infos = [info or {} for info in trajectory.infos] if trajectory.infos is not None else [{}] * n_steps

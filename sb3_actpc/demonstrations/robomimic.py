@@ -176,27 +176,18 @@ def _read_episode(group: Any, task: RobosuiteTask, obs: str, source: str) -> Col
 
 
 def _is_trusted(recorded: np.ndarray, successes: np.ndarray, source: str) -> bool:
-    """Whether recorded rewards (N,) of 0 and 1 are taken, rather than the observed successes (N,); warns when they disagree."""
-    if not successes.any():
-        if recorded.any():
-            warnings.warn(f"{source}: key 'rewards' has a success, the observed object none: check the file", stacklevel=2)
-        return True
-    observed = int(np.argmax(successes))
-    if not recorded.any():
-        rule = "the observations are taken"
-        warnings.warn(
-            f"{source}: key 'rewards' is 0 throughout, the observed object is where it should be at step {observed}: {rule}",
-            stacklevel=2,
-        )
-        return False
-    first = int(np.argmax(recorded))
-    if abs(first - observed) > SUCCESS_LAG:
-        warnings.warn(
-            f"{source}: key 'rewards' has its first success at step {first}, the observed object at step {observed}: check the "
-            "file; the rewards are taken",
-            stacklevel=2,
-        )
-    return True
+    """Whether recorded rewards (N,) of 0 and 1 are taken, not the observed successes (N,); warns when they disagree."""
+    first, observed = int(np.argmax(recorded)), int(np.argmax(successes))
+    problem = ""
+    if not recorded.any() and successes.any():
+        problem = f"is 0 throughout, the object is observed in place at step {observed}: the observations are taken"
+    elif recorded.any() and not successes.any():
+        problem = "has a success, the observed object none: check the file"
+    elif abs(first - observed) > SUCCESS_LAG:
+        problem = f"has its first success at step {first}, the observed object at step {observed}: check the file"
+    if problem:
+        warnings.warn(f"{source}: key 'rewards' {problem}", stacklevel=2)
+    return bool(recorded.any() or not successes.any())
 
 
 def _read_parts(group: Any, kind: str, task: RobosuiteTask, obs: str, length: int, source: str) -> dict[str, np.ndarray]:

@@ -88,6 +88,9 @@ def whole_columns(episode: Mapping[str, Any], known: Sequence[str], source: str)
     for name in ("observations", "actions", "rewards"):
         if name not in columns:
             raise field_error(source, name, "a column of every episode", f"only {', '.join(sorted(columns)) or 'none'}")
+    if columns["actions"].dtype.kind in "biu":
+        found = f"whole numbers ({columns['actions'].dtype}), as of a Discrete action space; of a Box, convert them to float"
+        raise field_error(source, "actions", "floats, in the units of a Box action space", found)
     n = len(columns["actions"])
     if not n:
         raise field_error(source, "actions", "a step of every episode", "an episode of none; leave it out")

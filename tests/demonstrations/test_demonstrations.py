@@ -616,6 +616,43 @@ class TestMinari:
         else:
             assert_equal(Demonstrations.from_minari(shown.to_minari("tiny/images-v0", env)), shown)
 
+    @pytest.mark.parametrize(
+        ("space", "is_kept"),
+        [
+            (spaces.Box(0, 255, (8,), np.uint8), False),
+            (spaces.Box(0, 255, (4, 5), np.uint8), False),
+            (spaces.Box(0, 255, (40, 33), np.uint8), True),  # an image: Minari decodes it
+            (spaces.Box(0, 255, (8,), np.int64), True),
+            (spaces.Box(-1, 1, (3, 2)), True),
+        ],
+    )
+    @pytest.mark.parametrize("is_dict", [False, True])
+    def test_rows_that_are_not_of_the_datasets_own_space_are_refused(
+        self, space: spaces.Box, is_kept: bool, is_dict: bool, minari: Any
+    ) -> None:
+        """Minari stores every uint8 vector as JPEG and gives back its bytes."""
+        from minari.data_collector import EpisodeBuffer
+
+        space.seed(0)
+        rows: Any = np.stack([space.sample() for _ in range(4)])
+        whole: spaces.Space[Any] = spaces.Dict(state=space, time=spaces.Box(0, 9, (1,))) if is_dict else space
+        seen = {"state": rows, "time": np.zeros((4, 1), np.float32)} if is_dict else rows
+        ends = {"rewards": [0.0] * 3, "terminations": [False] * 3, "truncations": [False] * 3}
+        episode = EpisodeBuffer(observations=seen, actions=np.zeros((3, 2), np.float32), **ends)
+        dataset = minari.create_dataset_from_buffers(
+            "tiny/bytes-v0", [episode], observation_space=whole, action_space=spaces.Box(-1, 1, (2,))
+        )
+        if not is_kept:
+            name = "observations/state" if is_dict else "observations"
+            expected = rf"tiny/bytes-v0: episode 0: .*'{name}': expected rows of shape .*, found .*stored them as JPEG"
+            with pytest.raises(ValueError, match=expected):
+                Demonstrations.from_minari(dataset, env_id="Named-v0")
+            return
+        read = Demonstrations.from_minari(dataset, env_id="Named-v0").observations
+        assert read.shape == (3, rows[0].size + is_dict)
+        if space.dtype != np.uint8:
+            assert np.array_equal(read[:, : rows[0].size], rows[:3].reshape(3, -1).astype(np.float32))
+
     def test_truncation_and_termination_are_told_apart(self) -> None:
         dataset = make_demonstrations().to_minari("tiny/ends-v0")
         ends = [(bool(episode.terminations[-1]), bool(episode.truncations[-1])) for episode in dataset.iterate_episodes()]

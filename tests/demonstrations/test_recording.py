@@ -2,6 +2,7 @@
 
 import warnings
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -182,6 +183,19 @@ def test_an_episode_that_goes_on_and_on_is_said_to(monkeypatch: pytest.MonkeyPat
         Demonstrations.record(lambda _: np.zeros(1), Corridor(length=3), 1)
 
 
+@pytest.mark.parametrize(
+    "space", [spaces.Discrete(3), spaces.MultiBinary(2), spaces.Dict(state=spaces.Box(-1, 1, (2,)), cell=spaces.Discrete(3))]
+)
+def test_observations_that_are_no_boxes_are_refused(space: spaces.Space[Any]) -> None:
+    env = Corridor()
+    env.observation_space = space
+    with pytest.raises(ValueError, match=r"need Box observations or a Dict of Boxes, found (Discrete|MultiBinary)"):
+        Demonstrations.record(forward, env, 1)
+    shown = Demonstrations.record(forward, Corridor(), 1)
+    with pytest.raises(ValueError, match="need Box observations or a Dict of Boxes"):
+        shown.check(space, env.action_space)
+
+
 def test_sampled_actions_differ_and_deterministic_ones_do_not() -> None:
     model = PPO("MlpPolicy", "Pendulum-v1", n_steps=8, batch_size=8, device="cpu", seed=0)
     first, second = (Demonstrations.record(model, "Pendulum-v1", 1, seed=3) for _ in range(2))
@@ -298,6 +312,31 @@ class TestTrajectories:
         shown = Demonstrations.from_trajectories([trajectory], "Named-v0", observation_space=space)
         first = spaces.utils.flatten(space, {"goal": np.array([9.0]), "state": np.array([0.0, 1.0])})
         assert shown.observations[0].tolist() == list(first)
+
+    @pytest.mark.parametrize("kind", [np.int64, np.int32, np.uint8, bool])
+    @pytest.mark.parametrize("shape", [(3,), (3, 2)])
+    def test_choices_of_a_discrete_action_space_are_refused(self, kind: type, shape: tuple[int, ...]) -> None:
+        choices = Trajectory(np.zeros((4, 2)), np.ones(shape, kind), None, False, np.zeros(3))
+        with pytest.raises(ValueError, match=r"'actions': expected floats, .* found whole numbers .* Discrete action space"):
+            Demonstrations.from_trajectories([choices], "CartPole-v1")
+        episode = {"observations": np.zeros((4, 2)), "actions": np.ones(shape, kind), "rewards": np.zeros(3)}
+        with pytest.raises(ValueError, match="whole numbers"):
+            Demonstrations.from_episodes([episode], "CartPole-v1")
+
+    def test_discrete_observations_are_refused(self) -> None:
+        states = Trajectory(np.arange(4), np.ones((3, 1)), None, False, np.zeros(3))
+        with pytest.raises(ValueError, match=r"need Box observations, found obs of shape \(4,\)"):
+            Demonstrations.from_trajectories([states], "Named-v0")
+
+    def test_files_of_the_imitation_library_are_named_when_they_are_loaded(self, tmp_path: Path) -> None:
+        """Its old format is an npz file with these entries, its new one a folder of Hugging Face's datasets."""
+        old = {"obs": np.zeros((4, 2)), "acts": np.zeros((3, 1)), "infos": np.zeros(3), "terminal": np.ones(1)}
+        np.savez(tmp_path / "old.npz", **old, indices=np.zeros(0, int))
+        (tmp_path / "new").mkdir()
+        (tmp_path / "new" / "dataset_info.json").write_text("{}")
+        for name in ("old.npz", "new"):
+            with pytest.raises(ValueError, match=rf"{name}: .*imitation.data.serialize.load.*from_trajectories"):
+                Demonstrations.load(tmp_path / name)
 
     def test_a_missing_observation_is_noticed(self) -> None:
         with pytest.raises(ValueError, match="2 actions must have 3 observations, found 2"):
