@@ -19,7 +19,15 @@ from gymnasium import spaces
 from sb3_actpc.demonstrations.minari import read_minari, write_minari
 from sb3_actpc.demonstrations.npz import read_npz, write_npz
 from sb3_actpc.demonstrations.recording import env_name, record_episodes, time_limit, trajectory_columns
-from sb3_actpc.demonstrations.rows import box_paths, field_error, flat_size, outside_bounds, unchained_indices, whole_columns
+from sb3_actpc.demonstrations.rows import (
+    box_paths,
+    field_error,
+    flat_size,
+    outside_bounds,
+    unchained_indices,
+    warn_of_indistinguishable,
+    whole_columns,
+)
 from sb3_actpc.envs import SPARSE_IDS
 
 if TYPE_CHECKING:
@@ -146,6 +154,7 @@ class Demonstrations:
                 columns[name] = np.concatenate([episode[name] for episode in episodes])
             except ValueError as error:
                 raise field_error(source, name, "rows of one size in every episode", str(error)) from None
+        warn_of_indistinguishable(columns["observations"], source)
         starts = np.cumsum([0, *(len(episode["rewards"]) for episode in episodes[:-1])])
         return cls(**columns, episode_starts=starts, env_id=env_id, metadata=dict(metadata or {}), source=source)
 

@@ -3,14 +3,21 @@
 import sys
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from sb3_actpc.demonstrations.rows import box_paths, join_observations, outside_bounds, transition_columns
+from sb3_actpc.demonstrations.rows import (
+    box_paths,
+    column_names,
+    flatten_observation,
+    join_observations,
+    outside_bounds,
+    transition_columns,
+    warn_of_indistinguishable,
+)
 from sb3_actpc.utils.extras import installed_version
 
 Columns = dict[str, np.ndarray]
@@ -75,7 +82,7 @@ def record_episodes(
         )
     made_by: dict[str, Any] = {"seed": seed, "n_tries": n_tries, "deterministic": deterministic}
     simulators = [name for name in ("gymnasium", "mujoco", "robosuite") if name in sys.modules]
-    return episodes, made_by | {name: installed_version(name) for name in simulators}
+    return _as_stored(episodes, env.observation_space), made_by | {name: installed_version(name) for name in simulators}
 
 
 def env_name(env: gym.Env[Any, Any]) -> str:
@@ -145,8 +152,8 @@ def _play(act: Callable[[Any, bool], np.ndarray], env: gym.Env[Any, Any], seed: 
     """One episode as columns, and its last info."""
     rows: list[tuple[Any, ...]] = []
     observation, info = env.reset(seed=seed)
-    flat = partial(spaces.utils.flatten, env.observation_space)  # a copy: the environment may go on writing on what it gave
-    row = flat(observation)
+    # copies: the environment may go on writing on what it gave
+    row = flatten_observation(env.observation_space, observation)
     done = False
     while not done:
         action = act(observation, not rows)
@@ -162,7 +169,7 @@ def _play(act: Callable[[Any, bool], np.ndarray], env: gym.Env[Any, Any], seed: 
             wanted = f"{env_name(env)} takes {env.action_space}: clip it (numpy.clip)"
             raise ValueError(f"the demonstrator gives the action {shown} at step {len(rows)}, {wanted}")
         observation, reward, terminated, truncated, info = env.step(action)
-        next_row = flat(observation)
+        next_row = flatten_observation(env.observation_space, observation)
         rows.append((row, next_row, shown, reward, terminated, info.get("dense_reward", reward)))
         row, done = next_row, terminated or truncated
         if len(rows) == ENDLESS:
@@ -172,8 +179,18 @@ def _play(act: Callable[[Any, bool], np.ndarray], env: gym.Env[Any, Any], seed: 
                 stacklevel=2,
             )
     names = ("observations", "next_observations", "actions", "rewards", "terminations", "dense_rewards")
-    columns = {name: np.asarray(values, dtype=np.float32) for name, values in zip(names, zip(*rows, strict=True), strict=True)}
+    columns = {name: np.asarray(values) for name, values in zip(names, zip(*rows, strict=True), strict=True)}
     return {**columns, "terminations": columns["terminations"].astype(bool)}, info
+
+
+def _as_stored(episodes: list[Columns], space: spaces.Space[Any]) -> list[Columns]:
+    """The same episodes in float32; warns of the features of the observations that it cannot hold."""
+    rows = np.concatenate([episode["observations"] for episode in episodes])
+    warn_of_indistinguishable(rows, "", column_names(space))
+    return [
+        {name: column if column.dtype == bool else column.astype(np.float32) for name, column in episode.items()}
+        for episode in episodes
+    ]
 
 
 def _is_kept(info: Mapping[str, Any], only_successes: bool | None) -> bool:

@@ -13,6 +13,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_actpc.demonstrations import Demonstrations, fit_demonstrations, recording
+from sb3_actpc.demonstrations.rows import indistinguishable_features
 from tests.recordings import record
 
 
@@ -150,6 +151,83 @@ def test_rows_are_copies_of_what_environment_and_demonstrator_write_on() -> None
     assert shown.observations[:, 1].tolist() == [0, 1, 2, 3]
     assert shown.next_observations[:, 1].tolist() == [1, 2, 3, 4]
     assert shown.actions.ravel().tolist() == [0, 0.25, 0.5, 0.75]
+
+
+class Clock(gym.Env[Any, Any]):
+    """Observes the time, from ``start`` in steps of ``tick``, in the precision of ``kind``, and a constant."""
+
+    action_space = spaces.Box(-1, 1, (1,), np.float32)
+
+    def __init__(self, start: float, tick: float, kind: Any = np.float64, is_dict: bool = False) -> None:
+        self.start, self.tick, self.kind, self.is_dict = start, tick, kind, is_dict
+        one = spaces.Box(-np.inf, np.inf, (1,), kind)
+        two = spaces.Box(-np.inf, np.inf, (2,), kind)
+        inner = spaces.Dict(seconds=one)
+        self.observation_space = spaces.Dict(other=one, clock=inner) if is_dict else two
+
+    def observe(self) -> Any:
+        values = np.array([0.5, self.start + self.tick * self.t], self.kind)
+        return {"other": values[:1], "clock": {"seconds": values[1:]}} if self.is_dict else values
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.t = 0
+        return self.observe(), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self.t += 1
+        return self.observe(), 0.0, self.t == 10, self.t == 20, {}
+
+
+UNIX_TIME = 1.7e9  # float32 has a value every 128 seconds
+
+
+@pytest.mark.parametrize(("is_dict", "name"), [(False, "column 1"), (True, "clock/seconds\\[0\\]")])
+@pytest.mark.parametrize("kind", [np.float64, np.int64])
+def test_features_that_float32_cannot_follow_are_named(kind: Any, is_dict: bool, name: str) -> None:
+    with pytest.warns(UserWarning, match=rf"cannot tell apart successive values of {name}: let the environment") as warned:
+        shown = Demonstrations.record(forward, Clock(UNIX_TIME, 1.0, kind, is_dict), 2)
+    assert len(warned) == 1 and len(shown) == 20
+    seen = UNIX_TIME + np.arange(11.0)
+    episode = {"observations": seen[:, None], "actions": np.zeros((10, 1)), "rewards": np.zeros(10)}
+    with pytest.warns(UserWarning, match="successive values of column 0"):
+        Demonstrations.from_episodes([episode], "Mine-v0")
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize(
+    ("start", "tick"),
+    [
+        (UNIX_TIME, 1000.0),  # float32 follows these steps
+        (0.0, 1e-12),
+        (1.0, 1e-12),  # the noise of a number that is constant
+        (1e6, 1e-9),
+        (UNIX_TIME, 0.0),
+        (1e3, 0.05),
+    ],
+)
+def test_features_that_float32_follows_or_that_do_not_change_are_not_named(start: float, tick: float) -> None:
+    Demonstrations.record(forward, Clock(start, tick), 1)
+    Demonstrations.record(forward, Clock(start, tick, np.float32), 1)
+
+
+def test_the_features_of_observations_of_any_form_are_named() -> None:
+    time = UNIX_TIME + np.arange(5.0)
+    assert indistinguishable_features(time) == ["column 0"]
+    assert indistinguishable_features(np.stack([time * 0, time, time], axis=1)) == ["column 1", "column 2"]
+    assert indistinguishable_features({"a": np.zeros((5, 2)), "b": {"c": np.stack([time * 0, time], axis=1)}}) == ["b/c[1]"]
+    assert indistinguishable_features(time.astype(np.float32)) == []
+    assert indistinguishable_features(time[:1]) == []
+    assert indistinguishable_features(np.arange(5, dtype=np.uint8)) == []
+
+
+@pytest.mark.parametrize(
+    "env_id", ["SparseReacher-v5", "SparseHopper-v5", "SparseSwimmer-v5", "GoalReacher-v5", "Pendulum-v1"]
+)
+def test_no_feature_of_usual_tasks_is_named(env_id: str) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        record(env_id)
 
 
 def test_an_action_out_of_bounds_is_refused_where_it_is_made() -> None:
