@@ -11,6 +11,7 @@ from gymnasium import spaces
 
 from sb3_actpc.demonstrations.dataset import DATA_FOLDER, Demonstrations, base_name
 from sb3_actpc.demonstrations.rows import box_paths, join_observations, split_observations
+from sb3_actpc.demonstrations.wrappers import check_wrapping, wrapping_of_vectorised
 from sb3_actpc.envs import SPARSE_MUJOCO_IDS, dense_env_id, sparse_env_id
 
 if TYPE_CHECKING:
@@ -84,6 +85,9 @@ def fit_demonstrations(
         raise ValueError(f"{error}: {fix}") from None
     if env is None:
         return demonstrations
+    recorded_behind = demonstrations.metadata.get("wrappers")
+    if env_id is not None or recorded_behind is not None:
+        check_wrapping(wrapping_of_vectorised(env, demonstrations.actions), recorded_behind, env_id or demonstrations.env_id)
     from stable_baselines3.common.vec_env import VecTransposeImage, unwrap_vec_wrapper  # heavy: demonstrations do without
 
     transposes = unwrap_vec_wrapper(env, VecTransposeImage)  # SB3 wraps environments of images; they were recorded without

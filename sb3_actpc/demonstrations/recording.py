@@ -18,6 +18,7 @@ from sb3_actpc.demonstrations.rows import (
     transition_columns,
     warn_of_indistinguishable,
 )
+from sb3_actpc.demonstrations.wrappers import wrapping_of
 from sb3_actpc.utils.extras import installed_version
 
 Columns = dict[str, np.ndarray]
@@ -81,6 +82,8 @@ def record_episodes(
             "(--episodes, n_episodes=), or keep those that fail too (only_successes=False)"
         )
     made_by: dict[str, Any] = {"seed": seed, "n_tries": n_tries, "deterministic": deterministic}
+    if env.spec is not None:
+        made_by["wrappers"] = list(wrapping_of(env, episodes[0]["actions"]).names)
     simulators = [name for name in ("gymnasium", "mujoco", "robosuite") if name in sys.modules]
     return _as_stored(episodes, env.observation_space), made_by | {name: installed_version(name) for name in simulators}
 

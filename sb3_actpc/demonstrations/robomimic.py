@@ -160,7 +160,7 @@ def _read_episode(group: Any, task: RobosuiteTask, obs: str, source: str) -> Col
     recorded = hdf5.read_array(group, "rewards", source, length=length) if "rewards" in group else None
     is_sparse = recorded is not None and bool(np.isin(recorded, (0.0, 1.0)).all())
     rewards = successes.astype(np.float64)
-    if recorded is not None and is_sparse and _is_trusted(recorded, successes, source):
+    if recorded is not None and is_sparse and _is_trusted(recorded, successes, "next_obs" in group, source):
         rewards = recorded
     end = int(np.argmax(rewards)) + 1 if rewards.any() else length
     columns = {
@@ -175,15 +175,16 @@ def _read_episode(group: Any, task: RobosuiteTask, obs: str, source: str) -> Col
     return {name: column[:end] for name, column in columns.items()}
 
 
-def _is_trusted(recorded: np.ndarray, successes: np.ndarray, source: str) -> bool:
-    """Whether recorded rewards (N,) of 0 and 1 are taken, not the observed successes (N,); warns when they disagree."""
+def _is_trusted(recorded: np.ndarray, successes: np.ndarray, sees_end: bool, source: str) -> bool:
+    """Whether recorded rewards (N,) of 0 and 1 are taken, not the observed successes (N,); warns when they disagree. The state
+    after the last action is not always observed (``sees_end``)."""
     first, observed = int(np.argmax(recorded)), int(np.argmax(successes))
     problem = ""
     if not recorded.any() and successes.any():
         problem = f"is 0 throughout, the object is observed in place at step {observed}: the observations are taken"
-    elif recorded.any() and not successes.any():
+    elif recorded.any() and not successes.any() and (sees_end or first < len(recorded) - 1):
         problem = "has a success, the observed object none: check the file"
-    elif abs(first - observed) > SUCCESS_LAG:
+    elif successes.any() and abs(first - observed) > SUCCESS_LAG:
         problem = f"has its first success at step {first}, the observed object at step {observed}: check the file"
     if problem:
         warnings.warn(f"{source}: key 'rewards' {problem}", stacklevel=2)

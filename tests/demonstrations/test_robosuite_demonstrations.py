@@ -268,6 +268,7 @@ def test_an_episode_ends_at_its_first_success(lift_file: Path) -> None:
     assert read.terminations.tolist() == [False] * 3 + [True] + [False] * 2 + [True] + [False, True]
 
 
+@pytest.mark.filterwarnings("error")
 def test_without_next_observations_the_last_one_follows_itself(lift_file: Path) -> None:
     remove_everywhere(lift_file, "next_obs")
     original, read = made_up(LIFT), read_robomimic(lift_file, LIFT)
