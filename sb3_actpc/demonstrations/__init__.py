@@ -1,6 +1,6 @@
-"""Demonstrations: recorded from whoever can do a task, or read from the files of this package, Minari, robomimic, robosuite.
+"""Demonstrations: recorded from any policy, or read from files of this package, Minari, robomimic and robosuite.
 
-All of it ends in the one form of :class:`Demonstrations`.
+Every source gives a :class:`Demonstrations`.
 """
 
 from sb3_actpc.demonstrations.dataset import Demonstrations, shipped_demonstrations

@@ -133,10 +133,16 @@ class Demonstrations:
         metadata: Mapping[str, Any] | None = None,
         source: str = "",
     ) -> Demonstrations:
-        """The episodes end to end, from the columns of each, by the names of ``COLUMNS``, recorded in the environment
-        ``env_id``; ``metadata`` are JSON values, ``source`` is for error messages. An episode of n actions may have n + 1
-        observations in the place of ``next_observations``; without ``terminations`` none has ended by itself; dense rewards
-        count where all have them. ValueError when there are none, or they do not fit together."""
+        """Join episodes, each a dictionary of columns named as in ``COLUMNS``.
+
+        :param episodes: columns of n rows. ``next_observations`` may be left out where ``observations`` has n + 1 rows, and
+            ``terminations`` where no episode terminated. Dense rewards are kept if all episodes have them
+        :param env_id: the environment that was recorded
+        :param metadata: JSON values
+        :param source: for error messages
+        :raises ValueError: when there are no episodes, or columns do not fit together
+        :warns UserWarning: for features of the observations that float32 cannot follow
+        """
         if metadata is not None and not isinstance(metadata, Mapping):
             raise field_error(source, "metadata", "a dictionary", repr(metadata))
         if isinstance(episodes, Mapping):
@@ -169,11 +175,11 @@ class Demonstrations:
         metadata: Mapping[str, Any] | None = None,
         **options: Any,
     ) -> Demonstrations:
-        """Let someone who can do a task show it.
+        """Record episodes of a policy.
 
-        :param demonstrator: an object with SB3's ``predict`` (a model's ``VecNormalize`` is heeded), a function from an
-            observation to an action in the environment's units, or a list of such, who take turns. One with a method
-            ``start(seed)`` is told of every new episode
+        :param demonstrator: an object with SB3's ``predict`` (a model's ``VecNormalize`` is applied), a function from an
+            observation to an action in the environment's units, or a list of such, which alternate. A method
+            ``start(seed)`` is called at every new episode
         :param env: any Gymnasium environment with Box actions and Box observations, or a Dict of such; or its id
         :param n_episodes: episodes wanted
         :param only_successes: keep only episodes that end with a true ``info["is_success"]`` (or ``"success"``); None: all but
@@ -203,12 +209,18 @@ class Demonstrations:
         observation_space: spaces.Space[Any] | None = None,
         final_reward: float | None = None,
     ) -> Demonstrations:
-        """Take over trajectories of the ``imitation`` library, or objects like them, recorded in ``env_id``: each has ``obs``
-        (n + 1 rows), ``acts`` (n rows), ``infos`` (or None), ``terminal``, and perhaps ``rews``; where it has none, the last
-        step is paid ``final_reward`` and all others 0. A last info with ``TimeLimit.truncated`` is no termination; without
-        infos (``rollout(exclude_infos=True)``, its default) an episode as long as ``env_id``'s time limit has none, with a
-        warning where no limit is known. ``dense_reward`` in every info is kept. Dict observations need the environment's
-        ``observation_space``. ValueError when something needed is missing, or does not fit together."""
+        """Convert trajectories of the ``imitation`` library. Its files are read with ``imitation.data.serialize.load``.
+
+        A last info with ``TimeLimit.truncated`` is a truncation. Without infos (imitation's default) an episode as long as
+        ``env_id``'s time limit is truncated; warns where no limit is known. ``dense_reward`` is kept if every info has it.
+
+        :param trajectories: objects with ``obs`` (n + 1 rows), ``acts`` (n rows), ``infos`` (or None), ``terminal`` and
+            perhaps ``rews``
+        :param env_id: the environment that was recorded
+        :param observation_space: of the environment; needed for Dict observations
+        :param final_reward: reward of the last step where there are no ``rews``; all others are 0
+        :raises ValueError: when something is missing, does not fit together, or is of a Discrete space
+        """
         limit = time_limit(env_id)
         if limit is None and any(one.infos is None and one.terminal for one in trajectories):
             warnings.warn(
@@ -280,7 +292,7 @@ class Demonstrations:
     def rewarded_by(self, env: VecEnv) -> Demonstrations:
         """The same transitions with the rewards that ``env`` gives for them, under its own condition and threshold, by its
         method ``demonstrated_rewards(demonstrations)``, which this package's MuJoCo tasks have; without one, or where a
-        ``gymnasium.RewardWrapper`` has the last word, as recorded."""
+        ``gymnasium.RewardWrapper`` is outermost, as recorded."""
         if not env.has_attr("demonstrated_rewards") or env.env_is_wrapped(gym.RewardWrapper, indices=[0])[0]:
             return self
         return dataclasses.replace(self, rewards=env.env_method("demonstrated_rewards", self, indices=[0])[0])
@@ -301,7 +313,7 @@ class Demonstrations:
     def from_minari(
         cls, dataset: Any, env_id: str | None = None, observation_space: spaces.Space[Any] | None = None
     ) -> Demonstrations:
-        """Take over a Minari dataset (needs the ``minari`` extra).
+        """Read a Minari dataset (needs the ``minari`` extra).
 
         Dict observations are flattened in the order of the dataset's observation space. ``rewards`` become the sparse
         rewards and ``infos["dense_reward"]``, where recorded, the dense ones.

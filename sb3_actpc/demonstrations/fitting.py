@@ -1,4 +1,4 @@
-"""Demonstrations as an environment would have shown them, and as the rows of a buffer."""
+"""Demonstrations as the agent's environment would have recorded them."""
 
 import dataclasses
 import os
@@ -54,10 +54,20 @@ def fit_demonstrations(
     n_episodes: int | None = None,
     n_transitions: int | None = None,
 ) -> Demonstrations:
-    """The demonstrations, from a source of :func:`resolve`, as an environment would have shown them: of its task, in its
-    spaces, paid as it pays (None where there is none yet); the first ``n_episodes`` alone, or ``n_transitions``, None for all.
-    Those of the dense base task of a sparse one (such as Minari's ``mujoco/hopper/expert-v0``) fit too. FileNotFoundError when
-    there is no such file, ValueError when they are damaged, fewer than asked for, or of another task."""
+    """The demonstrations as an environment would have recorded them: of its task, in its spaces, with its rewards.
+
+    Those of the dense base task of a sparse one (such as Minari's ``mujoco/hopper/expert-v0``) fit too.
+
+    :param source: of :func:`resolve`
+    :param env: None where there is none yet
+    :param observation_space: of the agent
+    :param action_space: of the agent
+    :param n_episodes: use only this many episodes, the first ones
+    :param n_transitions: use only this many transitions, the first ones
+    :raises FileNotFoundError: when there is no such file
+    :raises ValueError: for demonstrations that are damaged, too few, of another task, or recorded in other units
+    :warns UserWarning: where the agent's wrappers may change the units, see :mod:`~sb3_actpc.demonstrations.wrappers`
+    """
     has_goals = env is not None and env.has_attr("goal_demonstrations")
     demonstrations = resolve(source, None if has_goals else observation_space)  # they may be of the task without goals
     try:
@@ -69,9 +79,9 @@ def fit_demonstrations(
         from sb3_actpc.utils.tasks import task_id  # heavy: demonstrations do without
 
         env_id = task_id(env)
-        paid_id = "" if env_id is None else sparse_env_id(env_id)
-        if paid_id in SPARSE_MUJOCO_IDS and base_name(dense_env_id(paid_id)) == base_name(demonstrations.env_id):
-            sparse_id = f"Sparse{demonstrations.env_id.rpartition(':')[2]}"  # which then pays them anew
+        sparse_task = "" if env_id is None else sparse_env_id(env_id)
+        if sparse_task in SPARSE_MUJOCO_IDS and base_name(dense_env_id(sparse_task)) == base_name(demonstrations.env_id):
+            sparse_id = f"Sparse{demonstrations.env_id.rpartition(':')[2]}"  # rewarded_by gives the sparse rewards
             demonstrations = dataclasses.replace(demonstrations, env_id=sparse_id, dense_rewards=demonstrations.rewards)
         if has_goals:
             demonstrations = env.env_method("goal_demonstrations", demonstrations, indices=[0])[0]
@@ -81,7 +91,7 @@ def fit_demonstrations(
         fix = "record them in this environment, wrapped as it is here (Demonstrations.record)"
         is_named_otherwise = env_id is not None and base_name(env_id) != base_name(demonstrations.env_id)
         if is_named_otherwise and _fits(demonstrations, observation_space, action_space):
-            fix += f", or say that it is this one: dataclasses.replace(demonstrations, env_id={env_id!r})"
+            fix += f", or rename them: dataclasses.replace(demonstrations, env_id={env_id!r})"
         raise ValueError(f"{error}: {fix}") from None
     if env is None:
         return demonstrations
@@ -99,7 +109,7 @@ def fit_demonstrations(
 
 
 def _channels_first(rows: np.ndarray, env: "VecTransposeImage") -> np.ndarray:
-    """(N, flat size), as the wrapper shows them, of rows as its inner environment does."""
+    """Rows (N, flat size) of the inner environment in the wrapper's order of channels."""
     observations = env.transpose_observations(split_observations(env.venv.observation_space, rows))
     return join_observations(observations, box_paths(env.observation_space))
 
@@ -111,7 +121,7 @@ def scaled_actions(demonstrations: Demonstrations, action_space: spaces.Box) -> 
 
 
 def _fits(demonstrations: Demonstrations, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> bool:
-    """Whether demonstrations, of whatever environment, have these spaces."""
+    """Whether demonstrations have these spaces, whatever their environment's id is."""
     try:
         demonstrations.check(observation_space, action_space)
     except ValueError:

@@ -82,8 +82,8 @@ def read_array(group: Any, key: str, source: str, size: int | None = None, lengt
     if values.dtype.kind not in "biuf":
         raise ValueError(f"{source}: key {key!r} must hold numbers, found type {values.dtype}")
     columns = () if size is None else (size,)
-    wanted = (max(1, len(values)) if length is None else length, *columns) if values.ndim else None
-    if values.shape != wanted:
+    expected = (max(1, len(values)) if length is None else length, *columns) if values.ndim else None
+    if values.shape != expected:
         shape = ", ".join(str(n) for n in ("N" if length is None else length, *columns))
         raise ValueError(f"{source}: key {key!r} must have the shape ({shape}), found {values.shape}")
     bad = np.argwhere(~np.isfinite(values))
@@ -121,7 +121,7 @@ def check_recorded_task(recorded: dict[str, Any], name: str, source: str) -> Non
         # absolute poses are not what the environment takes
         "input_type": arm.get("input_type", "delta" if arm.get("control_delta", True) else "absolute"),
     }
-    wanted = {"env_name": name, "robots": "Panda", "controller": "OSC_POSE", "control_freq": 20, "input_type": "delta"}
-    for key, value in wanted.items():
+    expected = {"env_name": name, "robots": "Panda", "controller": "OSC_POSE", "control_freq": 20, "input_type": "delta"}
+    for key, value in expected.items():
         if found[key] != value:
             raise ValueError(f"{source}: expected demonstrations with {key} = {value!r}, found {found[key]!r}: another task")

@@ -1,4 +1,4 @@
-"""Playing a task with whoever can do it: trained agents, scripted demonstrators, plain functions."""
+"""Recording episodes of trained agents, scripted demonstrators and plain functions."""
 
 import sys
 import warnings
@@ -42,7 +42,7 @@ def record_episodes(
 ) -> tuple[list[Columns], dict[str, Any]]:
     """Play until enough episodes are kept.
 
-    :param demonstrators: as of ``Demonstrations.record``; episode i is by number ``i % len(demonstrators)``, who tries again
+    :param demonstrators: as of ``Demonstrations.record``; number ``i % len(demonstrators)`` records episode i, and tries again
         after a failure
     :param deterministic: of ``predict``; False samples the actions of a stochastic policy, from SB3's generators
     :param seed: try number i is reset with the seed ``seed + i``
@@ -165,20 +165,20 @@ def _play(act: Callable[[Any, bool], np.ndarray], env: gym.Env[Any, Any], seed: 
                 "the demonstrator gives a tuple: return the action alone, or give the agent itself, not its predict"
             )
         if np.shape(action) != env.action_space.shape:
-            wanted = f"{env_name(env)} takes {env.action_space.shape}: return an array of that shape"
-            raise ValueError(f"the demonstrator gives an action of shape {np.shape(action)}, {wanted}")
-        shown = np.array(action).ravel()  # a copy: environment and demonstrator may write on theirs
-        if isinstance(env.action_space, spaces.Box) and outside_bounds(shown, env.action_space).any():
-            wanted = f"{env_name(env)} takes {env.action_space}: clip it (numpy.clip)"
-            raise ValueError(f"the demonstrator gives the action {shown} at step {len(rows)}, {wanted}")
+            expected = f"{env_name(env)} takes {env.action_space.shape}: return an array of that shape"
+            raise ValueError(f"the demonstrator gives an action of shape {np.shape(action)}, {expected}")
+        row_action = np.array(action).ravel()  # a copy: environment and demonstrator may write on theirs
+        if isinstance(env.action_space, spaces.Box) and outside_bounds(row_action, env.action_space).any():
+            expected = f"{env_name(env)} takes {env.action_space}: clip it (numpy.clip)"
+            raise ValueError(f"the demonstrator gives the action {row_action} at step {len(rows)}, {expected}")
         observation, reward, terminated, truncated, info = env.step(action)
         next_row = flatten_observation(env.observation_space, observation)
-        rows.append((row, next_row, shown, reward, terminated, info.get("dense_reward", reward)))
+        rows.append((row, next_row, row_action, reward, terminated, info.get("dense_reward", reward)))
         row, done = next_row, terminated or truncated
         if len(rows) == ENDLESS:
             warnings.warn(
-                f"an episode of {env_name(env)} has gone on for {ENDLESS} steps and is recorded to its end: where it has "
-                "none, give it one with gymnasium.wrappers.TimeLimit",
+                f"an episode of {env_name(env)} has gone on for {ENDLESS} steps and is recorded to its end: if it never ends, "
+                "limit it with gymnasium.wrappers.TimeLimit",
                 stacklevel=2,
             )
     names = ("observations", "next_observations", "actions", "rewards", "terminations", "dense_rewards")

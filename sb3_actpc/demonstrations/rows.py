@@ -101,9 +101,9 @@ def outside_bounds(actions: Any, space: spaces.Box) -> np.ndarray:
     """Which numbers of actions (..., action_dim) lie outside the bounds, by more than ``ACTION_TOLERANCE`` and what float32
     rounds away; shaped as they are."""
     low, high = (bound.ravel().astype(np.float64) for bound in (space.low, space.high))
-    room_low, room_high = (ACTION_TOLERANCE + np.finfo(np.float32).eps * np.abs(bound) for bound in (low, high))
+    slack_low, slack_high = (ACTION_TOLERANCE + np.finfo(np.float32).eps * np.abs(bound) for bound in (low, high))
     values = np.asarray(actions, dtype=np.float64)
-    return (values < low - room_low) | (values > high + room_high)
+    return (values < low - slack_low) | (values > high + slack_high)
 
 
 def split_observations(space: spaces.Space[Any], rows: np.ndarray) -> Any:
@@ -169,18 +169,18 @@ def whole_columns(episode: Mapping[str, Any], known: Sequence[str], source: str)
 
 def _array(column: Any, name: str, source: str) -> np.ndarray:
     """A column as an array with a row for each step."""
-    wanted = "an array with a row for each step"
+    expected = "an array with a row for each step"
     if isinstance(column, Mapping) or (isinstance(column, list | tuple) and column and isinstance(column[0], Mapping)):
         flatten = "np.array([gymnasium.spaces.flatten(space, one) for one in ...])"
-        raise field_error(source, name, wanted, f"dictionaries: flatten them, as {flatten}")
+        raise field_error(source, name, expected, f"dictionaries: flatten them, as {flatten}")
     if isinstance(column, np.ma.MaskedArray):
-        raise field_error(source, name, wanted, "a masked array, of which nobody knows what the masked rows are: fill them")
+        raise field_error(source, name, expected, "a masked array: fill its masked rows")
     try:
         rows = np.asarray(column)
     except ValueError as error:
         raise field_error(source, name, "rows of one size", " ".join(str(error).split())) from None
     if not rows.ndim:
-        raise field_error(source, name, wanted, f"{column!r}")
+        raise field_error(source, name, expected, f"{column!r}")
     return rows
 
 

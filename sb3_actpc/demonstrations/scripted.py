@@ -49,12 +49,12 @@ class View:
 
 
 class ScriptedDemonstrator:
-    """Reaches over the object, descends, grasps, lifts, and for the can carries and lets go; starts anew when it has lost it.
+    """Moves over the object, descends, grasps and lifts; carries and releases the can. Starts again when it loses the object.
 
     :param env_id: ``SparseLift-v0`` or ``SparsePickPlaceCan-v0``
     :param obs: the environment's ``obs``, ``"paper"`` or ``"robomimic"``
-    :param proficiency: 1 is quick and sure, 0 slow, trembling, pausing, roundabout and apt to miss
-    :param seed: seed of the demonstrator's habits and, with the episode's, of its noise
+    :param proficiency: 1 is fast and accurate; 0 is slow and noisy, with pauses, detours and missed grasps
+    :param seed: of the demonstrator's heights and, with the episode's seed, of its noise
     :raises ValueError: when an argument is not allowed
     """
 
@@ -72,9 +72,9 @@ class ScriptedDemonstrator:
         self.tolerance = 0.01 + 0.015 * clumsiness  # metres from the place aimed at, within which the fingers go down
         self._layout = self.task.layout(obs)
         self._object_columns = self.task.object_columns()
-        habits = np.random.default_rng([seed, 0])
-        self._hover_height = habits.uniform(0.06, 0.12)
-        self._lift_height = habits.uniform(0.1, 0.2)
+        heights = np.random.default_rng([seed, 0])
+        self._hover_height = heights.uniform(0.06, 0.12)
+        self._lift_height = heights.uniform(0.1, 0.2)
         self._stages = ["reach", "descend", "grasp", "lift"]
         self._stages += ["carry", "lower", "release"] if self.task.name == "PickPlaceCan" else []
         self.start(0)
@@ -221,7 +221,7 @@ def collect_scripted(
     """Record successful episodes of scripted demonstrators.
 
     :param env_id: ``SparseLift-v0`` or ``SparsePickPlaceCan-v0``
-    :param proficiency: in [0, 1], or ``"mixed"`` for the six of ``MIXED_DEMONSTRATORS``, who take turns
+    :param proficiency: in [0, 1], or ``"mixed"`` for the six of ``MIXED_DEMONSTRATORS``, which alternate
     :param n_episodes: successful episodes wanted
     :param seed: of the demonstrators and of the episodes
     :param obs: the environment's ``obs``

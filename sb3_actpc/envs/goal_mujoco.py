@@ -3,7 +3,7 @@
 Observations are dictionaries of ``observation``, ``achieved_goal`` and ``desired_goal``. The Reacher's goals are positions
 of its fingertip; what it observes of the target is in ``desired_goal`` alone, or a relabelled transition would still show the
 old one. The locomotion tasks have no goal of their own (the paper says so of HER): here it is the distance at which the
-``"displacement"`` condition begins to pay, and what is achieved is the distance from the start.
+``"displacement"`` condition gives a reward, and what is achieved is the distance from the start.
 """
 
 from __future__ import annotations
@@ -53,9 +53,9 @@ class GoalTask(gym.ObservationWrapper[Any, np.ndarray, Any]):
         return demonstrations.rewards
 
     def goal_demonstrations(self, demonstrations: Demonstrations) -> Demonstrations:
-        """Recorded transitions of the sparse task as transitions of this one, each observation the flattened dictionary, paid
-        by :meth:`compute_reward`; those of this one, and of others, as they are. ValueError when the recording does not tell
-        what was achieved."""
+        """Recorded transitions of the sparse task as transitions of this one: flattened dictionaries, with the rewards of
+        :meth:`compute_reward`. Demonstrations of this task, and of others, are returned as they are. ValueError when the
+        recording lacks what was achieved."""
         spec = self.spec
         env_id = demonstrations.env_id if spec is None else spec.id
         recorded, own = (name.rpartition(":")[2].rpartition("-v")[0] for name in (demonstrations.env_id, env_id))
@@ -102,7 +102,7 @@ class GoalReacher(GoalTask):
 
 
 class GoalLocomotion(GoalTask):
-    """A goal is a distance from the start along x, in metres, (1,): reached, and paid, at or beyond it. It is the threshold of
+    """A goal is a distance from the start along x, in metres, (1,): reached at or beyond it. It is the threshold of
     a sparse locomotion task with the ``"displacement"`` condition; ValueError for another condition."""
 
     def __init__(self, env: gym.Env[np.ndarray, np.ndarray]) -> None:

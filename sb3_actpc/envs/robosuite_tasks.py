@@ -247,8 +247,8 @@ class SparsePickPlaceCanEnv(SparseRobosuiteEnv):
 
 def make_simulation(name: str, **kwargs: Any) -> Any:
     """A robosuite environment of the Panda with soft resets, shaped rewards and neither renderer nor time limit; ``name``
-    is robosuite's, ``kwargs`` are its keywords, in the place of ours. robosuite's own observations are off, unless
-    ``use_object_obs`` is asked for: ours are read from the simulation."""
+    is robosuite's, ``kwargs`` are its keywords and replace ours. robosuite's own observations are off, unless
+    ``use_object_obs`` is true: ours are read from the simulation."""
     with _quiet_import():
         robosuite = import_extra("robosuite", "robosuite")
         settings = dict(

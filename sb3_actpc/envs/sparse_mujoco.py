@@ -1,8 +1,8 @@
 """Gymnasium's MuJoCo tasks with sparse rewards.
 
-The tasks are those of Ororbia & Mali (arXiv 2209.09174). The Reacher is paid near its target. The locomotion tasks have
-two conditions: ``"displacement"``, the published benchmark of LOGO (Rengarajan et al., arXiv 2202.04628), which pays for
-having travelled a distance, and ``"forward"``, the wording of the paper's appendix, which pays for moving forward fast enough.
+The tasks are those of Ororbia & Mali (arXiv 2209.09174). The Reacher's reward is 1 near its target. The locomotion tasks
+have two conditions. ``"displacement"``, the published benchmark of LOGO (Rengarajan et al., arXiv 2202.04628), rewards a
+distance travelled. ``"forward"``, the wording of the paper's appendix, rewards a forward velocity.
 
 The position along x is not observed, so the reward of ``"displacement"`` is no function of the observation; the reward of
 ``"forward"`` nearly is.
@@ -59,7 +59,7 @@ class _SparseMujocoEnv(MujocoEnv, utils.EzPickle):
 
     def demonstrated_rewards(self, demonstrations: Demonstrations) -> np.ndarray:
         """The rewards that this environment, with its own condition and threshold, gives for N recorded transitions of the
-        same task, under any condition: (N,) float32; the recorded ones where the recording does not tell."""
+        same task, under any condition: (N,) float32; the recorded ones where they cannot be computed."""
         raise NotImplementedError
 
     def demonstrated_positions(self, demonstrations: Demonstrations) -> np.ndarray:
@@ -74,9 +74,9 @@ class _SparseMujocoEnv(MujocoEnv, utils.EzPickle):
 class SparseReacherEnv(_SparseMujocoEnv):
     """Reward 1 while the fingertip is near the target.
 
-    ``info["is_success"]`` is whether the present step is paid, so at the end of an episode, whether its last step was.
+    ``info["is_success"]`` is whether the present step has reward 1, so at the end of an episode, whether its last step had.
 
-    :param threshold: distance in metres at or below which a step is paid, None for 0.06
+    :param threshold: distance in metres at or below which the reward is 1, None for 0.06
     :param miss_reward: reward of every other step, 0 by default; baselines are often given -1
     :param kwargs: the base task's keywords
     :raises ValueError: for a threshold that is not positive and finite, a ``miss_reward`` that is not a finite number
@@ -120,12 +120,12 @@ class SparseLocomotionEnv(_SparseMujocoEnv):
     """Reward 1 for having come far enough, or for moving forward fast enough, else 0.
 
     ``info["is_success"]`` is whether the distance of the ``"displacement"`` condition has been passed in this episode,
-    whichever condition pays.
+    under either condition.
 
-    :param condition: ``"displacement"`` pays every step at which x - x_0 exceeds the threshold, x_0 being x after the
-        reset; ``"forward"`` pays every step whose mean forward velocity exceeds it
+    :param condition: ``"displacement"`` rewards every step at which x - x_0 exceeds the threshold, x_0 being x after
+        the reset; ``"forward"`` rewards every step whose mean forward velocity exceeds it
     :param threshold: metres or metres per second, None for the task's own ``default_distance`` or ``default_velocity``;
-        with ``"forward"`` it may be 0: any forward motion is paid, the paper's wording for Walker2d, Hopper and Swimmer
+        with ``"forward"`` it may be 0: any forward motion is rewarded, the paper's wording for Walker2d, Hopper and Swimmer
     :param kwargs: the base task's keywords
     :raises ValueError: for an unknown condition, a threshold that is not positive and finite, or a ``miss_reward``
     """
@@ -141,7 +141,7 @@ class SparseLocomotionEnv(_SparseMujocoEnv):
             raise ValueError(f"condition={condition!r} is not one of {LOCOMOTION_CONDITIONS}: choose one of these")
         if "miss_reward" in kwargs:
             raise ValueError(
-                f"miss_reward={kwargs['miss_reward']!r} is not allowed here, an unpaid step of a locomotion task gives 0: "
+                f"miss_reward={kwargs['miss_reward']!r} is not allowed here, other steps of a locomotion task give 0: "
                 "leave it out, it is a keyword of the Reacher"
             )
         self.condition = condition
@@ -204,8 +204,8 @@ class SparseLocomotionEnv(_SparseMujocoEnv):
     def _sparse_reward(self, info: dict[str, Any]) -> tuple[float, bool]:
         is_far = bool(self.data.qpos[0] - self._start_x > self.distance)
         self._has_passed = self._has_passed or is_far
-        is_paid = is_far if self.condition == "displacement" else bool(info["x_velocity"] > self.velocity)
-        return float(is_paid), self._has_passed
+        is_rewarded = is_far if self.condition == "displacement" else bool(info["x_velocity"] > self.velocity)
+        return float(is_rewarded), self._has_passed
 
 
 _REWARD_WEIGHTS = ("forward_reward_weight", "ctrl_cost_weight", "healthy_reward")
@@ -216,13 +216,13 @@ def _velocities(
 ) -> np.ndarray:
     assert demonstrations.dense_rewards is not None
     costs = ctrl_cost_weight * np.square(demonstrations.actions, dtype=np.float64).sum(axis=1)
-    # -v4 pays health also on the step that falls
+    # -v4 rewards health also on the step that falls
     healthy = healthy_reward * ~(demonstrations.terminations & demonstrations.env_id.endswith("v5"))
     return (demonstrations.dense_rewards + costs - healthy) / forward_reward_weight
 
 
 # metres, of LOGO's benchmark, and metres per second, our choice: the paper gives none. Of the steps of uniformly random
-# actions (10 episodes of -v5) the latter pays 0 % (HalfCheetah, Walker2d), 4 % (Hopper) and 18 % (Swimmer, which swings)
+# actions (10 episodes of -v5) the latter rewards 0 % (HalfCheetah, Walker2d), 4 % (Hopper) and 18 % (Swimmer, which swings)
 _DISTANCES = {"HalfCheetah": 20.0, "Walker2d": 2.0, "Hopper": 2.0, "Swimmer": 1.0}
 _VELOCITIES = {"HalfCheetah": 3.5, "Walker2d": 1.0, "Hopper": 1.0, "Swimmer": 0.3}
 
