@@ -211,8 +211,9 @@ class Demonstrations:
     ) -> Demonstrations:
         """Convert trajectories of the ``imitation`` library. Its files are read with ``imitation.data.serialize.load``.
 
-        A last info with ``TimeLimit.truncated`` is a truncation. Without infos (imitation's default) an episode as long as
-        ``env_id``'s time limit is truncated; warns where no limit is known. ``dense_reward`` is kept if every info has it.
+        A true ``TimeLimit.truncated`` in the last info is a truncation. Where it is missing, or there are no infos, an episode
+        as long as ``env_id``'s time limit is truncated; warns where no limit is known and there are no infos (imitation's
+        default). ``dense_reward`` is kept if every info has it.
 
         :param trajectories: objects with ``obs`` (n + 1 rows), ``acts`` (n rows), ``infos`` (or None), ``terminal`` and
             perhaps ``rews``

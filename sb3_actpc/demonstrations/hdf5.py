@@ -12,6 +12,13 @@ import numpy as np
 
 from sb3_actpc.utils.extras import import_extra
 
+# of robosuite's OSC_POSE: an action of 1 moves the gripper by 5 cm, or turns it by 0.5 rad
+ACTION_SCALES = {
+    "input_max": 1.0,
+    "input_min": -1.0,
+    "output_max": [0.05, 0.05, 0.05, 0.5, 0.5, 0.5],
+    "output_min": [-0.05, -0.05, -0.05, -0.5, -0.5, -0.5],
+}
 # what h5py raises on bytes that are not there, or not HDF5's
 _READ_ERRORS = (OSError, RuntimeError, KeyError, ValueError, TypeError)
 
@@ -107,8 +114,8 @@ def read_json_attribute(data: Any, name: str, source: str) -> dict[str, Any]:
 
 
 def check_recorded_task(recorded: dict[str, Any], name: str, source: str) -> None:
-    """Check the task (robosuite's ``name``), robot and controller among robosuite's recorded keywords; ValueError names the
-    first one that differs."""
+    """Check the task (robosuite's ``name``), robot, controller and the units of its actions among robosuite's recorded
+    keywords; ValueError names the first one that differs."""
     robots = recorded.get("robots", "Panda")
     controller = recorded.get("controller_configs") or {}
     parts = controller.get("body_parts", {})
@@ -125,3 +132,14 @@ def check_recorded_task(recorded: dict[str, Any], name: str, source: str) -> Non
     for key, value in expected.items():
         if found[key] != value:
             raise ValueError(f"{source}: expected demonstrations with {key} = {value!r}, found {found[key]!r}: another task")
+    for key, value in ACTION_SCALES.items():
+        if key in arm and not _is_near(arm[key], value):
+            raise ValueError(f"{source}: expected actions with {key} = {value}, found {arm[key]!r}: actions of other units")
+
+
+def _is_near(found: Any, expected: Any) -> bool:
+    """Whether a number, or a list of six, is this one."""
+    try:
+        return bool(np.allclose(np.asarray(found, dtype=np.float64), expected))
+    except (TypeError, ValueError):
+        return False

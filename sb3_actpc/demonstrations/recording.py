@@ -53,8 +53,8 @@ def record_episodes(
 
     For the other parameters see ``Demonstrations.record``.
     """
-    if n_episodes < 1:
-        raise ValueError(f"n_episodes={n_episodes} must be at least 1: give the number of demonstrated episodes")
+    if isinstance(n_episodes, bool) or not isinstance(n_episodes, int | np.integer) or n_episodes < 1:
+        raise ValueError(f"n_episodes={n_episodes} must be at least 1, a whole number: give the number of episodes")
     if not isinstance(env.action_space, spaces.Box):
         raise ValueError(f"demonstrations need a Box action space, found {env.action_space}")
     box_paths(env.observation_space)
@@ -115,15 +115,18 @@ def trajectory_columns(
             f"trajectories need Box observations, found obs of shape {np.shape(observations)}, as of a Discrete space"
         )
     rows = join_observations(observations, [[]] if observation_space is None else box_paths(observation_space))
-    columns, n_steps = transition_columns(rows, trajectory.acts, "a trajectory"), len(trajectory.acts)
-    infos = [info or {} for info in trajectory.infos] if trajectory.infos is not None else [{}] * n_steps
+    n_steps = len(trajectory.acts)
+    infos = [{}] * n_steps if trajectory.infos is None else [info or {} for info in trajectory.infos]
+    if n_steps < 1 or len(infos) != n_steps:
+        raise ValueError(f"trajectories need at least 1 action and an info of each, found {n_steps} acts, {len(infos)} infos")
+    columns = transition_columns(rows, trajectory.acts, "a trajectory")
     rewards = getattr(trajectory, "rews", None)
     if rewards is None:
         if final_reward is None:
             raise ValueError("trajectories without rews need final_reward, the reward of each one's last step (1.0, say)")
         rewards = np.append(np.zeros(n_steps - 1), final_reward)
     columns |= {"rewards": np.asarray(rewards), "terminations": np.zeros(n_steps, dtype=bool)}
-    was_cut = n_steps == limit if trajectory.infos is None else infos[-1].get("TimeLimit.truncated", False)
+    was_cut = infos[-1].get("TimeLimit.truncated", n_steps == limit)  # Stable-Baselines3 writes it, Gymnasium does not
     columns["terminations"][-1] = trajectory.terminal and not was_cut
     if all("dense_reward" in info for info in infos):
         columns["dense_rewards"] = np.array([info["dense_reward"] for info in infos])
@@ -173,6 +176,9 @@ def _play(act: Callable[[Any, bool], np.ndarray], env: gym.Env[Any, Any], seed: 
             raise ValueError(f"the demonstrator gives the action {row_action} at step {len(rows)}, {expected}")
         observation, reward, terminated, truncated, info = env.step(action)
         next_row = flatten_observation(env.observation_space, observation)
+        if next_row.shape != row.shape:
+            sizes = f"{next_row.size} values at step {len(rows) + 1}, after {row.size} before"
+            raise ValueError(f"{env_name(env)} gives an observation of {sizes}: it must keep to its observation_space")
         rows.append((row, next_row, row_action, reward, terminated, info.get("dense_reward", reward)))
         row, done = next_row, terminated or truncated
         if len(rows) == ENDLESS:

@@ -234,8 +234,8 @@ def _object_states(
 
 
 def _env_args(task: RobosuiteTask) -> dict[str, Any]:
-    arm = {"type": "OSC_POSE", "input_max": 1, "input_min": -1, "input_type": "delta", "input_ref_frame": "base"}
-    arm |= {"output_max": [0.05] * 3 + [0.5] * 3, "output_min": [-0.05] * 3 + [-0.5] * 3, "kp": 150, "damping_ratio": 1}
+    arm: dict[str, Any] = {"type": "OSC_POSE", "input_type": "delta", "input_ref_frame": "base"}
+    arm |= {**hdf5.ACTION_SCALES, "kp": 150, "damping_ratio": 1}
     arm |= {"impedance_mode": "fixed", "kp_limits": [0, 300], "damping_ratio_limits": [0, 10], "gripper": {"type": "GRIP"}}
     controller = {"type": "BASIC", "body_parts": {"right": {**arm, "uncouple_pos_ori": True, "ramp_ratio": 0.2}}}
     kwargs = {"robots": ["Panda"], "controller_configs": controller, "control_freq": 20, "reward_shaping": False}

@@ -153,6 +153,15 @@ def test_rows_are_copies_of_what_environment_and_demonstrator_write_on() -> None
     assert shown.actions.ravel().tolist() == [0, 0.25, 0.5, 0.75]
 
 
+def test_an_observation_of_another_size_is_named_with_its_step() -> None:
+    class Grows(Corridor):
+        def observe(self) -> Any:
+            return np.zeros(2 + (self.t == 3), np.float32)
+
+    with pytest.raises(ValueError, match="Grows gives an observation of 3 values at step 3, after 2 before"):
+        Demonstrations.record(forward, Grows(), 1)
+
+
 class Clock(gym.Env[Any, Any]):
     """Observes the time, from ``start`` in steps of ``tick``, in the precision of ``kind``, and a constant."""
 
@@ -288,6 +297,8 @@ def test_sampled_actions_differ_and_deterministic_ones_do_not() -> None:
     [
         ({"demonstrator": 3}, "3 must have SB3's predict, or be a function"),
         ({"n_episodes": 0}, "n_episodes=0 must be at least 1"),
+        ({"n_episodes": 1.5}, "n_episodes=1.5 must be at least 1, a whole number"),
+        ({"n_episodes": True}, "n_episodes=True must be at least 1, a whole number"),
         ({"demonstrator": []}, r"demonstrator=\[\] must be at least one"),
         ({"env": "CartPole-v1"}, "Box action space, found Discrete"),
         ({"env": 3}, "env must be a Gymnasium environment or the id of one, found 3"),
@@ -367,6 +378,18 @@ class TestTrajectories:
         assert shown.terminations[[49, 98]].tolist() == [False, True]
         with pytest.warns(UserWarning, match="of Named-v0, whose time limit is not known.*exclude_infos=False"):
             assert Demonstrations.from_trajectories(told, "Named-v0").terminations[[49, 98]].all()
+
+    def test_infos_without_the_time_limits_key_are_judged_by_the_length(self) -> None:
+        """Gymnasium's TimeLimit does not write it; Stable-Baselines3 does."""
+        for info, terminates in (({}, False), ({"TimeLimit.truncated": False}, True), ({"TimeLimit.truncated": True}, False)):
+            whole = Trajectory(np.zeros((51, 10)), np.zeros((50, 2)), [{}] * 49 + [info], True, np.zeros(50))
+            assert Demonstrations.from_trajectories([whole], "Reacher-v5").terminations[-1] == terminates
+
+    @pytest.mark.parametrize(("n", "infos"), [(3, [{}] * 2), (3, []), (0, [])])
+    def test_infos_of_another_number_and_no_steps_are_refused(self, n: int, infos: list[dict[str, Any]]) -> None:
+        short = Trajectory(np.zeros((n + 1, 2)), np.zeros((n, 1)), infos, True, np.zeros(n))
+        with pytest.raises(ValueError, match=rf"at least 1 action and an info of each, found {n} acts, {len(infos)} infos"):
+            Demonstrations.from_trajectories([short], "Named-v0")
 
     @pytest.mark.filterwarnings("error")
     def test_a_fragment_does_not_terminate(self) -> None:

@@ -292,11 +292,25 @@ def with_old_controller(file: h5py.File) -> None:
     file["data"].attrs["env_args"] = json.dumps(arguments)
 
 
+def with_other_units(file: h5py.File) -> None:
+    arguments = json.loads(file["data"].attrs["env_args"])
+    arguments["env_kwargs"]["controller_configs"]["body_parts"]["right"]["output_max"] = 0.1
+    file["data"].attrs["env_args"] = json.dumps(arguments)
+
+
+def with_old_units(file: h5py.File) -> None:
+    arguments = json.loads(file["data"].attrs["env_args"])
+    arguments["env_kwargs"]["controller_configs"] = {"type": "OSC_POSE", "output_min": [-0.1] * 6}
+    file["data"].attrs["env_args"] = json.dumps(arguments)
+
+
 BAD_FILES: dict[str, tuple[Callable[[h5py.File], object], str]] = {
     "no env_args": (lambda f: f["data"].attrs.pop("env_args"), r"attribute 'env_args' of 'data' is missing"),
     "env_args": (lambda f: f["data"].attrs.__setitem__("env_args", "{"), r"attribute 'env_args' of 'data' is not JSON"),
     "robot": (with_another_arm, r"expected demonstrations with robots = 'Panda', found 'Sawyer'"),
     "controller": (with_old_controller, r"controller = 'OSC_POSE', found 'JOINT_VELOCITY'"),
+    "units": (with_other_units, r"expected actions with output_max = .*, found 0.1: actions of other units"),
+    "units of robosuite 1.4": (with_old_units, r"expected actions with output_min = .*, found \[-0.1"),
     "no data": (lambda f: f.pop("data"), r"expected a group 'data'"),
     "no demos": (lambda f: [f["data"].pop(name) for name in list(f["data"])], r"expected demonstrations data/demo_0"),
     "actions missing": (lambda f: f["data/demo_1"].pop("actions"), r"demo_1: key 'actions' is missing"),
