@@ -95,7 +95,9 @@ def fit_demonstrations(
         raise ValueError(f"{error}: {fix}") from None
     if env is None:
         return demonstrations
-    recorded_behind = demonstrations.metadata.get("wrappers")
+    # sb3-actpc demos collect makes the environment by its id
+    is_collected = str(demonstrations.metadata.get("command", "")).startswith("sb3-actpc demos collect")
+    recorded_behind = demonstrations.metadata.get("wrappers", [] if is_collected else None)
     if env_id is not None or recorded_behind is not None:
         check_wrapping(wrapping_of_vectorised(env, demonstrations.actions), recorded_behind, env_id or demonstrations.env_id)
     from stable_baselines3.common.vec_env import VecTransposeImage, unwrap_vec_wrapper  # heavy: demonstrations do without

@@ -247,3 +247,8 @@ def test_every_algorithm_refuses_them(kind: Any) -> None:
 def test_the_packages_demonstrations_fit_its_tasks(env_id: str) -> None:
     shown = Demonstrations.load(shipped_demonstrations(env_id.replace("Goal", "Sparse"))).select(1)
     fitted(shown, env_id, Monitor)
+
+
+def test_the_packages_demonstrations_are_known_to_be_recorded_behind_no_wrapper() -> None:
+    with pytest.raises(ValueError, match="recorded behind no wrapper, the agent learns behind TransformObservation"):
+        fitted(Demonstrations.load(shipped_demonstrations("SparseReacher-v5")), "SparseReacher-v5", scaled)
