@@ -85,7 +85,7 @@ def test_the_agent_and_the_demonstrations_of_the_readme_can_be_made(tmp_path: Pa
     for block in (recorded, made):
         names: dict[str, Any] = {"policy": lambda observation: np.zeros(1)}
         exec(block, names)
-        ActPC("MlpPolicy", "Pendulum-v1", demonstrations=names["shown"])
+        ActPC("MlpPolicy", "Pendulum-v1", demonstrations=names["recorded"])
     assert Demonstrations.load("mine.npz").n_episodes == 20
 
 

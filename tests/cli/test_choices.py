@@ -77,12 +77,12 @@ def test_public_names_are_completed() -> None:
 
 @pytest.mark.parametrize(
     ("kind", "found"),
-    [("tasks", "SparseHopper-v5"), ("algos", "td3"), ("variants", "refresh_alone  "), ("demos", "20 episodes")],
+    [("tasks", "SparseHopper-v5"), ("algos", "td3"), ("variants", "no_guidance  "), ("demos", "20 episodes")],
 )
 def test_what_there_is_can_be_listed(kind: str, found: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["list", kind]) == 0
     assert found in (listed := capsys.readouterr().out)
-    assert ("refresh_alone" in listed) == (kind == "variants")
+    assert ("no_guidance" in listed) == (kind == "variants")
 
 
 @pytest.mark.filterwarnings("ignore:.*is set to None:UserWarning", "ignore:env_spec is None:UserWarning")

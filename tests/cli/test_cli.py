@@ -89,7 +89,7 @@ def test_a_run_says_when_nothing_is_shipped_for_its_environment(
 
 def test_a_comparison_says_so_too_of_algorithms_that_would_imitate(capsys: pytest.CaptureFixture[str]) -> None:
     tasks = ("--envs", "Pendulum-v1", "SparseHopper-v5", "--seeds", "2", "--dry-run")
-    assert main(["compare", "--algos", "actpc", "refresh_alone", *tasks]) == 0
+    assert main(["compare", "--algos", "actpc", "no_guidance", *tasks]) == 0
     assert capsys.readouterr().out.count("no demonstrations are shipped") == 1
     assert main(["compare", "--algos", "ppo", *tasks]) == 0
     assert "no demonstrations" not in capsys.readouterr().out
