@@ -895,9 +895,11 @@ class ActPC(StoresLastTransition):
         n_drawn = n_newest + n_batches * (n_replayed - n_newest)
         samples = self.replay_buffer.sample(n_drawn, self._vec_normalize_env, signals, n_newest)
         replayed = inputs.replayed(samples, weights, self.gamma)
-        internal = replayed.rewards - weights[0] * samples.rewards
-        if len(internal):
-            self.diagnostics.follow(internal_reward=internal.mean, task_reward=samples.rewards.mean)
+        # one of these updates may be measured, whose number is known though it has not begun
+        updates = range(self._n_updates + 1, self._n_updates + 1 + n_batches)
+        if len(samples.rewards) and any(self.diagnostics.is_due(update, self.policy_delay) for update in updates):
+            internal = replayed.rewards - weights[0] * samples.rewards
+            self.diagnostics.follow(internal_reward=float(internal.mean()), task_reward=float(samples.rewards.mean()))
         demonstrated = None
         if n_expert and self.expert is not None:
             demonstrated = self.expert.sample(n_expert * n_batches, inputs, weights, self.gamma, self.n_steps, signals)

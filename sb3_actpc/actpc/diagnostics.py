@@ -21,14 +21,18 @@ class Diagnostics:
         self.active = False
         self.values: dict[str, float] = {}
 
+    def is_due(self, n_updates: int, delay: int = 1) -> bool:
+        """Whether the update with this number, from 1 on, is measured."""
+        interval = delay * -(-INTERVAL // delay)
+        return n_updates % interval == delay % interval
+
     def begin_update(self, n_updates: int, step: int, delay: int = 1) -> None:
         """Decide whether this update, by its number from 1 on, is measured, and if so check all synapses. The actor, which
         has one update in ``delay``, takes part in every one that is measured.
 
         :raises ValueError: naming the circuit and the environment step when a synapse is not finite
         """
-        interval = delay * -(-INTERVAL // delay)
-        self.active = n_updates % interval == delay % interval
+        self.active = self.is_due(n_updates, delay)
         if not self.active:
             return
         for name, circuit in self.circuits.items():

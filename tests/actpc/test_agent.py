@@ -464,9 +464,7 @@ def test_every_circuit_learns_from_as_many_rows_as_train_was_asked_for(monkeypat
 def test_an_unknown_keyword_is_answered_with_the_nearest_one():
     with pytest.raises(TypeError, match=r"ActPC has no keyword 'learning_rat' .did you mean 'learning_rate'"):
         make(learning_rat=0.1)
-    with pytest.raises(
-        ValueError, match=r"guidance_kwargs has 'gat' .did you mean 'gate'.*; choose from \['bc_updates'"
-    ):
+    with pytest.raises(ValueError, match=r"guidance_kwargs has 'gat' .did you mean 'gate'.*; choose from \['bc_updates'"):
         make(demonstrations=demonstrations(), guidance="default", guidance_kwargs={"gat": True})
 
 

@@ -81,4 +81,3 @@ def test_ctrl_c_in_a_callback_stores_the_step_that_was_made(n_envs, train_freq):
     buffer = model.replay_buffer
     rows = buffer.observations[: buffer.pos, :, 0], buffer.next_observations[: buffer.pos, :, 0]
     assert np.array_equal(rows[1], rows[0] + 1.0)
-

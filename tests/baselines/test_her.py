@@ -244,7 +244,8 @@ def test_actpc_runs_on_the_same_goal_task_and_demonstrations() -> None:
         demonstrations=record("SparseReacher-v5"),
         learning_starts=50,
         batch_size=16,
-        actor_warm_start=2,
+        guidance_kwargs={"bc_updates": 2},
+        gradient_steps=1,
         policy_kwargs={"net_arch": [8]},
         seed=0,
     )
@@ -326,7 +327,7 @@ def test_actpc_does_not_fall_below_what_a_slow_arm_shows_of_fetch_reach() -> Non
         return np.append(np.clip(8.0 * (observation["desired_goal"] - observation["achieved_goal"]), -1.0, 1.0), 0.0)
 
     shown = Demonstrations.record(slowly, env, n_episodes=40, only_successes=True)
-    settings = {**preset("FetchReach-v4"), "demonstrations": shown, "actor_warm_start": 2000}
+    settings = {**preset("FetchReach-v4"), "demonstrations": shown, "guidance_kwargs": {"bc_updates": 2000}}
     model = ActPC(env=env, **settings, seed=0, device="cpu").learn(10_000)
     played = [episode["r"] for episode in model.ep_info_buffer]  # the last hundred: 5,000 steps under pressure
     assert len(played) == 100 and np.mean(played) > shown.episode_returns.mean()
@@ -349,6 +350,6 @@ def test_hindsight_is_known_by_its_class_and_not_by_a_name() -> None:
     """A user's class of any name has one-step returns by default, as hindsight needs; others keep five."""
     shown = shipped_demonstrations("SparseReacher-v5")
     own, plain = type("Relabelled", (CombinedHerReplayBuffer,), {}), type("NoHerReplayBuffer", (CombinedDictReplayBuffer,), {})
-    for kind, n_steps in ((own, 1), ("HerReplayBuffer", 1), (HerReplayBuffer, 1), (plain, 5)):
+    for kind, n_steps in ((own, 1), ("HerReplayBuffer", 1), (HerReplayBuffer, 1), (plain, 3)):
         kwargs = {"demonstrations": shown, "replay_buffer_class": kind, "buffer_size": 200, "device": "cpu"}
         assert ActPC("MultiInputPolicy", "GoalReacher-v5", **kwargs).n_steps == n_steps
