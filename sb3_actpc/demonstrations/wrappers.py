@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 # wrappers that pass observations, actions and rewards on as they are
 PLAIN = {"Monitor", "TimeLimit", "OrderEnforcing", "PassiveEnvChecker", "RecordEpisodeStatistics", "Autoreset"}
 PLAIN |= {"RecordVideo", "RenderCollection", "HumanRendering"}
+PLAIN |= {"PatchedTimeLimit"}  # rl-zoo3 replaces Gymnasium's TimeLimit by it on import
 # vectorised wrappers of Stable-Baselines3, which the agent undoes or which change the shape
 PLAIN_VECTORISED = ("stable_baselines3.", "sb3_contrib.", "sb3_actpc.")
 N_STEPS = 10  # of the comparison; at each the task's reward is replaced by another known one

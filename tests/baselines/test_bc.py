@@ -235,15 +235,16 @@ def test_what_it_cannot_act_on_is_refused() -> None:
 
 
 def test_an_offline_method_is_evaluated_at_every_interval_and_others_before_their_first_step(tmp_path: Path) -> None:
-    """Steps 10, 20 and 30 of BC; ActPC also at 0, after its warm start, or in five episodes at most where it has none."""
+    """Steps 10, 20 and 30 of BC; ActPC also at 0, after BC, or in five episodes at most where it has none."""
     steps, episodes, imitated = {}, {}, {}
-    played: list[tuple[int, float]] = []
+    played: list[tuple[int, bool]] = []
 
     def counted(model: Any, envs: Any, n_episodes: int, seed: int) -> Any:
-        played.append((n_episodes, getattr(model, "n_cloning_updates", 0)))
+        played.append((n_episodes, getattr(model, "pretrained", False)))
         return play_episodes(model, envs, n_episodes, seed)
 
-    kinds = {"bc": ("bc", {}), "untrained": ("actpc", {"actor_warm_start": 0}), "clone": ("actpc", {"actor_warm_start": 2})}
+    short = {"bc_updates": 2}
+    kinds = {"bc": ("bc", {}), "untrained": ("actpc", {"guidance": "none"}), "cloned": ("actpc", {"guidance_kwargs": short})}
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("sb3_actpc.experiments.runs.evaluation.play_episodes", counted)
         for name, (algo, settings) in kinds.items():
@@ -258,6 +259,7 @@ def test_an_offline_method_is_evaluated_at_every_interval_and_others_before_thei
             with open(folder / "progress.csv", encoding="utf-8") as file:
                 steps[name] = [int(row["timesteps"]) for row in csv.DictReader(file)]
             episodes[name], imitated[name] = [n for n, _ in played], played[0][1]
-    assert steps == {"bc": [10, 20, 30], "untrained": [0, 10, 20, 30], "clone": [0, 10, 20, 30]}
-    assert episodes == {"bc": [6, 6, 6], "untrained": [5, 6, 6, 6], "clone": [6, 6, 6, 6]}
-    assert imitated["clone"] == 4 * 2  # three teachers and the clone
+    assert steps == {"bc": [10, 20, 30], "untrained": [0, 10, 20, 30], "cloned": [0, 10, 20, 30]}
+    assert episodes == {"bc": [6, 6, 6], "untrained": [5, 6, 6, 6], "cloned": [6, 6, 6, 6]}
+    assert imitated["cloned"]
+    assert not imitated["untrained"]

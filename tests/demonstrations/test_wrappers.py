@@ -1,6 +1,8 @@
 """Demonstrations in other units than the agent's: wrappers around the same task are compared, and plain ones are no matter."""
 
 import dataclasses
+import subprocess
+import sys
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -252,3 +254,17 @@ def test_the_packages_demonstrations_fit_its_tasks(env_id: str) -> None:
 def test_the_packages_demonstrations_are_known_to_be_recorded_behind_no_wrapper() -> None:
     with pytest.raises(ValueError, match="recorded behind no wrapper, the agent learns behind TransformObservation"):
         fitted(Demonstrations.load(shipped_demonstrations("SparseReacher-v5")), "SparseReacher-v5", scaled)
+
+
+def test_the_time_limit_that_rl_zoo3_puts_in_raises_no_alarm():
+    """It is there as soon as rl_zoo3 is imported, whoever imports it."""
+    code = (
+        "import warnings; warnings.simplefilter('error', UserWarning)\n"
+        "import rl_zoo3.gym_patches, gymnasium as gym, numpy as np\n"
+        "from sb3_actpc.demonstrations.wrappers import Wrapping, wrapping_of\n"
+        "env = gym.wrappers.TimeLimit(gym.make('Pendulum-v1'), 9)\n"
+        "assert type(env).__name__ == 'PatchedTimeLimit'\n"
+        "assert wrapping_of(env, np.zeros((10, 1))) == Wrapping()\n"
+    )
+    pytest.importorskip("rl_zoo3")
+    subprocess.run([sys.executable, "-W", "ignore::DeprecationWarning", "-c", code], check=True)
