@@ -28,7 +28,22 @@ from stable_baselines3.common.type_aliases import (
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 from tqdm import tqdm
 
-from sb3_actpc.actpc.arguments import (
+from sb3_actpc.actpc.buffers import CombinedHerReplayBuffer, SignalReplay, combined_buffer_class, relabels
+from sb3_actpc.actpc.demonstration_replay import DemonstrationReplay
+from sb3_actpc.actpc.diagnostics import Diagnostics
+from sb3_actpc.actpc.features import Batch, CircuitInputs
+from sb3_actpc.actpc.policies import POLICIES, ActPCActor, ActPCPolicy, check_policy, check_policy_kwargs
+from sb3_actpc.actpc.reward_signals import InternalSignals, summed_squared_errors
+from sb3_actpc.actpc.self_imitation import Episodes, Observations, sample_union
+from sb3_actpc.actpc.transfer import to_device
+from sb3_actpc.checkpoints import Restored, between_updates, load_checkpoint, load_weights, save_weights
+from sb3_actpc.demonstrations import fit_demonstrations
+from sb3_actpc.demonstrations.dataset import Demonstrations
+from sb3_actpc.demonstrations.recording import ENDLESS
+from sb3_actpc.guidance import ActorGuidance, BehaviorGuidance, GuidanceConfig, GuidanceContext
+from sb3_actpc.guidance.base import ImitationBatch
+from sb3_actpc.ngc import NGCCircuit, settle_coupled
+from sb3_actpc.utils.arguments import (
     MAX_SEED,
     Between,
     Count,
@@ -43,23 +58,9 @@ from sb3_actpc.actpc.arguments import (
     check_train_freq,
     checked,
 )
-from sb3_actpc.actpc.buffers import CombinedHerReplayBuffer, SignalReplay, combined_buffer_class, relabels
-from sb3_actpc.actpc.demonstration_replay import DemonstrationReplay
-from sb3_actpc.actpc.diagnostics import Diagnostics
-from sb3_actpc.actpc.features import Batch, CircuitInputs
-from sb3_actpc.actpc.policies import POLICIES, ActPCActor, ActPCPolicy, check_policy, check_policy_kwargs
-from sb3_actpc.actpc.reward_signals import InternalSignals, summed_squared_errors
-from sb3_actpc.actpc.self_imitation import Episodes, Observations, map_observations, sample_union
-from sb3_actpc.actpc.transfer import to_device
-from sb3_actpc.checkpoints import Restored, between_updates, load_checkpoint, load_weights, save_weights
-from sb3_actpc.demonstrations import fit_demonstrations
-from sb3_actpc.demonstrations.dataset import Demonstrations
-from sb3_actpc.demonstrations.recording import ENDLESS
-from sb3_actpc.guidance import ActorGuidance, BehaviorGuidance, GuidanceConfig, GuidanceContext
-from sb3_actpc.guidance.base import ImitationBatch
-from sb3_actpc.ngc import NGCCircuit, settle_coupled
 from sb3_actpc.utils.checks import Settings, check_finite, check_kind, named_in_errors, nearest
 from sb3_actpc.utils.constructors import constructor_keywords
+from sb3_actpc.utils.nested import map_observations
 from sb3_actpc.utils.rollouts import StoresLastTransition
 
 SelfActPC = TypeVar("SelfActPC", bound="ActPC")
@@ -467,7 +468,7 @@ class ActPC(StoresLastTransition):
         """As in SB3. Returns of another environment are forgotten; ValueError where demonstrations do not fit."""
         super().set_env(env, force_reset)
         self._steps_at_pause = None
-        self.actor_guidance.load_state_dict({"selection": None})
+        self.actor_guidance.forget_returns()
         if self.replay_buffer is not None:
             self.replay_buffer.forget_own_episodes()
         if isinstance(self.replay_buffer, HerReplayBuffer):  # SB3 goes on paying by the old one
@@ -1047,7 +1048,7 @@ class ActPC(StoresLastTransition):
             if self.demonstrations is not None and not self.pretrained:
                 self._setup_demonstrations()
             return
-        self.actor_guidance.load_state_dict({"selection": None})
+        self.actor_guidance.forget_returns()
 
     def checkpoint_state(self) -> dict[str, Any]:
         """What a checkpoint (:mod:`sb3_actpc.checkpoints`) keeps beside SB3's state: plain values and arrays."""

@@ -11,11 +11,12 @@ from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer
 from stable_baselines3.common.vec_env import VecNormalize
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
-from sb3_actpc.actpc.arguments import Between, Share, Size, checked
 from sb3_actpc.actpc.reward_signals import STORED, Normalize
-from sb3_actpc.actpc.self_imitation import Observations, SelfImitationMemory, TensorObservations, map_observations
+from sb3_actpc.actpc.self_imitation import Observations, SelfImitationMemory, TensorObservations
 from sb3_actpc.actpc.transfer import to_device
+from sb3_actpc.utils.arguments import Between, Share, Size, checked
 from sb3_actpc.utils.checks import LARGEST_SIZE
+from sb3_actpc.utils.nested import map_observations
 
 OWN_TRANSITIONS = 100_000  # that the self-imitation memory keeps, of a buffer that keeps more
 # (observations, actions, next observations, the working memory's past and which of it there was) of n_envs new transitions ->
@@ -175,7 +176,7 @@ class SignalReplay(ReplayBuffer):
         self.n_steps, self.gamma = n_steps, gamma
 
     def forget_own_episodes(self) -> None:
-        """Those of the self-imitation memory: in another environment they would be paid otherwise."""
+        """Those of the self-imitation memory: in another environment their returns would differ."""
         if self.self_imitation is not None:
             self.self_imitation = SelfImitationMemory(self.self_imitation.capacity)
 

@@ -81,7 +81,7 @@ class DemonstrationReplay:
         dones, discounts = self.demonstrations.terminations[last][:, None], gamma ** counts.sum(1, keepdims=True)
         numbers = map(_single, (samples.actions, rewards.sum(1)[:, None], dones, discounts))
         arrays = inputs.normalized(samples.observations), self._next(last, inputs), following, *numbers
-        observed, bootstrap, following, actions, paid, dones, discounts = to_device(arrays, inputs.device)
+        observed, bootstrap, following, actions, returns, dones, discounts = to_device(arrays, inputs.device)
         features, bootstrap_features = inputs.features(observed), inputs.features(bootstrap)
         next_past: tuple[Any, Any] = (None, None)
         if n_steps > 1:
@@ -94,7 +94,7 @@ class DemonstrationReplay:
             bootstrap_features=bootstrap_features,
             memory=memory,
             next_memory=next_memory,
-            rewards=paid,
+            rewards=returns,
             dones=dones,
             discounts=discounts,
         )
@@ -120,9 +120,8 @@ class DemonstrationReplay:
 
     def check_scale(self, rewards: np.ndarray) -> None:
         """
-        Warn, once, where the environment's rewards cannot be of the demonstrated ones' scale: the largest and the mean of the
-        steps that are paid, and of those that are punished, differ all alike. One may differ by what is done: a beginner comes
-        to no prize and makes greater mistakes.
+        Warn, once, where the environment's rewards cannot have the scale of the demonstrated ones: maximum and mean of the positive
+        rewards, and of the negative ones, differ in the same direction. One alone may differ by behavior.
 
         :param rewards: of all environment steps so far; of few, or without a common sign, they say nothing
         """
@@ -130,9 +129,9 @@ class DemonstrationReplay:
             return
         ratios: list[float] = []
         for sign in (1.0, -1.0):
-            shown, paid = (sign * part[sign * part > 0.0] for part in (self.demonstrations.rewards, rewards))
-            if len(shown) and len(paid):
-                ratios += [shown.mean() / paid.mean(), shown.max() / paid.max()]
+            shown, seen = (sign * part[sign * part > 0.0] for part in (self.demonstrations.rewards, rewards))
+            if len(shown) and len(seen):
+                ratios += [shown.mean() / seen.mean(), shown.max() / seen.max()]
         self.has_scale = bool(ratios)
         if ratios and (min(ratios) > OTHER_SCALE or max(ratios) < 1 / OTHER_SCALE):
             warnings.warn(

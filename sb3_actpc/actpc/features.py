@@ -8,8 +8,9 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_actpc.actpc.buffers import SignalReplaySamples
 from sb3_actpc.actpc.policies import ActPCActor
-from sb3_actpc.actpc.self_imitation import Observations, TensorObservations, map_observations
+from sb3_actpc.actpc.self_imitation import Observations, TensorObservations
 from sb3_actpc.actpc.transfer import to_device
+from sb3_actpc.utils.nested import map_observations
 
 
 class Batch(NamedTuple):

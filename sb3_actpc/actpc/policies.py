@@ -15,7 +15,9 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, Combine
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
-from sb3_actpc.actpc.arguments import (
+from sb3_actpc.ngc import NGCCircuit, WorkingMemory, check_agreement
+from sb3_actpc.ngc.activations import ACTIVATIONS
+from sb3_actpc.utils.arguments import (
     CIRCUITS,
     MAX_CRITICS,
     Between,
@@ -26,8 +28,6 @@ from sb3_actpc.actpc.arguments import (
     check_optimizer,
     checked,
 )
-from sb3_actpc.ngc import NGCCircuit, WorkingMemory, check_agreement
-from sb3_actpc.ngc.activations import ACTIVATIONS
 from sb3_actpc.utils.checks import LARGEST_SIZE, Settings, named_in_errors
 from sb3_actpc.utils.constructors import constructor_keywords
 

@@ -6,8 +6,8 @@ from typing import Any, Literal
 import numpy as np
 import torch as th
 
-from sb3_actpc.actpc.arguments import checked
 from sb3_actpc.ngc import SettledState
+from sb3_actpc.utils.arguments import checked
 
 Normalize = Callable[[np.ndarray], np.ndarray]  # element by element, in any shape
 STORED: tuple[Normalize, Normalize] = (np.asarray, np.asarray)  # both signals pay what was stored
@@ -120,7 +120,7 @@ class InternalSignals:
         return epistemic, instrumental
 
     @property
-    def paid(self) -> tuple[Normalize, Normalize]:
+    def rewards_of_errors(self) -> tuple[Normalize, Normalize]:
         """What summed squared errors of generator and prior pay by what the normalisers have seen; these do not move."""
         rescale = self.instrumental.rescale
         return self.epistemic.rescale, lambda raw: instrumental_reward(rescale(raw), self.instrumental_form)
@@ -128,12 +128,12 @@ class InternalSignals:
     @property
     def replayed(self) -> tuple[Normalize, Normalize]:
         """What stored signals pay when they are replayed."""
-        return self.paid if self.normalization == "sampled" else STORED
+        return self.rewards_of_errors if self.normalization == "sampled" else STORED
 
     @property
     def rescored(self) -> tuple[Normalize, Normalize]:
         """What is stored of signals that are computed anew."""
-        return STORED if self.normalization == "sampled" else self.paid
+        return STORED if self.normalization == "sampled" else self.rewards_of_errors
 
     def checkpoint_state(self) -> list[dict[str, Any]]:
         """What the normalisers have seen."""

@@ -143,8 +143,7 @@ class SelfImitationMemory:
     An episode enters when its sparse return is positive and at least the best return now stored; the oldest leave when the
     capacity is passed. A task that pays negative rewards alone never gets one in: the memory warns of it, once.
 
-    Beside demonstrations that are imitated by returns every paid episode enters (``takes_all``): its return says how often it
-    is imitated. What a clone does from where its own mistakes have led, no demonstration shows.
+    With ``takes_all`` every episode with a positive return enters; its return then says how often it is imitated.
 
     :param capacity: most transitions kept (an episode longer than that is not stored)
     """
@@ -256,8 +255,8 @@ class SelfImitationMemory:
 
 
 def is_by_return(parts: list[Episodes], weighting: Weighting) -> bool:
-    """Whether steps of the union of ``parts`` are drawn by returns: where the first are not paid, one own episode that is
-    would end their imitation."""
+    """Whether steps of the union of ``parts`` are drawn by returns: not where the first (the demonstrations) have none, as one
+    episode of the agent's own would end their imitation."""
     return weighting == "returns" and bool(parts[0].cumulative_weights[-1] > 0.0)
 
 

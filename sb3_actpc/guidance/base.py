@@ -62,6 +62,9 @@ class ActorGuidance:
     def on_reset(self) -> None:
         """The environments were reset in mid-episode."""
 
+    def forget_returns(self) -> None:
+        """Another environment, or other parameters: returns so far say nothing of them."""
+
     def critic_weight(self, n_updates: int) -> float:
         """Factor of the critic term in the actor's update."""
         return 1.0

@@ -120,6 +120,10 @@ class BehaviorGuidance(ActorGuidance):
         if self.selection is not None:
             self.selection.reset()
 
+    def forget_returns(self) -> None:
+        """The gate starts anew with the next ``learn``."""
+        self.selection = None
+
     def critic_weight(self, n_updates: int) -> float:
         """0 during the warm-up, then 1."""
         return float(n_updates > self.config.critic_warmup)

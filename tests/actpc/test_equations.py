@@ -43,7 +43,7 @@ def test_signals_outlive_the_surprises_of_the_first_steps_by_default():
         signals = InternalSignals(**settings)
         for raw in (first, *[later] * 4000):
             signals.score(raw, np.zeros(1), alpha_ep=1.0, alpha_in=0.0)
-        assert signals.paid[0](later) == pytest.approx(expected, rel=0.02)
+        assert signals.rewards_of_errors[0](later) == pytest.approx(expected, rel=0.02)
 
 
 def test_demonstrated_steps_are_rewarded_by_surprise_and_punished_for_leaving_the_prior():

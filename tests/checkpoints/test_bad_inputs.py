@@ -22,10 +22,10 @@ from hypothesis.extra import numpy as hypothesis_numpy
 from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_actpc import ActPC
-from sb3_actpc.actpc.arguments import CIRCUITS
 from sb3_actpc.actpc.policies import CIRCUIT_KEYWORDS, ActPCPolicy
 from sb3_actpc.cli import main
 from sb3_actpc.demonstrations.dataset import Demonstrations
+from sb3_actpc.utils.arguments import CIRCUITS
 from tests.actpc.envs import CountingEnv, demonstrations
 from tests.checkpoints.runs import ACTPC, SHORT_WARM_UP
 

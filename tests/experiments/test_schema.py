@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from sb3_actpc import ActPC, preset
-from sb3_actpc.actpc.arguments import check_settings
 from sb3_actpc.experiments.comparison import plan_runs, read_comparison
 from sb3_actpc.experiments.comparison.plan import read_comparison_file
 from sb3_actpc.experiments.runs import Run, resolve
@@ -20,6 +19,7 @@ from sb3_actpc.experiments.runs.presets import read_yaml, with_changes
 from sb3_actpc.experiments.runs.provenance import git_state
 from sb3_actpc.experiments.runs.record import read_run, write_config
 from sb3_actpc.experiments.runs.schema import merged
+from sb3_actpc.utils.arguments import check_settings
 from sb3_actpc.utils.constructors import constructors
 
 

@@ -1,1 +1,0 @@
-from sb3_actpc.utils.arguments import *  # noqa: F403
