@@ -120,8 +120,10 @@ class DemonstrationReplay:
 
     def check_scale(self, rewards: np.ndarray) -> None:
         """
-        Warn, once, where the environment's rewards cannot have the scale of the demonstrated ones: maximum and mean of the positive
-        rewards, and of the negative ones, differ in the same direction. One alone may differ by behavior.
+        Warn, once, where the environment's rewards cannot have the scale of the demonstrated ones.
+
+        Maximum and mean of the positive rewards, and of the negative ones, then differ in the same direction. One alone may
+        differ by behavior.
 
         :param rewards: of all environment steps so far; of few, or without a common sign, they say nothing
         """
