@@ -152,7 +152,7 @@ class ActPC(StoresLastTransition):
         its ``net_arch``, ``learning_rate`` and ``batch_size``)
     :param stats_window_size: as in SB3
     :param tensorboard_log: as in SB3
-    :param verbose: as in SB3; from 1 on, ``learn`` also says what the reward is made of
+    :param verbose: as in SB3; from 1 on, the first ``learn`` also says what the reward is made of
     :param device: as in SB3
     :param seed: as in SB3
     :raises ValueError: for a keyword with a value that is not allowed, for action spaces that are not Boxes, for
@@ -281,6 +281,7 @@ class ActPC(StoresLastTransition):
         self.observation_normalization: str = default(observation_normalization, "demonstrations", "none")
         self.signal_kwargs = signal_kwargs
         self.signals = InternalSignals()
+        self._described = ""  # what ``learn`` has said
         self._is_stepping = False  # between a choice of actions and the storage of what followed
         self._awaits_parameters = not _init_setup_model  # ``load`` sets them
         if _init_setup_model:
@@ -523,8 +524,9 @@ class ActPC(StoresLastTransition):
         if memory is not None:
             memory.takes_all = self.actor_guidance.stores == "positive" and self.expert is not None
         self._warn_of_idle_settings()
-        if self.verbose:
-            print(self.describe(), flush=True)
+        if self.verbose and self._described != self.describe():
+            self._described = self.describe()
+            print(self._described, flush=True)
         self.pretrain(between_updates(result[1]), _shows_progress(result[1]))
         self.start_time = time.time_ns()  # of the frames per second: pre-training has none
         return result
@@ -573,7 +575,8 @@ class ActPC(StoresLastTransition):
             )
 
     def describe(self) -> str:
-        """What the reward is made of, from which demonstrations, and what is off; ``learn`` prints it with ``verbose=1``."""
+        """What the reward is made of, from which demonstrations, and what is off; ``learn`` prints it with ``verbose=1``, and
+        again when it has changed."""
         assert self.replay_buffer is not None
         ext, ep, inst = self.reward_weights
         parts = {
@@ -1128,7 +1131,7 @@ class ActPC(StoresLastTransition):
     def _excluded_save_params(self) -> list[str]:
         aliases = ["actor", "critic", "generator", "prior", "actor_target", "critic_target"]
         derived = ["expert", "_followed", "diagnostics", "actor_guidance"]
-        derived += ["_awaits_parameters", "_is_stepping"]
+        derived += ["_awaits_parameters", "_described", "_is_stepping"]
         return [*super()._excluded_save_params(), *aliases, *derived]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
