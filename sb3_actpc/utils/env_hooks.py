@@ -111,6 +111,7 @@ class WatchedVecEnv(VecEnvWrapper):
     single environment that were made directly are noticed where it runs in this process.
 
     :param venv: the training environment
+    :raises ValueError: where a wrapper outside VecNormalize changes what it returns: SB3 stores what arrives at VecNormalize
     """
 
     def __init__(self, venv: VecEnv) -> None:
@@ -121,6 +122,9 @@ class WatchedVecEnv(VecEnvWrapper):
         base = venv
         while isinstance(base, VecEnvWrapper):
             base = base.venv
+        self._outside = [] if self._normalize is None else _outside(venv, self._normalize)
+        if self._outside and self._normalize is not None and self._normalize.observation_space != venv.observation_space:
+            raise self._wrong_order("observations")
         self._copies = True
         self._base = base
         self._seen: list[Any] | None = []  # until their precision is checked
@@ -176,8 +180,30 @@ class WatchedVecEnv(VecEnvWrapper):
         if not self._copies:
             self._check_last_observations(observations, dones, infos)
         self.mark()
+        self._check_order(observations, rewards)
         self._check_precision(observations)
         return observations, rewards, dones, infos
+
+    def _check_order(self, observations: Any, rewards: np.ndarray) -> None:
+        """Once: what arrives here is what VecNormalize returned."""
+        if not self._outside or self._normalize is None:
+            return
+        normalized = self._normalize.normalize_obs(self._normalize.get_original_obs())
+        parts = [(observations, normalized)]
+        if isinstance(observations, dict):
+            parts = [(observations[key], normalized[key]) for key in observations]
+        if not all(np.allclose(mine, theirs) for mine, theirs in parts):
+            raise self._wrong_order("observations")
+        if not np.allclose(rewards, self._normalize.normalize_reward(self._normalize.get_original_reward())):
+            raise self._wrong_order("rewards")
+        self._outside = []
+
+    def _wrong_order(self, what: str) -> ValueError:
+        inner = self._outside[-1]
+        return ValueError(
+            f"{' of '.join(self._outside)} of VecNormalize: a wrapper outside VecNormalize changes the {what}, and the replay "
+            f"buffer holds those that VecNormalize was given. VecNormalize goes outside: VecNormalize({inner}(...))"
+        )
 
     def _check_precision(self, observations: Any) -> None:
         """Name the features that float32 cannot follow, once, by the first observations of the first environment."""
@@ -210,6 +236,15 @@ class WatchedVecEnv(VecEnvWrapper):
                     stacklevel=2,
                 )
                 self._copies = True  # said once
+
+
+def _outside(venv: VecEnv, normalize: VecEnv) -> list[str]:
+    """The wrappers outside VecNormalize, the outermost first."""
+    names = []
+    while isinstance(venv, VecEnvWrapper) and venv is not normalize:
+        names.append(type(venv).__name__)
+        venv = venv.venv
+    return names
 
 
 def _stacked(observations: list[Any]) -> Any:

@@ -10,7 +10,15 @@ from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack, VecMonitor, VecNormalize
+from stable_baselines3.common.vec_env import (
+    DummyVecEnv,
+    SubprocVecEnv,
+    VecCheckNan,
+    VecEnvWrapper,
+    VecFrameStack,
+    VecMonitor,
+    VecNormalize,
+)
 
 from sb3_actpc import ActPC
 from sb3_actpc.baselines.her import HER
@@ -270,3 +278,47 @@ def test_frame_stacks_hold_frames_of_one_episode():
         rows = buffer.next_observations[: buffer.pos, 0]  # (episode, step) twice, the older first
         assert all(row[0] in (0.0, row[2]) for row in rows)
         assert (rows[:, 3] == buffer.observations[: buffer.pos, 0, 3] + 1.0).all()
+
+
+class Shifts(VecEnvWrapper):
+    """Adds to observations or rewards, of the same space."""
+
+    def __init__(self, venv, observation: float = 0.0, reward: float = 0.0) -> None:
+        super().__init__(venv)
+        self.observation, self.reward = observation, reward
+
+    def reset(self):
+        return self.venv.reset() + self.observation
+
+    def step_wait(self):
+        observations, rewards, dones, infos = self.venv.step_wait()
+        return observations + self.observation, rewards + self.reward, dones, infos
+
+
+@pytest.mark.parametrize("algorithm", [ActPC, TD3Demo])
+@pytest.mark.parametrize(
+    ("wrap", "name", "changed"),
+    [
+        (lambda env: VecFrameStack(env, 2), "VecFrameStack", "observations"),
+        (lambda env: Shifts(env, observation=1.0), "Shifts", "observations"),
+        (lambda env: Shifts(env, reward=1.0), "Shifts", "rewards"),
+        (lambda env: VecMonitor(VecFrameStack(env, 2)), "VecFrameStack", "observations"),
+    ],
+)
+def test_a_wrapper_outside_vec_normalize_that_changes_something_is_refused(algorithm, wrap, name, changed):
+    """The example of SB3 issue 693."""
+    model = agent(algorithm, wrap(VecNormalize(DummyVecEnv([OneArray]))))
+    message = rf"changes the {changed}, .*VecNormalize goes outside: VecNormalize\({name}\(...\)\)"
+    with pytest.raises(ValueError, match=message):
+        model.learn(10)
+
+
+@pytest.mark.parametrize("algorithm", [ActPC, TD3Demo])
+def test_a_wrapper_outside_vec_normalize_that_changes_nothing_is_none_of_our_business(algorithm):
+    for wrap in (VecMonitor, VecCheckNan, Shifts):
+        model = agent(algorithm, wrap(VecNormalize(DummyVecEnv([OneArray]), clip_obs=1e6)))
+        model.learn(20)
+        assert_no_transition_is_wrong(model)
+    model = agent(algorithm, VecNormalize(VecFrameStack(DummyVecEnv([OneArray]), 2)))
+    model.learn(20)
+    assert model.replay_buffer.observations.shape[-1] == 4
