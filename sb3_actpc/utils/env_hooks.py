@@ -1,5 +1,9 @@
 """Hooks in a training environment: calls are counted, and what an environment returns is a copy."""
 
+import copyreg
+import multiprocessing
+import signal
+import threading
 import types
 import warnings
 from collections.abc import Callable
@@ -9,7 +13,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import torch as th
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper, unwrap_vec_normalize
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecEnvWrapper, unwrap_vec_normalize
 
 from sb3_actpc.utils.nested import map_observations
 from sb3_actpc.utils.precision import warn_of_indistinguishable
@@ -102,6 +106,16 @@ class _Hooked(metaclass=_HooksWhatItIsAskedOf):
     """``VecEnv.env_is_wrapped(_Hooked)`` hooks the environments, also those in other processes, and is true where it did."""
 
 
+def _on_arrival() -> type:
+    """In another process: Ctrl-C in a terminal reaches every process. The one that learns decides what it means."""
+    if multiprocessing.parent_process() is not None and threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+    return _Hooked
+
+
+copyreg.pickle(_HooksWhatItIsAskedOf, lambda _: (_on_arrival, ()))  # type: ignore[arg-type]
+
+
 class WatchedVecEnv(VecEnvWrapper):
     """
     The training environment as one algorithm steps it: what arrives is copied, and other callers are noticed.
@@ -163,6 +177,18 @@ class WatchedVecEnv(VecEnvWrapper):
     def _put_back_original(self) -> None:
         if self._normalize is not None:
             vars(self._normalize).update({name: value for name, value in self._original.items() if value is not None})
+
+    def finish_step(self) -> None:
+        """Ctrl-C may come between a step in other processes and its result, which the next call would take for its own."""
+        base = self._base
+        if not isinstance(base, SubprocVecEnv) or not base.waiting:
+            return
+        for remote in base.remotes:
+            remote.send(("has_attr", "step"))
+        for remote in base.remotes:
+            while not isinstance(remote.recv(), bool):  # the results of a step are a tuple
+                pass
+        base.waiting = False
 
     def reset(self) -> Any:
         """As the environment's."""

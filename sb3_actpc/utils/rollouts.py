@@ -83,7 +83,7 @@ class StoresLastTransition(OffPolicyAlgorithm):
         *args: Any,
         **options: Any,
     ) -> tuple[int, BaseCallback]:
-        self._watch()
+        self._watch().finish_step()
         self._is_reset = reset_num_timesteps or self._last_obs is None  # by SB3, before it prepares the callbacks
         result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, *args, **options)
         self._last_obs = copied(self._last_obs)

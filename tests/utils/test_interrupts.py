@@ -1,0 +1,84 @@
+"""Ctrl-C in a terminal, which reaches the processes of the environments too: learning goes on afterwards."""
+
+import os
+import signal
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
+
+from sb3_actpc import ActPC
+from sb3_actpc.baselines.td3 import TD3Demo
+from sb3_actpc.checkpoints import CheckpointCallback
+from tests.utils.test_rollouts import OneArray, agent, assert_no_transition_is_wrong
+
+
+class PressesCtrlC(BaseCallback):
+    """As a terminal does: every process of the group gets the signal."""
+
+    def _on_step(self) -> bool:
+        if self.n_calls == 20:
+            os.killpg(os.getpgid(0), signal.SIGINT)
+        return True
+
+
+def learn_twice(kind: str, is_wrapped: bool, folder: str) -> None:
+    """The script of the process."""
+    env = {"dummy": DummyVecEnv, "processes": SubprocVecEnv}[kind](
+        [lambda: Monitor(OneArray()) if is_wrapped else OneArray()] * 2
+    )
+    model = agent(ActPC, env)
+    callbacks = [PressesCtrlC(), *([CheckpointCallback(folder, save_freq=1000)] if folder else [])]
+    try:
+        model.learn(400, callbacks)
+    except (KeyboardInterrupt, SystemExit) as stop:
+        print("stopped by", type(stop).__name__)
+    model.learn(40, reset_num_timesteps=False)
+    assert_no_transition_is_wrong(model)
+    env.close()
+    print("went on")
+
+
+@pytest.mark.parametrize("kind", ["dummy", "processes"])
+@pytest.mark.parametrize("saves", [False, True])
+def test_learning_goes_on_after_ctrl_c_in_a_terminal(kind, saves, tmp_path):
+    folder = str(tmp_path / "checkpoints") if saves else ""
+    script = f"from tests.utils.test_interrupts import learn_twice\nlearn_twice({kind!r}, True, {folder!r})"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, start_new_session=True, timeout=300)
+    assert done.stdout.split("\n")[:2] == [f"stopped by {'TrainingStopped' if saves else 'KeyboardInterrupt'}", "went on"], (
+        done
+    )
+    assert not saves or list((tmp_path / "checkpoints").iterdir())
+
+
+def test_environments_without_wrappers_survive_ctrl_c_too():
+    script = "from tests.utils.test_interrupts import ends_alone\nends_alone()"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, start_new_session=True, timeout=300)
+    assert done.stdout.strip() == "went on", done
+
+
+def ends_alone() -> None:
+    """The script of the process."""
+    env = SubprocVecEnv([OneArray] * 2)
+    model = agent(TD3Demo, env)
+    try:
+        model.learn(400, PressesCtrlC())
+    except KeyboardInterrupt:
+        model.learn(40, reset_num_timesteps=False)
+        print("went on")
+    env.close()
+
+
+@pytest.mark.parametrize("algorithm", [ActPC, TD3Demo])
+def test_the_result_of_an_interrupted_step_is_not_taken_for_another_one(algorithm):
+    env = SubprocVecEnv([lambda: Monitor(OneArray())] * 2)
+    model = agent(algorithm, env)
+    model.learn(10)
+    env.step_async(np.zeros((2, 1), np.float32))  # and Ctrl-C before the result is read
+    model.learn(30, reset_num_timesteps=False)
+    assert_no_transition_is_wrong(model)
+    env.close()
