@@ -3,6 +3,7 @@
 import dataclasses
 import os
 import re
+import warnings
 from pathlib import Path, PureWindowsPath
 from typing import TYPE_CHECKING, Any
 
@@ -66,7 +67,8 @@ def fit_demonstrations(
     :param n_transitions: use only this many transitions, the first ones
     :raises FileNotFoundError: when there is no such file
     :raises ValueError: for demonstrations that are damaged, too few, of another task, or recorded in other units
-    :warns UserWarning: where the agent's wrappers may change the units, see :mod:`~sb3_actpc.demonstrations.wrappers`
+    :warns UserWarning: where the agent's wrappers may change the units, see :mod:`~sb3_actpc.demonstrations.wrappers`, or
+        where episodes are longer than the environment's time limit
     """
     has_goals = env is not None and env.has_attr("goal_demonstrations")
     demonstrations = resolve(source, None if has_goals else observation_space)  # they may be of the task without goals
@@ -95,6 +97,7 @@ def fit_demonstrations(
         raise ValueError(f"{error}: {fix}") from None
     if env is None:
         return demonstrations
+    _compare_lengths(demonstrations, env)
     # sb3-actpc demos collect makes the environment by its id
     is_collected = str(demonstrations.metadata.get("command", "")).startswith("sb3-actpc demos collect")
     recorded_behind = demonstrations.metadata.get("wrappers", [] if is_collected else None)
@@ -108,6 +111,19 @@ def fit_demonstrations(
         observations, following = (_channels_first(rows, transposes) for rows in columns)
         demonstrations = dataclasses.replace(demonstrations, observations=observations, next_observations=following)
     return demonstrations.rewarded_by(env)
+
+
+def _compare_lengths(demonstrations: Demonstrations, env: "VecEnv") -> None:
+    """A UserWarning for episodes that are longer than the environment lets an episode be."""
+    spec = env.get_attr("spec", indices=[0])[0] if env.has_attr("spec") else None
+    limit = getattr(spec, "max_episode_steps", None)
+    longest = int(np.diff(demonstrations.episode_bounds, axis=1).max())
+    if limit is not None and longest > limit:
+        warnings.warn(
+            f"demonstrated episodes have up to {longest} steps, the environment's at most {limit}: their returns cannot be "
+            f"compared. Make it with gymnasium.make(..., max_episode_steps={longest}), or record in it as it is",
+            stacklevel=3,
+        )
 
 
 def _channels_first(rows: np.ndarray, env: "VecTransposeImage") -> np.ndarray:

@@ -20,6 +20,7 @@ from sb3_actpc.utils.precision import warn_of_indistinguishable
 
 _CALLS = "_n_hooked_calls"
 _LATEST = "_latest_observation"  # in the environment's own precision
+_ENDS = "_last_observations"  # of the episodes that ended in the last step, by their environments' numbers
 _BEFORE = "_unhooked_"  # before the name of a method that was an attribute of the environment already
 _MOVES = ("step", "reset")
 N_CHECKED = 100  # observations whose precision is compared with float32
@@ -64,8 +65,18 @@ def _vec_env_hook(name: str) -> Callable[..., Any]:
     return call
 
 
+def _keep_ends(self: VecEnv) -> Any:
+    returned = type(self).step_wait(self)
+    key = "terminal_observation"
+    vars(self)[_ENDS] = {env: copied(info[key]) for env, info in enumerate(returned[3]) if info.get(key) is not None}
+    return returned
+
+
+_keep_ends.__name__ = "step_wait"
 _ENV_HOOKS = {name: _env_hook(name) for name in _MOVES}
 _VEC_ENV_HOOKS = {name: _vec_env_hook(name) for name in _VEC_MOVES}
+
+_END_HOOKS = {"step_wait": _keep_ends}
 
 
 def _install(target: Any, hooks: dict[str, Callable[..., Any]]) -> None:
@@ -133,6 +144,10 @@ class WatchedVecEnv(VecEnvWrapper):
             warnings.simplefilter("ignore")  # SB3 has warned about it when the environment was made
             super().__init__(venv)
         self._normalize = unwrap_vec_normalize(venv)
+        self._infos: list[dict[str, Any]] = []
+        self._ends: dict[int, Any] = {}
+        if self._normalize is not None:
+            _install(self._normalize.venv, _END_HOOKS)
         base = venv
         while isinstance(base, VecEnvWrapper):
             base = base.venv
@@ -170,9 +185,10 @@ class WatchedVecEnv(VecEnvWrapper):
             self._put_back_original()
 
     def put_back(self) -> None:
-        """After other calls: VecNormalize's unnormalized observations and rewards are again those of the last own step."""
+        """After other calls: what VecNormalize keeps unnormalized is again that of the last own step."""
         if self.is_disturbed:
             self._put_back_original()
+            self._normalize_ends()
 
     def _put_back_original(self) -> None:
         if self._normalize is not None:
@@ -205,10 +221,18 @@ class WatchedVecEnv(VecEnvWrapper):
                 info["terminal_observation"] = copied(info["terminal_observation"])
         if not self._copies:
             self._check_last_observations(observations, dones, infos)
+        self._infos = infos
+        self._ends = {} if self._normalize is None else vars(self._normalize.venv)[_ENDS]
+        self._normalize_ends()
         self.mark()
         self._check_order(observations, rewards)
         self._check_precision(observations)
         return observations, rewards, dones, infos
+
+    def _normalize_ends(self) -> None:
+        """An episode's last observation is stored as it was: VecNormalize clips it, and what is clipped cannot be undone."""
+        for env, observation in self._ends.items():
+            self._infos[env]["terminal_observation"] = _unclipped(self._normalize, observation)
 
     def _check_order(self, observations: Any, rewards: np.ndarray) -> None:
         """Once: what arrives here is what VecNormalize returned."""
@@ -262,6 +286,19 @@ class WatchedVecEnv(VecEnvWrapper):
                     stacklevel=2,
                 )
                 self._copies = True  # said once
+
+
+def _unclipped(normalize: Any, observation: Any) -> Any:
+    """What ``unnormalize_obs`` turns into the observation, however far it lies from the mean."""
+    if not normalize.norm_obs:
+        return observation
+    if not isinstance(observation, dict):
+        return (observation - normalize.obs_rms.mean) / np.sqrt(normalize.obs_rms.var + normalize.epsilon)
+    normalized = dict(observation)
+    for key in normalize.norm_obs_keys:
+        statistics = normalize.obs_rms[key]
+        normalized[key] = (observation[key] - statistics.mean) / np.sqrt(statistics.var + normalize.epsilon)
+    return normalized
 
 
 def _outside(venv: VecEnv, normalize: VecEnv) -> list[str]:

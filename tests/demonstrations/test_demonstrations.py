@@ -7,6 +7,7 @@ import json
 import os
 import subprocess
 import sys
+import warnings
 import zipfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,8 +17,10 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv
 
-from sb3_actpc.demonstrations import Demonstrations, resolve, shipped_demonstrations
+from sb3_actpc.demonstrations import Demonstrations, fit_demonstrations, resolve, shipped_demonstrations
 from sb3_actpc.demonstrations.minari import episode_buffer
 from sb3_actpc.demonstrations.npz import FORMAT_VERSION
 from sb3_actpc.utils.files import atomic_write
@@ -851,3 +854,25 @@ def test_what_is_no_file_is_not_printed_whole(tmp_path: Path) -> None:
         ValueError, match=r"an entry, as Demonstrations.save writes it .*from_episodes.*found only observations"
     ):
         resolve(tmp_path / "mine.npz")
+
+
+class TestTimeLimits:
+    """Episodes longer than the environment's are named."""
+
+    def fit(self, n_steps: int, limit: int | None) -> None:
+        rng = np.random.default_rng(0)
+        columns = {"observations": rng.uniform(-1, 1, (n_steps + 1, 3)), "actions": rng.uniform(-1, 1, (n_steps, 1))}
+        given = Demonstrations.from_episodes([{**columns, "rewards": np.ones(n_steps)}], "Pendulum-v1")
+        env = DummyVecEnv([lambda: Monitor(gym.make("Pendulum-v1", max_episode_steps=limit))])
+        fit_demonstrations(given, env, env.observation_space, env.action_space)
+
+    @pytest.mark.parametrize(("n_steps", "limit"), [(400, 200), (201, None), (51, 50)])
+    def test_longer_ones_are_named(self, n_steps: int, limit: int | None) -> None:
+        with pytest.warns(UserWarning, match=f"up to {n_steps} steps, the environment's at most {limit or 200}"):
+            self.fit(n_steps, limit)
+
+    @pytest.mark.parametrize(("n_steps", "limit"), [(200, 200), (100, 200), (400, 400)])
+    def test_others_are_not(self, n_steps: int, limit: int | None) -> None:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("error", message="demonstrated episodes have")
+            self.fit(n_steps, limit)

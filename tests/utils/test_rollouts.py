@@ -66,7 +66,7 @@ class Plays(BaseCallback):
         self.move, self.when, self.infos_of_ends = move, when, []
 
     def _maybe(self, when: str) -> bool:
-        if when == self.when and self.num_timesteps % 5 == 4:
+        if when == self.when and self.num_timesteps % 10 in (4, 9):
             self.move(self.model)
         return True
 
@@ -322,3 +322,14 @@ def test_a_wrapper_outside_vec_normalize_that_changes_nothing_is_none_of_our_bus
     model = agent(algorithm, VecNormalize(VecFrameStack(DummyVecEnv([OneArray]), 2)))
     model.learn(20)
     assert model.replay_buffer.observations.shape[-1] == 4
+
+
+@pytest.mark.parametrize("algorithm", [ActPC, TD3Demo])
+@pytest.mark.parametrize("kind", ["box", "dict"])
+@pytest.mark.parametrize("plays", [False, True])
+def test_the_last_observation_of_an_episode_is_stored_unclipped(algorithm, kind, plays):
+    """VecNormalize clips what it normalizes; evaluation in a callback moves its statistics before the storage."""
+    env = VecNormalize(DummyVecEnv([lambda: OneArray(kind)] * 2), norm_reward=False, clip_obs=0.5)
+    model = agent(algorithm, env, train_freq=3)
+    model.learn(60, callback=Plays(evaluates if plays else lambda model: None, "step"))  # first at the fifth step
+    assert_no_transition_is_wrong(model)
