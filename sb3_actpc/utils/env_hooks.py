@@ -124,7 +124,25 @@ def _on_arrival() -> type:
     return _Hooked
 
 
-copyreg.pickle(_HooksWhatItIsAskedOf, lambda _: (_on_arrival, ()))  # type: ignore[arg-type]
+def _pickled(hooked: _HooksWhatItIsAskedOf) -> Any:
+    return _on_arrival, ()
+
+
+copyreg.pickle(_HooksWhatItIsAskedOf, _pickled)
+
+
+def hook_vec_env(venv: VecEnv) -> tuple[VecEnv, bool]:
+    """Hook the environments of a vectorized one: what is below its wrappers, and whether that was possible."""
+    while isinstance(venv, VecEnvWrapper):
+        venv = venv.venv
+    if isinstance(venv, DummyVecEnv):
+        for env in venv.envs:
+            hook_env(env)
+        return venv, True
+    _install(venv, _VEC_ENV_HOOKS)
+    with suppress(AttributeError, NotImplementedError, TypeError):
+        return venv, all(venv.env_is_wrapped(_Hooked))  # type: ignore[arg-type]
+    return venv, False  # in another process without any wrapper
 
 
 class WatchedVecEnv(VecEnvWrapper):
@@ -148,23 +166,14 @@ class WatchedVecEnv(VecEnvWrapper):
         self._ends: dict[int, Any] = {}
         if self._normalize is not None:
             _install(self._normalize.venv, _END_HOOKS)
-        base = venv
-        while isinstance(base, VecEnvWrapper):
-            base = base.venv
         self._outside = [] if self._normalize is None else _outside(venv, self._normalize)
         if self._outside and self._normalize is not None and self._normalize.observation_space != venv.observation_space:
             raise self._wrong_order("observations")
-        self._copies = True
-        self._base = base
+        self._base, self._copies = hook_vec_env(venv)
         self._seen: list[Any] | None = []  # until their precision is checked
-        self._counted: list[Any] = [base]
-        if isinstance(base, DummyVecEnv):
-            for env in base.envs:
-                hook_env(env)
-            self._counted = [_innermost(env) for env in base.envs]
-        else:
-            _install(base, _VEC_ENV_HOOKS)
-            self._copies = _hook_others(base)
+        self._counted: list[Any] = [self._base]
+        if isinstance(self._base, DummyVecEnv):
+            self._counted = [_innermost(env) for env in self._base.envs]
         self.mark()
 
     @property
@@ -238,7 +247,7 @@ class WatchedVecEnv(VecEnvWrapper):
         """Once: what arrives here is what VecNormalize returned."""
         if not self._outside or self._normalize is None:
             return
-        normalized = self._normalize.normalize_obs(self._normalize.get_original_obs())
+        normalized: Any = self._normalize.normalize_obs(self._normalize.get_original_obs())
         parts = [(observations, normalized)]
         if isinstance(observations, dict):
             parts = [(observations[key], normalized[key]) for key in observations]
@@ -315,10 +324,3 @@ def _stacked(observations: list[Any]) -> Any:
     if isinstance(observations[0], dict):
         return {key: _stacked([one[key] for one in observations]) for key in observations[0]}
     return np.array(observations)
-
-
-def _hook_others(base: VecEnv) -> bool:
-    """Whether environments in other processes could be hooked: those without any wrapper cannot."""
-    with suppress(AttributeError, NotImplementedError, TypeError):
-        return all(base.env_is_wrapped(_Hooked))  # type: ignore[arg-type]
-    return False

@@ -2,6 +2,7 @@
 
 import copy
 import pickle
+from typing import ClassVar
 
 import gymnasium as gym
 import numpy as np
@@ -22,6 +23,7 @@ from stable_baselines3.common.vec_env import (
 
 from sb3_actpc import ActPC
 from sb3_actpc.baselines.her import HER
+from sb3_actpc.baselines.logo import LOGO
 from sb3_actpc.baselines.td3 import TD3Demo
 
 LENGTH = 7
@@ -146,6 +148,23 @@ def test_an_environment_without_a_wrapper_in_another_process_cannot_be_mended_an
     env = vec_env(monitor=False, vec=SubprocVecEnv)
     with pytest.warns(UserWarning, match="must return a copy of it, or be wrapped in stable_baselines3's Monitor"):
         agent(TD3Demo, env).learn(20)
+    env.close()
+
+
+@pytest.mark.parametrize("vec", [DummyVecEnv, SubprocVecEnv])
+def test_logo_values_the_last_observation_of_an_episode_that_a_time_limit_cut(vec):
+    class LooksAtEnds(BaseCallback):
+        steps: ClassVar[list[float]] = []
+
+        def _on_step(self) -> bool:
+            infos = [self.locals["infos"][env] for env in np.flatnonzero(self.locals["dones"])]
+            self.steps.extend(float(info["terminal_observation"][1]) for info in infos)
+            return True
+
+    env = vec_env(n_envs=2, vec=vec)
+    callback = LooksAtEnds()
+    LOGO("MlpPolicy", env, n_steps=16, batch_size=16, n_critic_updates=1).learn(32, callback=callback)
+    assert callback.steps == [LENGTH] * 4
     env.close()
 
 
