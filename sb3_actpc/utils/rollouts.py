@@ -1,4 +1,4 @@
-"""Rollouts that store their last transition, and that join no two episodes, whoever stops or disturbs them."""
+"""Rollouts that store their last transition and join no two episodes, also where callbacks stop or others interfere."""
 
 from typing import Any, cast
 

@@ -1,4 +1,4 @@
-"""Whoever stops learning in the middle of a rollout: every environment step is stored, with its reward and its end."""
+"""A rollout that is stopped in the middle: every environment step is stored, with its reward and its end."""
 
 import gymnasium as gym
 import numpy as np
