@@ -14,7 +14,6 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback, ProgressBarCallback
-from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.noise import ActionNoise, VectorizedActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.preprocessing import get_action_dim, get_obs_shape
@@ -153,7 +152,7 @@ class ActPC(StoresLastTransition):
         its ``net_arch``, ``learning_rate`` and ``batch_size``)
     :param stats_window_size: as in SB3
     :param tensorboard_log: as in SB3
-    :param verbose: as in SB3; from 1 on, ``learn`` also says what the reward is made of
+    :param verbose: as in SB3; from 1 on, the first ``learn`` also says what the reward is made of
     :param device: as in SB3
     :param seed: as in SB3
     :raises ValueError: for a keyword with a value that is not allowed, for action spaces that are not Boxes, for
@@ -282,9 +281,9 @@ class ActPC(StoresLastTransition):
         self.observation_normalization: str = default(observation_normalization, "demonstrations", "none")
         self.signal_kwargs = signal_kwargs
         self.signals = InternalSignals()
+        self._described = ""  # what ``learn`` has said
         self._is_stepping = False  # between a choice of actions and the storage of what followed
         self._awaits_parameters = not _init_setup_model  # ``load`` sets them
-        self._steps_at_pause: list[int] | None = None  # that the environments had made when ``learn`` ended
         if _init_setup_model:
             self._setup_model()
             self._check_learning_rates()
@@ -467,7 +466,6 @@ class ActPC(StoresLastTransition):
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         """As in SB3. Returns of another environment are forgotten; ValueError where demonstrations do not fit."""
         super().set_env(env, force_reset)
-        self._steps_at_pause = None
         self.actor_guidance.forget_returns()
         if self.replay_buffer is not None:
             self.replay_buffer.forget_own_episodes()
@@ -510,16 +508,12 @@ class ActPC(StoresLastTransition):
     ) -> tuple[int, BaseCallback]:
         self._check_together()
         self._check_learning_rates()
-        if self._steps_at_pause is not None and self._steps_at_pause != self._steps_of_envs():
-            self._last_obs = None  # somebody else has played in them, as ``evaluate_policy`` does: they are reset
+        if self.is_disturbed:
+            self._last_obs = None  # the environments are reset
         if isinstance(self.action_noise, VectorizedActionNoise) and self.action_noise.n_envs != self.n_envs:
             self.action_noise = self.action_noise.base_noise  # of a loaded agent; SB3 makes it one for each environment
         if reset_num_timesteps or self._last_obs is None:  # SB3 resets the environments
-            self._rollout_state: tuple[np.ndarray, ...] | None = None
-            self._rollout_starts = np.ones(self.n_envs, dtype=bool)
-            if self.replay_buffer is not None:
-                self.replay_buffer.cut_running_episodes()
-            self.actor_guidance.on_reset()
+            self._cut_running_episodes()
         result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
         self._check_observations(self._last_obs)
         self._follow_demonstrations()
@@ -530,22 +524,19 @@ class ActPC(StoresLastTransition):
         if memory is not None:
             memory.takes_all = self.actor_guidance.stores == "positive" and self.expert is not None
         self._warn_of_idle_settings()
-        if self.verbose:
-            print(self.describe(), flush=True)
+        if self.verbose and self._described != self.describe():
+            self._described = self.describe()
+            print(self._described, flush=True)
         self.pretrain(between_updates(result[1]), _shows_progress(result[1]))
         self.start_time = time.time_ns()  # of the frames per second: pre-training has none
         return result
 
-    def _steps_of_envs(self) -> list[int] | None:
-        """How many steps each environment has made, whoever acted, and of these in the running episode; None without SB3's
-        Monitor, which counts them, or where nobody can be asked for it."""
-        assert self.env is not None
-        try:
-            if not all(self.env.env_is_wrapped(Monitor)):
-                return None
-            return [*self.env.get_attr("total_steps"), *map(len, self.env.get_attr("rewards"))]
-        except (AttributeError, NotImplementedError, TypeError):
-            return None
+    def _cut_running_episodes(self) -> None:
+        self._rollout_state: tuple[np.ndarray, ...] | None = None
+        self._rollout_starts = np.ones(self.n_envs, dtype=bool)
+        if self.replay_buffer is not None:
+            self.replay_buffer.cut_running_episodes()
+        self.actor_guidance.on_reset()
 
     def _check_together(self) -> None:
         """
@@ -584,7 +575,8 @@ class ActPC(StoresLastTransition):
             )
 
     def describe(self) -> str:
-        """What the reward is made of, from which demonstrations, and what is off; ``learn`` prints it with ``verbose=1``."""
+        """What the reward is made of, from which demonstrations, and what is off; ``learn`` prints it with ``verbose=1``, and
+        again when it has changed."""
         assert self.replay_buffer is not None
         ext, ep, inst = self.reward_weights
         parts = {
@@ -697,6 +689,7 @@ class ActPC(StoresLastTransition):
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
     ) -> tuple[np.ndarray, np.ndarray]:
+        self._restart_if_disturbed()
         assert self._last_obs is not None
         self._is_stepping = True
         warming_up = self.num_timesteps < learning_starts
@@ -1011,7 +1004,6 @@ class ActPC(StoresLastTransition):
         check_kind("total_timesteps", total_timesteps, float)
         Between(0)("total_timesteps", total_timesteps)
         super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
-        self._steps_at_pause = self._steps_of_envs()
         return self
 
     @classmethod
@@ -1139,7 +1131,7 @@ class ActPC(StoresLastTransition):
     def _excluded_save_params(self) -> list[str]:
         aliases = ["actor", "critic", "generator", "prior", "actor_target", "critic_target"]
         derived = ["expert", "_followed", "diagnostics", "actor_guidance"]
-        derived += ["_awaits_parameters", "_steps_at_pause", "_is_stepping"]
+        derived += ["_awaits_parameters", "_described", "_is_stepping"]
         return [*super()._excluded_save_params(), *aliases, *derived]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
