@@ -300,13 +300,13 @@ def test_noise_of_several_environments_is_that_of_one_in_another_number_of_them(
 
 
 def test_the_keywords_of_an_agents_policy_are_those_of_the_loaded_one(tmp_path):
-    """What demonstrations add to them is none that the user has given."""
+    """The deployment gate is guidance's, not the user's."""
     imitating().save(tmp_path / "agent")
-    for given in ({"net_arch": [16, 16]}, {"net_arch": [16, 16], "is_gated": True}):
-        assert ActPC.load(tmp_path / "agent", policy_kwargs=given).policy.is_gated
-    for other in ({"net_arch": [16, 16], "is_gated": False}, {"net_arch": [8]}):
-        with pytest.raises(ValueError, match=re.escape(f"specified kwargs: {other}")):  # as they were given
-            ActPC.load(tmp_path / "agent", policy_kwargs=other)
+    assert ActPC.load(tmp_path / "agent", policy_kwargs={"net_arch": [16, 16]}).policy.is_gated
+    with pytest.raises(ValueError, match=re.escape("specified kwargs: {'net_arch': [8]}")):
+        ActPC.load(tmp_path / "agent", policy_kwargs={"net_arch": [8]})
+    with pytest.raises(ValueError, match="policy_kwargs has 'is_gated', which guidance sets"):
+        imitating(policy_kwargs={"is_gated": False})
 
 
 @pytest.mark.parametrize("answer", [NotImplementedError, AttributeError, False])
