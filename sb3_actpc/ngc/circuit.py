@@ -70,6 +70,7 @@ class NGCCircuit(nn.Module):
     :raises ValueError: when a keyword has a value that is not allowed, or conflicts with ``settling="scheduled"``
     """
 
+    chain_class: type[SettlingChain] = SettlingChain  # how errors come back; a subclass of the circuit may have another
     rates: th.Tensor
     optimizer: th.optim.Optimizer  # of :meth:`parameter_groups`; set by whoever wants the circuit to learn
 
@@ -316,7 +317,7 @@ class NGCCircuit(nn.Module):
             self.memory_weight,
             self.normalization == "layer",
         )
-        return SettlingChain(self.synapses, settings, x, memory)
+        return self.chain_class(self.synapses, settings, x, memory)
 
     def _as_input(self, x: th.Tensor) -> th.Tensor:
         """``x``, checked; of an ensemble the same for every member, (M, B, n_inputs)."""
