@@ -1,34 +1,29 @@
 """ActPC: active predictive coding as a Stable-Baselines3 algorithm (Ororbia & Mali, arXiv 2209.09174, Algorithm 1)."""
 
-import time
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, TypeVar
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
-from sb3_actpc.actpc.base import ActPCBase, has_progress_bar, make_guidance
+from sb3_actpc.actpc.base import ActPCBase
 from sb3_actpc.actpc.buffers import SignalReplay, relabels
-from sb3_actpc.actpc.diagnostics import Diagnostics
 from sb3_actpc.actpc.environments import last_observations
 from sb3_actpc.actpc.features import Batch
 from sb3_actpc.actpc.policies import POLICIES, ActPCPolicy
 from sb3_actpc.actpc.reward_signals import InternalSignals
 from sb3_actpc.actpc.validation import (
-    check_observations,
     check_own_learning_rates,
     check_policy,
     check_step,
     warn_of_endless_episodes,
 )
-from sb3_actpc.checkpoints import between_updates
 from sb3_actpc.demonstrations.dataset import Demonstrations
 from sb3_actpc.demonstrations.recording import ENDLESS
 from sb3_actpc.guidance import ActorGuidance
@@ -47,9 +42,8 @@ from sb3_actpc.utils.arguments import (
     check_train_freq,
     checked,
 )
-from sb3_actpc.utils.checks import Settings, check_finite, check_kind
+from sb3_actpc.utils.checks import Settings, check_finite
 
-SelfActPC = TypeVar("SelfActPC", bound="ActPC")
 # the mean absolute action-value that divides the critic term is at least this: before any reward was seen, the critic's
 # noise must not be scaled up to full strength
 SMALLEST_VALUE_SCALE = 1.0
@@ -245,83 +239,6 @@ class ActPC(ActPCBase):
         if _init_setup_model:
             self._setup_model()
             check_own_learning_rates(self.policy.kwargs_of, self.lr_schedule(1.0))
-
-    # ------------------------------------------------------------------ setting up
-
-    def _setup_model(self) -> None:
-        if self.action_space is None:
-            raise ValueError("env=None: an environment or the id of one is needed, such as 'Pendulum-v1'")
-        self._check_actions()
-        self._check_agreement()
-        self.actor_guidance = make_guidance(self.guidance, self.guidance_kwargs)
-        self._setup_lr_schedule()
-        self.set_random_seed(self.seed)
-        self.policy = self._make_policy().to(self.device)
-        self.actor = self.policy.actor
-        self.critic = self.policy.critic
-        self.generator = self.policy.generator
-        self.prior = self.policy.prior
-        self.actor_target = self.policy.actor_target
-        self.critic_target = self.policy.critic_target
-        self.diagnostics = Diagnostics(self.policy)
-        self._setup_signals()
-        if self.replay_buffer is None:
-            self.replay_buffer = self._make_replay_buffer()
-        self._convert_train_freq()
-        self._setup_demonstrations()
-
-    # ------------------------------------------------------------------ before learning
-
-    def learn(
-        self: SelfActPC,
-        total_timesteps: int,
-        callback: MaybeCallback = None,
-        log_interval: int = 4,
-        tb_log_name: str = "ActPC",
-        reset_num_timesteps: bool = True,
-        progress_bar: bool = False,
-    ) -> SelfActPC:
-        """As in SB3, after BC pre-training (:meth:`pretrain`) where there are demonstrations; ValueError for a bad number of
-        environment steps, and where something that was set since does not fit."""
-        check_kind("total_timesteps", total_timesteps, float)
-        Between(0)("total_timesteps", total_timesteps)
-        try:
-            super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
-        except BaseException:
-            if self._is_stepping:  # a transition was lost: the next ``learn`` resets the environments
-                self._last_obs = None
-            raise
-        return self
-
-    def _setup_learn(
-        self,
-        total_timesteps: int,
-        callback: MaybeCallback = None,
-        reset_num_timesteps: bool = True,
-        tb_log_name: str = "run",
-        progress_bar: bool = False,
-    ) -> tuple[int, BaseCallback]:
-        self._check_agreement()
-        check_own_learning_rates(self.policy.kwargs_of, self.lr_schedule(1.0))
-        self._continue_episodes(reset_num_timesteps)
-        total_timesteps, callback = super()._setup_learn(
-            total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
-        )
-        check_observations(self._last_obs, self.num_timesteps)
-        self._update_demonstrations()
-        if self.verbose and self._described != self.describe():
-            self._described = self.describe()
-            print(self._described, flush=True)
-        self.pretrain(between_updates(callback), has_progress_bar(callback))
-        self.start_time = time.time_ns()  # of the frames per second: pre-training has none
-        return total_timesteps, callback
-
-    def _cut_running_episodes(self) -> None:
-        """The environments are reset in mid-episode."""
-        self._rollout_state = None
-        self._rollout_starts = np.ones(self.n_envs, dtype=bool)
-        self.replay_buffer.cut_running_episodes()
-        self.actor_guidance.on_reset()
 
     # ------------------------------------------------------------------ collecting (Algorithm 1, lines 8 to 16)
 

@@ -1,22 +1,24 @@
 """What stands between SB3 and Algorithm 1: the agent's parts, demonstrations, batches and what is said of them."""
 
 import sys
+import time
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback, ProgressBarCallback
 from stable_baselines3.common.noise import VectorizedActionNoise
-from stable_baselines3.common.type_aliases import GymEnv
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 from tqdm import tqdm
 
 from sb3_actpc.actpc.buffers import SignalReplay, combined_buffer_class
 from sb3_actpc.actpc.demonstration_replay import DemonstrationReplay
+from sb3_actpc.actpc.diagnostics import Diagnostics
 from sb3_actpc.actpc.features import Batch, CircuitInputs, minibatches
 from sb3_actpc.actpc.persistence import NEED_DEMONSTRATIONS, Persistent
 from sb3_actpc.actpc.policies import ActPCActor, ActPCPolicy
@@ -27,15 +29,20 @@ from sb3_actpc.actpc.validation import (
     check_agreement,
     check_buffer_kwargs,
     check_goal_env,
+    check_observations,
+    check_own_learning_rates,
     check_policy_kwargs,
     finite_bounds,
     warn_of_idle_settings,
 )
+from sb3_actpc.checkpoints import between_updates
 from sb3_actpc.demonstrations.mixin import LearnsFromDemonstrations
 from sb3_actpc.guidance import ActorGuidance, BehaviorGuidance, GuidanceConfig, GuidanceContext
 from sb3_actpc.guidance.base import ImitationBatch
-from sb3_actpc.utils.checks import Settings, check_finite, named_in_errors, nearest
+from sb3_actpc.utils.arguments import Between
+from sb3_actpc.utils.checks import Settings, check_finite, check_kind, named_in_errors, nearest
 
+SelfBase = TypeVar("SelfBase", bound="ActPCBase")
 RESCORING_INTERVAL = 1000  # updates between two evaluations of the demonstrations' signals
 
 
@@ -47,8 +54,9 @@ class ActPCBase(LearnsFromDemonstrations, Persistent):
     """
 
     action_space: spaces.Box
-    replay_buffer: SignalReplay
+    policy: ActPCPolicy
     actor: ActPCActor
+    replay_buffer: SignalReplay
     settling: str
     guidance: ActorGuidance | str
     guidance_kwargs: Settings | None
@@ -64,6 +72,8 @@ class ActPCBase(LearnsFromDemonstrations, Persistent):
     observation_normalization: str
     prior_updates: int
     _used_demonstrations: tuple[Any, ...]
+    _described: str
+    _is_stepping: bool
 
     @property
     def pretrained(self) -> bool:
@@ -86,6 +96,28 @@ class ActPCBase(LearnsFromDemonstrations, Persistent):
         return self.alpha_ext, self.alpha_ep, 0.0 if self.demonstrations is None else self.alpha_in
 
     # ------------------------------------------------------------------ parts
+
+    def _setup_model(self) -> None:
+        if self.action_space is None:
+            raise ValueError("env=None: an environment or the id of one is needed, such as 'Pendulum-v1'")
+        self._check_actions()
+        self._check_agreement()
+        self.actor_guidance = make_guidance(self.guidance, self.guidance_kwargs)
+        self._setup_lr_schedule()
+        self.set_random_seed(self.seed)
+        self.policy = self._make_policy().to(self.device)
+        self.actor = self.policy.actor
+        self.critic = self.policy.critic
+        self.generator = self.policy.generator
+        self.prior = self.policy.prior
+        self.actor_target = self.policy.actor_target
+        self.critic_target = self.policy.critic_target
+        self.diagnostics = Diagnostics(self.policy)
+        self._setup_signals()
+        if self.replay_buffer is None:
+            self.replay_buffer = self._make_replay_buffer()
+        self._convert_train_freq()
+        self._setup_demonstrations()
 
     def _check_agreement(self) -> None:
         every = self.train_freq
@@ -256,7 +288,58 @@ class ActPCBase(LearnsFromDemonstrations, Persistent):
             if self._last_original_obs is not None:
                 self._last_obs = normalize.normalize_obs(self._last_original_obs)
 
-    # ------------------------------------------------------------------ what learning needs
+    # ------------------------------------------------------------------ learn
+
+    def learn(
+        self: SelfBase,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 4,
+        tb_log_name: str = "ActPC",
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> SelfBase:
+        """As in SB3, after BC pre-training (:meth:`pretrain`) where there are demonstrations; ValueError for a bad number of
+        environment steps, and where something that was set since does not fit."""
+        check_kind("total_timesteps", total_timesteps, float)
+        Between(0)("total_timesteps", total_timesteps)
+        try:
+            super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+        except BaseException:
+            if self._is_stepping:  # a transition was lost: the next ``learn`` resets the environments
+                self._last_obs = None
+            raise
+        return self
+
+    def _setup_learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        reset_num_timesteps: bool = True,
+        tb_log_name: str = "run",
+        progress_bar: bool = False,
+    ) -> tuple[int, BaseCallback]:
+        self._check_agreement()
+        check_own_learning_rates(self.policy.kwargs_of, self.lr_schedule(1.0))
+        self._continue_episodes(reset_num_timesteps)
+        total_timesteps, callback = super()._setup_learn(
+            total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
+        )
+        check_observations(self._last_obs, self.num_timesteps)
+        self._update_demonstrations()
+        if self.verbose and self._described != self.describe():
+            self._described = self.describe()
+            print(self._described, flush=True)
+        self.pretrain(between_updates(callback), has_progress_bar(callback))
+        self.start_time = time.time_ns()  # of the frames per second: pre-training has none
+        return total_timesteps, callback
+
+    def _cut_running_episodes(self) -> None:
+        """The environments are reset in mid-episode."""
+        self._rollout_state = None
+        self._rollout_starts = np.ones(self.n_envs, dtype=bool)
+        self.replay_buffer.cut_running_episodes()
+        self.actor_guidance.on_reset()
 
     def _continue_episodes(self, reset_num_timesteps: bool) -> None:
         """Running episodes are cut where SB3 resets the environments, or someone else has stepped in them since."""

@@ -80,7 +80,8 @@ class DemonstrationReplay:
         rewards = self._rewards(window.clip(max=len(self) - 1), inputs, weights, signals or STORED) * counts * gamma**steps
         following = self._next(rows, inputs) if n_steps > 1 and weights[1] else None
         dones, discounts = self.demonstrations.terminations[last][:, None], gamma ** counts.sum(1, keepdims=True)
-        numbers = map(_single, (samples.actions, rewards.sum(1)[:, None], dones, discounts))
+        columns = samples.actions, rewards.sum(1)[:, None], dones, discounts
+        numbers = [column.astype(np.float32, copy=False) for column in columns]
         arrays = inputs.normalized(samples.observations), self._next(last, inputs), following, *numbers
         observed, bootstrap, following, actions, returns, dones, discounts = to_device(arrays, inputs.device)
         features, bootstrap_features = inputs.features(observed), inputs.features(bootstrap)
@@ -177,7 +178,3 @@ class DemonstrationReplay:
             self.epistemic[rows] = store[0](epistemic)
             self.instrumental[rows] = store[1](instrumental)
         self.has_signals = True
-
-
-def _single(array: np.ndarray) -> np.ndarray:
-    return array.astype(np.float32, copy=False)

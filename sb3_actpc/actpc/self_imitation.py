@@ -1,7 +1,6 @@
 """Whole episodes worth imitating: the demonstrations, and the agent's own good ones (self-imitation)."""
 
 import warnings
-from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
@@ -79,6 +78,16 @@ class Episodes:
             returns=np.repeat(demonstrations.episode_returns, lengths),
         )
 
+    def join(self, other: "Episodes") -> "Episodes":
+        """These episodes, then the ``other`` ones, whose starts count from the first of these."""
+        columns = [_concatenate([getattr(one, field.name) for one in (self, other)]) for field in fields(self)]
+        return Episodes(*columns)
+
+    def without_first(self, n: int) -> "Episodes":
+        """All but the first ``n`` rows, which are whole episodes."""
+        observations = map_observations(lambda array: array[n:], self.observations)
+        return Episodes(observations, self.actions[n:], self.starts[n:] - n, self.returns[n:])
+
     def take(self, indices: np.ndarray, history: int = 0) -> ImitationSamples:
         """(B,) rows, each with ``history`` preceding observations of the same episode."""
         past, mask = self.past(indices, history)
@@ -98,45 +107,6 @@ class Episodes:
         return map_observations(lambda array: array[np.maximum(earlier, 0)], self.observations), mask
 
 
-def _arrays(episodes: Episodes) -> list[np.ndarray]:
-    """All that has a row for each transition: observations (by key), actions, starts, returns, weights."""
-    seen = episodes.observations
-    observed = [seen[key] for key in sorted(seen)] if isinstance(seen, dict) else [seen]
-    return [*observed, episodes.actions, episodes.starts, episodes.returns, episodes.weights]
-
-
-class _Column:
-    """
-    Rows that come at the end of an array and go at its front, without a copy of the others each time.
-
-    A row stays where it is until the array has no room for the next one; then all of them move into one that has a quarter to
-    spare. None is ever written over, so that ``rows`` of before stay what they were.
-
-    :param rows: (N, ...), the first ones
-    """
-
-    def __init__(self, rows: np.ndarray) -> None:
-        self._room, self._start, self._end = rows, 0, len(rows)
-
-    @property
-    def rows(self) -> np.ndarray:
-        """(N, ...), a view."""
-        return self._room[self._start : self._end]
-
-    def shift(self, n_gone: int, new: np.ndarray) -> None:
-        """:param n_gone: how many of the first rows go
-        :param new: (n, ...), those that come"""
-        self._start += n_gone
-        if self._end + len(new) > len(self._room):
-            kept = self.rows
-            n_rows = len(kept) + len(new)
-            self._room = np.empty((n_rows + n_rows // 4, *kept.shape[1:]), kept.dtype)
-            self._room[: len(kept)] = kept
-            self._start, self._end = 0, len(kept)
-        self._room[self._end : self._end + len(new)] = new
-        self._end += len(new)
-
-
 class SelfImitationMemory:
     """The actor's memory of its own goal-reaching episodes (paper: M^actor, Algorithm 1, line 29), laid end to end.
 
@@ -149,33 +119,21 @@ class SelfImitationMemory:
     """
 
     def __init__(self, capacity: int = 100_000) -> None:
-        self.capacity, self.takes_all = capacity, False
+        self.capacity = capacity
+        self.takes_all = False
         self.returns: list[float] = []
         self.lengths: list[int] = []
         self.episodes: Episodes | None = None
-        self._n_ended, self._best_ended = 0, -np.inf
-        self._hold()
-
-    def _hold(self) -> None:
-        """What follows from the episodes that are stored."""
-        self._columns = [] if self.episodes is None else [_Column(array) for array in _arrays(self.episodes)]
-        self._size, self._n_gone = sum(self.lengths), 0
-        self._bests: deque[float] = deque()  # returns that no later one passes, the best first
-        for episode_return in self.returns:
-            self._note_return(episode_return)
-
-    def _note_return(self, episode_return: float) -> None:
-        while self._bests and self._bests[-1] < episode_return:
-            self._bests.pop()
-        self._bests.append(episode_return)
+        self._n_ended = 0
+        self._best_ended = -np.inf
 
     def __len__(self) -> int:
-        return self._size
+        return sum(self.lengths)
 
     @property
     def best_return(self) -> float:
         """The best sparse return stored; 0 while empty."""
-        return self._bests[0] if self._bests else 0.0
+        return max(self.returns, default=0.0)
 
     def takes(self, length: int, episode_return: float) -> bool:
         """Whether an episode of so many transitions, which has ended with this sparse return, is good and short enough."""
@@ -193,48 +151,16 @@ class SelfImitationMemory:
     def store(self, observations: Observations, actions: np.ndarray, episode_return: float) -> None:
         """One whole episode: observations (T, *obs_shape) or a dict of such, actions (T, A), and its sparse return."""
         n_new = len(actions)
-        starts, returns = np.full(n_new, self._n_gone + self._size), np.full(n_new, float(episode_return))
-        new = Episodes(observations, actions, starts, returns)
+        start = len(self)
+        new = Episodes(observations, actions, np.full(n_new, start), np.full(n_new, float(episode_return)))
+        episodes = new if self.episodes is None else self.episodes.join(new)
         self.lengths.append(n_new)
         self.returns.append(episode_return)
-        self._note_return(episode_return)
-        self._size += n_new
-        n_gone = self._forget_oldest()
-        if self._columns:
-            for column, array in zip(self._columns, _arrays(new), strict=True):
-                column.shift(n_gone, array)
-        else:
-            self._columns = [_Column(array) for array in _arrays(new)]
-        self.episodes = self._laid_out(observations)
-
-    def _forget_oldest(self) -> int:
-        """What is counted of the oldest episodes goes where the capacity is passed; how many transitions these had."""
         n_gone = 0
-        while self._size > self.capacity:
-            length, episode_return = self.lengths.pop(0), self.returns.pop(0)
-            n_gone, self._size = n_gone + length, self._size - length
-            if self._bests[0] == episode_return:
-                self._bests.popleft()
-        self._n_gone += n_gone
-        return n_gone
-
-    def _laid_out(self, like: Observations) -> Episodes:
-        """The columns, in the order of :func:`_arrays`; observations are a dict where those of ``like`` are one."""
-        *observed, actions, starts, returns, weights = (column.rows for column in self._columns)
-        observations = dict(zip(sorted(like), observed, strict=True)) if isinstance(like, dict) else observed[0]
-        episodes = Episodes(observations, actions, starts - self._n_gone, returns)
-        episodes.weights = weights
-        return episodes
-
-    def __getstate__(self) -> dict[str, Any]:
-        derived = ("_columns", "_size", "_n_gone", "_bests")
-        return {name: value for name, value in vars(self).items() if name not in derived}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        if state["episodes"] is not None and "returns" not in vars(state["episodes"]):
-            raise ValueError("the replay buffer is of another version of sb3_actpc: load it with that one")
-        self.__dict__.update(state)
-        self._hold()
+        while len(self) > self.capacity:
+            n_gone += self.lengths.pop(0)
+            self.returns.pop(0)
+        self.episodes = episodes.without_first(n_gone) if n_gone else episodes
 
     def checkpoint_state(self) -> dict[str, Any]:
         """The stored episodes and their returns, for a checkpoint."""
@@ -251,7 +177,6 @@ class SelfImitationMemory:
         self.episodes = None if state["episodes"] is None else Episodes(**state["episodes"])
         self._n_ended, best = state["ended"]
         self._best_ended = -np.inf if best is None else best
-        self._hold()
 
 
 def is_by_return(parts: list[Episodes], weighting: Weighting) -> bool:

@@ -15,6 +15,8 @@ def to_device(arrays: Any, device: th.device) -> Any:
     :param device: where the tensors are; on the CPU they share the arrays' memory
     :return: the same, of tensors
     """
+    if not isinstance(arrays, (dict, tuple)):
+        return th.as_tensor(arrays, device=device)
     if device.type == "cpu":
         return map_nested(th.as_tensor, arrays)
     kinds: dict[np.dtype, list[np.ndarray]] = {}
@@ -29,11 +31,12 @@ def to_device(arrays: Any, device: th.device) -> Any:
 
 def map_nested(function: Callable[[Any], Any], part: Any) -> Any:
     """Apply ``function`` to every array or tensor in (named) tuples and dicts; None stays None."""
-    if part is None:
-        return None
     if isinstance(part, dict):
-        return {key: map_nested(function, value) for key, value in part.items()}
-    if isinstance(part, tuple):
-        mapped = [map_nested(function, value) for value in part]
-        return type(part)(*mapped) if hasattr(part, "_fields") else tuple(mapped)
-    return function(part)
+        return dict(zip(part, map_nested(function, tuple(part.values())), strict=True))
+    mapped: list[Any] = []
+    for value in part:
+        if isinstance(value, (dict, tuple)):
+            mapped.append(map_nested(function, value))
+        else:
+            mapped.append(None if value is None else function(value))
+    return type(part)(*mapped) if hasattr(part, "_fields") else tuple(mapped)

@@ -191,19 +191,6 @@ def test_the_memory_is_its_last_episodes_laid_end_to_end(halfway, with_keys):
         assert_equal(*drawn, "what is drawn")
 
 
-def test_storing_an_episode_seldom_copies_the_others_and_changes_nothing_that_was_laid_out():
-    """Over 2,000 episodes a row is copied a few times on average, not once for each later episode."""
-    memory, n_copied, before = SelfImitationMemory(300), 0, []
-    for seen, actions, paid in random_episodes(2000, np.random.default_rng(0)):
-        old = memory.episodes
-        memory.store(seen, actions, paid)
-        if old is not None and not np.shares_memory(old.observations, memory.episodes.observations):
-            n_copied += len(memory)
-        before.append((memory.episodes, memory.episodes.observations.copy(), memory.episodes.starts.copy()))
-    assert n_copied < 6 * 2000 * 4.5
-    assert all(np.array_equal(one.observations, seen) and np.array_equal(one.starts, starts) for one, seen, starts in before)
-
-
 @pytest.mark.parametrize(("given", "capacity"), [(None, 20), (0, None), (7, 7), (50, 50)])
 def test_the_memory_of_own_episodes_is_no_larger_than_the_buffer_unless_asked_for(given, capacity):
     memory = CombinedReplayBuffer(20, *SPACES, n_envs=2, self_imitation_size=given, device="cpu").self_imitation
@@ -297,15 +284,6 @@ def test_an_own_episode_that_was_paid_does_not_end_the_imitation_of_unpaid_demon
     shown, own = paid_episodes((30, 0.0)), paid_episodes((0, 0.0), (10, 0.01))
     drawn = sample_union([shown, own], 20_000, weighting="returns").observations
     assert drawn.mean() == pytest.approx(0.25, abs=0.02)
-
-
-def test_a_memory_of_another_version_says_so():
-    memory = SelfImitationMemory(10)
-    memory.store(np.zeros((2, 1)), np.zeros((2, 1)), 1.0)
-    assert pickle.loads(pickle.dumps(memory)).returns == [1.0]
-    del vars(memory.episodes)["returns"]
-    with pytest.raises(ValueError, match="of another version"):
-        pickle.loads(pickle.dumps(memory))
 
 
 @pytest.mark.parametrize("unpaid", [0.0, -5.0])

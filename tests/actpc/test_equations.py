@@ -52,15 +52,6 @@ def test_demonstrated_steps_are_rewarded_by_surprise_and_punished_for_leaving_th
     assert model.expert.epistemic.min() > 0.0 > model.expert.instrumental.max()
 
 
-def test_a_second_learn_leaves_the_prior_alone():
-    """The paper trains it once, before the task, and freezes it."""
-    model = make(learning_starts=20, demonstrations=demonstrations())
-    model.learn(10)
-    before = [weights.clone() for weights in model.prior.weights]
-    model.learn(10)
-    assert all(th.equal(*pair) for pair in zip(before, model.prior.weights, strict=True))
-
-
 def test_the_bootstrapped_action_is_that_of_the_next_observation_with_the_memory_it_will_have():
     """μ'(o_t+1, m_t+1), where m_t+1 holds o_t: with m_t the target actor would act on what it had forgotten."""
     model = make(learning_starts=20, policy_kwargs={"memory_history": 3})
@@ -72,27 +63,3 @@ def test_the_bootstrapped_action_is_that_of_the_next_observation_with_the_memory
     values = model.critic_target.project(th.cat([batch.bootstrap_features, next_actions], dim=1))
     expected = batch.rewards + (1.0 - batch.dones) * model.gamma * values
     th.testing.assert_close(model.critic_targets(batch), expected)
-
-
-def test_the_target_actor_begins_where_the_warm_start_ends():
-    model = make(
-        learning_starts=20,
-        guidance="default",
-        guidance_kwargs={"bc_updates": 3, "gate": False},
-        demonstrations=demonstrations(),
-    )
-    before = model.actor.circuit.weights[0].clone()
-    model.learn(1)
-    assert not th.equal(before, model.actor.circuit.weights[0])
-    assert all(th.equal(*pair) for pair in zip(model.actor_target.weights, model.actor.circuit.weights, strict=True))
-
-
-def test_the_next_steps_memory_is_the_one_that_the_next_transition_has():
-    model = make(learning_starts=100, policy_kwargs={"memory_history": 3})
-    model.learn(40)
-    buffer = model.replay_buffer
-    rows = np.flatnonzero(buffer.dones[:39, 0] == 0)  # whose episode goes on
-    batches = [buffer._gather(these, np.zeros_like(these), None) for these in (rows, rows + 1)]
-    now, then = (model.inputs.replayed(batch, model.reward_weights, model.gamma) for batch in batches)
-    assert then.memory.abs().max() > 0.0
-    th.testing.assert_close(now.next_memory, then.memory)
