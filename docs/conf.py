@@ -19,8 +19,6 @@ version = release = __version__
 
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.viewcode"]
 exclude_patterns = ["_build", "jupyter_execute"]
-# a page that the index names by a pattern may not be written yet
-suppress_warnings = ["toc.empty_glob"]
 html_theme = "furo"
 html_title = "sb3_actpc"
 html_static_path = ["_static"]
@@ -28,10 +26,10 @@ html_theme_options = {"navigation_with_keys": True}
 
 myst_enable_extensions = ["colon_fence", "deflist"]
 myst_heading_anchors = 3
-# every notebook is executed by every build; an error in a cell ends the build
-nb_execution_mode = "force"
+# a notebook is executed when it has changed since the last build; an error in a cell ends the build
+nb_execution_mode = "cache"
 nb_execution_raise_on_error = True
-nb_execution_timeout = 600  # seconds, of one cell
+nb_execution_timeout = 1800  # seconds, of one cell
 nb_execution_in_temp = True
 nb_merge_streams = True
 
