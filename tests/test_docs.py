@@ -1,8 +1,16 @@
-"""What docs/paper.md names exists."""
+"""What docs/paper.md names exists, and docs/metrics.md names all that is logged."""
 
 import ast
 import re
 from pathlib import Path
+
+import pytest
+from stable_baselines3.common.logger import KVWriter, Logger
+from stable_baselines3.common.monitor import Monitor
+
+from sb3_actpc import ActPC
+from tests.actpc.agents import imitating
+from tests.actpc.envs import CountingEnv
 
 ROOT = Path(__file__).parents[1]
 TEXT = (ROOT / "docs" / "paper.md").read_text(encoding="utf-8")
@@ -34,3 +42,36 @@ def test_every_difference_that_is_referred_to_is_listed() -> None:
     assert numbers == list(range(1, len(numbers) + 1))
     referred = {int(number) for number in re.findall(r"\bD(\d+)\b", tables)}
     assert referred <= set(numbers) and len(referred) >= 10
+
+
+class Keys(KVWriter):
+    """What was logged."""
+
+    def __init__(self) -> None:
+        self.logged: set[str] = set()
+
+    def write(self, key_values, key_excluded, step=0) -> None:
+        self.logged |= set(key_values)
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+
+@pytest.mark.parametrize("settling", ["scheduled", "iterative"])
+def test_every_logged_key_is_in_the_table_of_metrics(settling: str) -> None:
+    keys = Keys()
+    signals = {"alpha_ep": 0.1, "alpha_in": 0.1}
+    guidance = {"bc_updates": 5, "critic_warmup": 5}
+    model: ActPC = imitating(
+        lambda: Monitor(CountingEnv()), settling=settling, prior_updates=5, guidance_kwargs=guidance, **signals
+    )
+    model.set_logger(Logger(None, [keys]))
+    model.learn(200)
+    keys_section = (ROOT / "docs" / "metrics.md").read_text(encoding="utf-8").split("\n## ")[1]
+    named = re.findall(r"^\| `([\w/{}]+)` \|", keys_section, flags=re.MULTILINE)
+    patterns = [name.replace("{circuit}", "(actor|critic|generator|prior)").replace("{layer}", r"\d+") for name in named]
+    missing = {key for key in keys.logged if not any(re.fullmatch(pattern, key) for pattern in patterns)}
+    assert missing == set()
+    unseen = [name for name, one in zip(named, patterns, strict=True) if not any(re.fullmatch(one, k) for k in keys.logged)]
+    optional = ("eval/", "rollout/success_rate", "train/deployed_return")  # of runs on the command line, and longer ones
+    assert [name for name in unseen if not name.startswith(optional)] == []

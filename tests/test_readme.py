@@ -2,10 +2,10 @@
 
 import re
 import shlex
+from functools import wraps
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 import yaml
@@ -14,6 +14,7 @@ from sb3_actpc import ActPC
 from sb3_actpc.cli import build_parser
 from sb3_actpc.demonstrations import Demonstrations
 from sb3_actpc.experiments.comparison import plan_runs, read_comparison
+from sb3_actpc.experiments.runs.presets import read_yaml
 
 ROOT = Path(__file__).parents[1]
 PAGES = ["README.md", *(f"docs/{path.name}" for path in sorted((ROOT / "docs").glob("*.md")))]
@@ -78,15 +79,43 @@ def test_the_circuit_of_the_readme_learns() -> None:
     assert energies[-1] < energies[0]
 
 
-def test_the_agent_and_the_demonstrations_of_the_readme_can_be_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    quick, recorded, made, *_ = blocks("README.md", "python")
-    exec(quick[: quick.index("model.learn")], {})
+SNIPPETS = [(page, index) for page in PAGES for index in range(len(blocks(page, "python")))]
+
+
+@pytest.mark.parametrize(("page", "index"), SNIPPETS)
+def test_every_snippet_runs_as_written_by_itself_and_shows_something(page, index, tmp_path, monkeypatch, capsys) -> None:
+    """Only training is shortened."""
+    learn, init = ActPC.learn, ActPC.__init__
+
+    def learn_a_little(self: ActPC, total_timesteps: int, *args: Any, **options: Any) -> ActPC:
+        return learn(self, min(total_timesteps, 40), *args, **options)
+
+    @wraps(init)
+    def clone_a_little(self: ActPC, *args: Any, **options: Any) -> None:
+        short = {"guidance_kwargs": {"bc_updates": 20}} if options.get("demonstrations") is not None else {}
+        init(self, *args, **{**short, **options})
+
+    monkeypatch.setattr(ActPC, "learn", learn_a_little)
+    monkeypatch.setattr(ActPC, "__init__", clone_a_little)
     monkeypatch.chdir(tmp_path)
-    for block in (recorded, made):
-        names: dict[str, Any] = {"policy": lambda observation: np.zeros(1)}
+    exec(blocks(page, "python")[index], {"__name__": "__main__"})
+    assert capsys.readouterr().out.strip()
+
+
+def test_demonstrations_recorded_as_the_readme_says_train_an_agent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for block in blocks("README.md", "python")[1:3]:
+        names: dict[str, Any] = {}
         exec(block, names)
         ActPC("MlpPolicy", "Pendulum-v1", demonstrations=names["recorded"])
     assert Demonstrations.load("mine.npz").n_episodes == 20
+
+
+def test_the_steps_of_the_readme_are_the_preset_s() -> None:
+    entries = read_yaml((ROOT / "hyperparams" / "actpc.yml").read_bytes(), "actpc.yml")
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    numbers = [int(number.replace("_", "")) for number in re.findall(r"(?:\.learn\(| -n )([\d_]{4,})", text)]
+    assert numbers == [entries["SparseHopper-v5"]["n_timesteps"]] * 2
 
 
 def test_the_file_of_the_comparisons_page_is_one() -> None:

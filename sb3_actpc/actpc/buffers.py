@@ -1,7 +1,6 @@
 """Replay buffers: combined experience replay, the two internal signals, self-imitation and rebuilt working memory."""
 
 import warnings
-from collections.abc import Callable
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
@@ -14,16 +13,29 @@ from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 from sb3_actpc.actpc.reward_signals import STORED, Normalize
 from sb3_actpc.actpc.self_imitation import Observations, SelfImitationMemory, TensorObservations
 from sb3_actpc.actpc.transfer import to_device
+from sb3_actpc.actpc.validation import check_buffer_class, check_n_steps
 from sb3_actpc.utils.arguments import Between, Share, Size, checked
 from sb3_actpc.utils.checks import LARGEST_SIZE
 from sb3_actpc.utils.nested import map_observations
 
 OWN_TRANSITIONS = 100_000  # that the self-imitation memory keeps, of a buffer that keeps more
-# (observations, actions, next observations, the working memory's past and which of it there was) of n_envs new transitions ->
-# their epistemic and instrumental signals, (n_envs,) each
-Score = Callable[
-    [Observations, np.ndarray, Observations, Observations | None, np.ndarray | None], tuple[np.ndarray, np.ndarray]
-]
+
+
+class NewestTransitions(NamedTuple):
+    """The last transition of every environment, in numpy and not normalised.
+
+    :param observations: (n_envs, *obs_shape), or a dict of such
+    :param actions: (n_envs, A), scaled to [-1, 1]
+    :param next_observations: as ``observations``
+    :param history: the observations before, (n_envs, H, *obs_shape), oldest first; None without a working memory
+    :param history_mask: (n_envs, H), 1 where there was such an observation, or None
+    """
+
+    observations: Observations
+    actions: np.ndarray
+    next_observations: Observations
+    history: Observations | None
+    history_mask: np.ndarray | None
 
 
 class SignalReplaySamples(NamedTuple):
@@ -104,34 +116,30 @@ class SignalReplay(ReplayBuffer):
     # ------------------------------------------------------------------ storing
 
     def add(
-        self,
-        obs: Any,
-        next_obs: Any,
-        action: np.ndarray,
-        reward: np.ndarray,
-        done: np.ndarray,
-        infos: list[dict[str, Any]],
-        score: Score | None = None,
+        self, obs: Any, next_obs: Any, action: np.ndarray, reward: np.ndarray, done: np.ndarray, infos: list[dict[str, Any]]
     ) -> None:
-        """As SB3's: store a transition of every environment, with its signals, which ``score`` gives (None for zeros)."""
+        """As SB3's: store a transition of every environment. Its signals are 0 until :meth:`store_signals`."""
         super().add(obs, next_obs, action, reward, done, infos)
-        newest = self.newest
-        signals: tuple[Any, Any] = (0.0, 0.0)
-        if score is not None:
-            past, mask = self._past_at(np.full(self.n_envs, newest), np.arange(self.n_envs))
-            signals = score(self._as_stored(obs), self.actions[newest], self._as_stored(next_obs), past, mask)
-        self.epistemic[newest], self.instrumental[newest] = signals
+        self.store_signals(0.0, 0.0)
         self._lengths += 1
         for env in np.flatnonzero(done):
             self._offer_episode(int(env))
             self._lengths[env] = 0
 
-    def _as_stored(self, observations: Any) -> Observations:
-        """Observations in the shape and precision in which they will be sampled."""
-        if isinstance(self.observations, dict):
-            rings = self.observations.items()
-            return {key: np.asarray(observations[key], ring.dtype).reshape(ring.shape[1:]) for key, ring in rings}
-        return np.asarray(observations, self.observations.dtype).reshape(self.observations.shape[1:])
+    def newest_transitions(self) -> NewestTransitions:
+        """The last transition of every environment, as it is stored: n_envs rows of each part."""
+        envs = np.arange(self.n_envs)
+        rows = np.full(self.n_envs, self.newest)
+        past, mask = self._past_at(rows, envs)
+        observations = self._observations_at(rows, envs, None)
+        return NewestTransitions(
+            observations, self.actions[rows, envs], self._next_observations_at(rows, envs, None), past, mask
+        )
+
+    def store_signals(self, epistemic: np.ndarray | float, instrumental: np.ndarray | float) -> None:
+        """Both signals of the newest transitions, (n_envs,) each."""
+        self.epistemic[self.newest] = epistemic
+        self.instrumental[self.newest] = instrumental
 
     def _offer_episode(self, env: int) -> None:
         """Copy the episode that has just ended into the self-imitation memory, if it is good enough and all there."""
@@ -148,6 +156,11 @@ class SignalReplay(ReplayBuffer):
     def running_lengths(self) -> np.ndarray:
         """(n_envs,), steps of the running episodes."""
         return self._lengths
+
+    @property
+    def can_sample(self) -> bool:
+        """Whether there is anything to draw."""
+        return self.size() > 0
 
     @property
     def newest(self) -> int:
@@ -172,7 +185,7 @@ class SignalReplay(ReplayBuffer):
         :param gamma: their discount
         :raises ValueError: for several steps where they cannot be had
         """
-        _check_n_steps(n_steps, type(self), self.optimize_memory_usage)
+        check_n_steps(n_steps, relabels(type(self)), self.optimize_memory_usage)
         self.n_steps, self.gamma = n_steps, gamma
 
     def forget_own_episodes(self) -> None:
@@ -364,7 +377,7 @@ class CombinedHerReplayBuffer(SignalReplay, HerReplayBuffer):  # type: ignore[mi
         self.random_goals = random_goals
 
     @property
-    def has_episodes(self) -> bool:
+    def can_sample(self) -> bool:
         """Whether an episode has ended, so that there is hindsight."""
         return bool(self.ep_length[: self.size()].any())
 
@@ -428,12 +441,6 @@ def relabels(given: Any) -> bool:
     return isinstance(kind, type) and issubclass(kind, HerReplayBuffer)
 
 
-def _check_n_steps(n_steps: int, kind: type | None, optimize_memory_usage: bool = False) -> None:
-    for in_the_way, name in ((relabels(kind), "hindsight relabelling"), (optimize_memory_usage, "optimize_memory_usage=True")):
-        if in_the_way and n_steps > 1:
-            raise ValueError(f"n_steps={n_steps} does not work with {name}; use n_steps=1 or leave it out")
-
-
 def combined_buffer_class(
     given: type[ReplayBuffer] | str | None, observation_space: spaces.Space, n_steps: int = 1
 ) -> type[SignalReplay]:
@@ -442,14 +449,8 @@ def combined_buffer_class(
         if given not in _BY_NAME:
             raise ValueError(f"replay_buffer_class={given!r} is unknown; choose one of {list(_BY_NAME)}")
         given = _BY_NAME[given]
-    if given is not None and not (isinstance(given, type) and issubclass(given, ReplayBuffer)):
-        raise ValueError(f"replay_buffer_class={given!r} must be None or a subclass of SB3's ReplayBuffer")
-    _check_n_steps(n_steps, given)
-    if given is not None and issubclass(given, DictReplayBuffer) != isinstance(observation_space, spaces.Dict):
-        fix = "DictReplayBuffer, HerReplayBuffer" if isinstance(observation_space, spaces.Dict) else "ReplayBuffer"
-        raise ValueError(
-            f"replay_buffer_class={given.__name__} does not keep observations of {observation_space}: use {fix} or None"
-        )
+    check_n_steps(n_steps, relabels(given))
+    check_buffer_class(given, observation_space)
     if given is None and isinstance(observation_space, spaces.Dict):
         return CombinedDictReplayBuffer
     if given is None:

@@ -1,12 +1,13 @@
 """The demonstrations, as the agent uses them: imitated by the actor, predicted by the prior, mixed into the critic's batch."""
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
+from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_actpc.actpc.features import Batch, CircuitInputs
 from sb3_actpc.actpc.reward_signals import STORED, Normalize
@@ -15,7 +16,7 @@ from sb3_actpc.actpc.transfer import to_device
 from sb3_actpc.demonstrations.dataset import Demonstrations
 from sb3_actpc.demonstrations.rows import split_observations
 
-RawSignals = Callable[[th.Tensor, th.Tensor, th.Tensor, th.Tensor | None], tuple[np.ndarray, np.ndarray]]
+Score = Callable[[th.Tensor, th.Tensor, th.Tensor, th.Tensor | None], tuple[np.ndarray, np.ndarray]]
 # environment steps before their rewards are compared with the demonstrated ones, and how many times larger one may be
 ENOUGH_REWARDS, OTHER_SCALE = 500, 30.0
 
@@ -118,6 +119,24 @@ class DemonstrationReplay:
         )
         return weights[0] * task + weights[1] * epistemic + weights[2] * instrumental
 
+    def features(self, inputs: CircuitInputs) -> th.Tensor:
+        """(N, n_features) of all observations, some at a time: there can be many images."""
+        parts = [inputs.observations(observations) for observations in self._parts()]
+        return th.cat([inputs.features(part) for part in parts])
+
+    def show_to(self, normalize: VecNormalize) -> None:
+        """Statistics of VecNormalize take in all observations, before anything learns from these."""
+        for observations in self._parts():
+            if isinstance(normalize.obs_rms, dict):
+                for key, statistics in normalize.obs_rms.items():
+                    statistics.update(observations[key])
+            else:
+                normalize.obs_rms.update(observations)
+
+    def _parts(self) -> Iterator[Any]:
+        for rows in np.array_split(np.arange(len(self)), 1 + len(self) // 1024):
+            yield self.episodes.take(rows).observations
+
     def check_scale(self, rewards: np.ndarray) -> None:
         """
         Warn, once, where the environment's rewards cannot have the scale of the demonstrated ones.
@@ -143,17 +162,20 @@ class DemonstrationReplay:
                 stacklevel=2,
             )
 
-    def refresh_signals(
-        self, raw_signals: RawSignals, inputs: CircuitInputs, epistemic: Normalize, instrumental: Normalize
-    ) -> None:
-        """Signals of all transitions under the present generator and prior: from the summed squared errors of both circuits,
-        by (features, actions, next features, memory), and what is stored of each of the two."""
+    def rescore(self, score: Score, inputs: CircuitInputs, store: tuple[Normalize, Normalize]) -> None:
+        """
+        Signals of all transitions under the present circuits.
+
+        :param score: (features, actions, next features, memory) -> r̂ of both signals, (B,) each
+        :param inputs: turns observations into features
+        :param store: what is stored of the epistemic and of the instrumental r̂
+        """
         for start in range(0, len(self), 1024):
             rows = np.arange(start, min(start + 1024, len(self)))
             batch = self.batch(rows, inputs, (0.0, 0.0, 0.0), 0.0)
-            raw_ep, raw_in = raw_signals(batch.features, batch.actions, batch.next_features, batch.memory)
-            self.epistemic[rows] = epistemic(raw_ep)
-            self.instrumental[rows] = instrumental(raw_in)
+            epistemic, instrumental = score(batch.features, batch.actions, batch.next_features, batch.memory)
+            self.epistemic[rows] = store[0](epistemic)
+            self.instrumental[rows] = store[1](instrumental)
         self.has_signals = True
 
 

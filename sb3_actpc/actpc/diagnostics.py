@@ -50,6 +50,23 @@ class Diagnostics:
             elif self.active:
                 self.values[key] = float(value())
 
+    def rewards(
+        self, n_updates: int, n_batches: int, delay: int, combined: th.Tensor, task: th.Tensor, alpha_ext: float
+    ) -> None:
+        """
+        Means of the internal and of the task's reward, where one of the next ``n_batches`` updates is measured.
+
+        :param n_updates: updates so far
+        :param n_batches: updates that the rewards are for
+        :param delay: updates for each of the actor
+        :param combined: (B, 1), the rewards that the critic learns from
+        :param task: (B, 1), the task's
+        :param alpha_ext: weight of the task's
+        """
+        numbers = range(n_updates + 1, n_updates + 1 + n_batches)
+        if len(task) and any(self.is_due(number, delay) for number in numbers):
+            self.follow(internal_reward=float((combined - alpha_ext * task).mean()), task_reward=float(task.mean()))
+
     def settled(self, name: str, state: SettledState) -> None:
         """Energy (batch mean) and settling residual of a circuit."""
         if self.active:

@@ -1,5 +1,6 @@
 """What the circuits see: normalised features of observations, and the working memory rebuilt from their past."""
 
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -73,6 +74,27 @@ class Batch(NamedTuple):
         order[keep:] = keep + th.randperm(max(len(order) - keep, 0), device=order.device)
         columns: list[Any] = [None if column is None else column[order] for column in self]
         return Batch(*columns)
+
+
+def minibatches(
+    replayed: Batch, demonstrated: Batch | None, n_batches: int, n_newest: int, is_shuffled: bool
+) -> Iterator[Batch]:
+    """
+    Minibatches of transitions that were sampled together: the newest in each, then replayed ones, then demonstrated ones.
+
+    :param replayed: the ``n_newest`` newest transitions, then those of all minibatches
+    :param demonstrated: those of all minibatches, or None
+    :param n_batches: how many
+    :param n_newest: rows that all minibatches share
+    :param is_shuffled: whether all but the newest rows come in random order
+    """
+    n_replayed = n_newest + (len(replayed.features) - n_newest) // n_batches
+    n_demonstrated = 0 if demonstrated is None else len(demonstrated.features) // n_batches
+    for index in range(n_batches):
+        batch = replayed.minibatch(index, n_replayed, n_newest)
+        if demonstrated is not None:
+            batch = batch.join(demonstrated.minibatch(index, n_demonstrated))
+        yield batch.shuffled(keep=n_newest) if is_shuffled else batch
 
 
 class CircuitInputs:

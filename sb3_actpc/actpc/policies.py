@@ -3,7 +3,6 @@
 import copy
 import inspect
 import warnings
-from collections.abc import Mapping
 from typing import Annotated, Any
 
 import numpy as np
@@ -16,7 +15,6 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
 from sb3_actpc.ngc import NGCCircuit, WorkingMemory, check_agreement
-from sb3_actpc.ngc.activations import ACTIVATIONS
 from sb3_actpc.utils.arguments import (
     CIRCUITS,
     MAX_CRITICS,
@@ -38,6 +36,16 @@ OBSERVATION_CLIP = 10.0
 # standard deviations at least, of a feature that has changed: of its largest size, and at all; a smaller one may be rounding
 SMALLEST_CHANGE, SMALLEST_DEVIATION = 1e-4, 1e-7
 PRIOR_NET_ARCH = (512, 256)  # paper: prior of all MuJoCo tasks
+
+
+def check_circuit_class(name: str, given: Any) -> None:
+    """:raises ValueError: for anything but a subclass of NGCCircuit, or such for circuits by their names"""
+    parts = given if isinstance(given, dict) else dict.fromkeys(CIRCUITS, given)
+    for circuit, kind in parts.items():
+        if circuit not in CIRCUITS or not isinstance(kind, type) or not issubclass(kind, NGCCircuit):
+            raise ValueError(
+                f"{name}={given!r} must be a subclass of {NGCCircuit.__name__}, or a dict of such for some of {list(CIRCUITS)}"
+            )
 
 
 class ObservationNormalizer(nn.Module):
@@ -80,8 +88,9 @@ class ActPCActor(BasePolicy):
     :param observation_space: Observation space
     :param action_space: Box with finite bounds
     :param features_extractor: fixed (it is never trained)
-    :param circuit_kwargs: keywords of :class:`~sb3_actpc.ngc.NGCCircuit`
     :param net_arch: hidden sizes
+    :param circuit_kwargs: keywords of :class:`~sb3_actpc.ngc.NGCCircuit`
+    :param circuit_class: the class of the circuit
     :param memory_history: H observations in the working memory; 0 for none
     :param is_gated: keep a second circuit, the deployed one, which acts
     :param normalize_images: divide image observations by 255
@@ -96,6 +105,7 @@ class ActPCActor(BasePolicy):
         features_extractor: BaseFeaturesExtractor,
         net_arch: list[int],
         circuit_kwargs: dict[str, Any],
+        circuit_class: type[NGCCircuit] = NGCCircuit,
         memory_history: int = 0,
         is_gated: bool = False,
         normalize_images: bool = True,
@@ -109,10 +119,20 @@ class ActPCActor(BasePolicy):
         )
         features_extractor.eval()  # dropout and running statistics would go on under a finished actor
         n_features = features_extractor.features_dim
-        self.net_arch, self.circuit_kwargs, self.memory_history = list(net_arch), circuit_kwargs, memory_history
+        self.net_arch = list(net_arch)
+        self.circuit_kwargs = circuit_kwargs
+        self.circuit_class = circuit_class
+        self.memory_history = memory_history
         self.normalizer = ObservationNormalizer(n_features)
         self.memory = WorkingMemory(n_features, memory_history) if memory_history else None
-        self.circuit = self.make_circuit()
+        self.circuit = circuit_class(
+            n_features,
+            int(np.prod(action_space.shape)),
+            self.net_arch,
+            output_activation="tanh",
+            n_memory=self.memory.size if self.memory else 0,
+            **circuit_kwargs,
+        )
         self.deployed = copy.deepcopy(self.circuit) if is_gated else None
         self._warned_of_empty_memory = False
 
@@ -122,21 +142,11 @@ class ActPCActor(BasePolicy):
             features_extractor=self.features_extractor,
             net_arch=self.net_arch,
             circuit_kwargs=self.circuit_kwargs,
+            circuit_class=self.circuit_class,
             memory_history=self.memory_history,
             is_gated=self.deployed is not None,
         )
         return data
-
-    def make_circuit(self) -> NGCCircuit:
-        """One that has learned nothing yet."""
-        return NGCCircuit(
-            self.features_extractor.features_dim,
-            int(np.prod(self.action_space.shape)),
-            self.net_arch,
-            output_activation="tanh",
-            n_memory=self.memory.size if self.memory else 0,
-            **self.circuit_kwargs,
-        ).to(self.device)
 
     @property
     def acting(self) -> NGCCircuit:
@@ -256,7 +266,9 @@ class ActPCPolicy(BasePolicy):
         left out stay at their defaults: 256 and 256, the prior's 512 and 256)
     :param n_critics: members of the critic ensemble; the smaller value of two, drawn anew for every update, bootstraps, and
         the actor follows the mean of all. 1 for the paper's single critic
-    :param circuit_kwargs: keywords of every :class:`~sb3_actpc.ngc.NGCCircuit`
+    :param circuit_class: a subclass of :class:`~sb3_actpc.ngc.NGCCircuit` for all circuits, or a dict with classes for some
+        of ``actor``, ``critic``, ``generator`` and ``prior``
+    :param circuit_kwargs: keywords of every circuit
     :param actor_kwargs: the same for the actor alone, and ``net_arch``, ``learning_rate``, ``batch_size``
     :param critic_kwargs: the same for the critic
     :param generator_kwargs: the same for the generator
@@ -288,6 +300,7 @@ class ActPCPolicy(BasePolicy):
         lr_schedule: Schedule,
         net_arch: Annotated[list[int] | dict[str, list[int]] | None, check_net_arch] = None,
         n_critics: Annotated[int, Between(1, MAX_CRITICS)] = 2,
+        circuit_class: Annotated[type[NGCCircuit] | dict[str, type[NGCCircuit]], check_circuit_class] = NGCCircuit,
         circuit_kwargs: Settings | None = None,
         actor_kwargs: Annotated[Settings | None, check_circuit] = None,
         critic_kwargs: Annotated[Settings | None, check_circuit] = None,
@@ -322,10 +335,14 @@ class ActPCPolicy(BasePolicy):
             normalize_images=normalize_images,
             squash_output=True,
         )
-        self.net_arch, self.n_critics, self.memory_history = net_arch, n_critics, memory_history
+        self.net_arch = net_arch
+        self.n_critics = n_critics
+        self.memory_history = memory_history
+        self.circuit_class = circuit_class
         self.circuit_kwargs = dict(circuit_kwargs or {})
         self.kwargs_of = dict(zip(CIRCUITS, (actor_kwargs, critic_kwargs, generator_kwargs, prior_kwargs), strict=True))
-        self.is_gated, self.nudge = is_gated, nudge
+        self.is_gated = is_gated
+        self.nudge = nudge
         self.lr_schedule = lr_schedule
         self._build()
 
@@ -333,18 +350,21 @@ class ActPCPolicy(BasePolicy):
         with named_in_errors(f"features_extractor_kwargs={self.features_extractor_kwargs!r}", AssertionError):
             extractor = self.make_features_extractor()
         extractor.requires_grad_(False)
-        arch, kwargs = self._net_arch_of("actor"), self._circuit_kwargs_of("actor")
+        arch = self._net_arch_of("actor")
+        kwargs = self._circuit_kwargs_of("actor")
         self.actor = ActPCActor(
             self.observation_space,
             self.action_space,
             extractor,
             arch,
             kwargs,
+            self._circuit_class_of("actor"),
             self.memory_history,
             self.is_gated,
             self.normalize_images,
         )
-        n_features, n_actions = extractor.features_dim, int(np.prod(self.action_space.shape))
+        n_features = extractor.features_dim
+        n_actions = int(np.prod(self.action_space.shape))
         n_memory = self.actor.memory.size if self.actor.memory else 0
         n_members = self.n_critics if self.n_critics > 1 else 0
         self.critic = self._circuit(
@@ -401,14 +421,20 @@ class ActPCPolicy(BasePolicy):
             default |= {"normalization": "layer", "activation": "relu"}
         own = {k: v for k, v in self._settings_of(name).items() if k not in ("net_arch", "learning_rate", "batch_size")}
         kwargs = {**default, **self.circuit_kwargs, **own}
-        unknown = sorted(set(kwargs) - CIRCUIT_KEYWORDS)
+        known = sorted({*CIRCUIT_KEYWORDS, *constructor_keywords(self._circuit_class_of(name))} - _SIZES)
+        unknown = sorted(set(kwargs) - set(known))
         if unknown:
-            known = sorted(CIRCUIT_KEYWORDS)
             raise ValueError(f"circuit_kwargs, {name}_kwargs: a circuit has no keywords {unknown}; choose from {known}")
         return kwargs
 
     def _circuit(self, name: str, n_inputs: int, n_outputs: int, **extra: Any) -> NGCCircuit:
-        return NGCCircuit(n_inputs, n_outputs, self._net_arch_of(name), **self._circuit_kwargs_of(name), **extra)
+        kind = self._circuit_class_of(name)
+        return kind(n_inputs, n_outputs, self._net_arch_of(name), **self._circuit_kwargs_of(name), **extra)
+
+    def _circuit_class_of(self, name: str) -> type[NGCCircuit]:
+        if isinstance(self.circuit_class, dict):
+            return self.circuit_class.get(name, NGCCircuit)
+        return self.circuit_class
 
     def _optimizer(self, name: str, circuit: NGCCircuit) -> th.optim.Optimizer:
         start, own = self.lr_schedule(1.0), self._settings_of(name).get("learning_rate")
@@ -428,9 +454,15 @@ class ActPCPolicy(BasePolicy):
         with named_in_errors(f"optimizer_kwargs={self.optimizer_kwargs!r}"):
             return self.optimizer_class(groups, **kwargs)
 
-    def batch_size_of(self, name: str, default: int) -> int:
-        """Batch size of a circuit: its own ``batch_size`` or the agent's."""
-        return int(self._settings_of(name).get("batch_size", default))
+    def batch_sizes(self, default: int) -> dict[str, int]:
+        """Batch size of every circuit: its own ``batch_size`` or the agent's."""
+        return {name: int((own or {}).get("batch_size", default)) for name, own in self.kwargs_of.items()}
+
+    def set_learning_rate(self, learning_rate: float) -> None:
+        """The agent's learning rate, times what each parameter group asks for (γ_e, a circuit's own learning rate)."""
+        for _, circuit in self.named_circuits():
+            for group in circuit.optimizer.param_groups:
+                group["lr"] = learning_rate * group["lr_scale"]
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         data = super()._get_constructor_parameters()
@@ -438,6 +470,7 @@ class ActPCPolicy(BasePolicy):
             lr_schedule=self._dummy_schedule,  # not needed to act
             net_arch=self.net_arch,
             n_critics=self.n_critics,
+            circuit_class=self.circuit_class,
             circuit_kwargs=self.circuit_kwargs,
             memory_history=self.memory_history,
             is_gated=self.is_gated,
@@ -471,32 +504,6 @@ class ActPCPolicy(BasePolicy):
     ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
         """SB3's ``predict``; see :meth:`ActPCActor.predict` for the working memory."""
         return self.actor.predict(observation, state, episode_start, deterministic)
-
-
-def check_policy(name: str, policy: Any) -> None:
-    """:raises ValueError: when it is neither the name of a policy nor a subclass of :class:`ActPCPolicy`"""
-    is_name = isinstance(policy, str) and policy in POLICIES
-    if not is_name and not (isinstance(policy, type) and issubclass(policy, ActPCPolicy)):
-        raise ValueError(f"{name}={policy!r} must be one of {list(POLICIES)}, or a subclass of {ActPCPolicy.__name__}")
-
-
-def check_policy_kwargs(policy_class: type[BasePolicy], given: Mapping[str, Any]) -> None:
-    """:raises ValueError: naming the keywords that the class has not, nor one that it is made from; the policy checks the
-    values"""
-    known = {*constructor_keywords(policy_class)} - {"observation_space", "action_space", "lr_schedule"}
-    unknown = sorted(set(given) - known)
-    if "activation_fn" in unknown:
-        raise ValueError(
-            f"policy_kwargs has activation_fn={given['activation_fn']!r}: activations are chosen by name, with "
-            f"policy_kwargs=dict(circuit_kwargs=dict(activation=...)), one of {sorted(ACTIVATIONS)}"
-        )
-    if {*unknown} & {*constructor_keywords(ActPCPolicy)}:
-        raise ValueError(
-            f"{policy_class.__name__} does not take {unknown}, which ActPC gives it: let its __init__ take **kwargs and pass "
-            "them on to ActPCPolicy's"
-        )
-    if unknown:
-        raise ValueError(f"policy_kwargs has unknown keys {unknown}; choose from {sorted(known)}")
 
 
 MlpPolicy = ActPCPolicy

@@ -1,12 +1,14 @@
 """The internal reward: epistemic and instrumental signals from the errors of settled circuits, and their normalisers."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch as th
 
-from sb3_actpc.ngc import SettledState
+from sb3_actpc.actpc.diagnostics import Diagnostics
+from sb3_actpc.ngc import NGCCircuit, SettledState
 from sb3_actpc.utils.arguments import checked
 
 Normalize = Callable[[np.ndarray], np.ndarray]  # element by element, in any shape
@@ -18,6 +20,78 @@ def summed_squared_errors(state: SettledState, which: str = "all") -> th.Tensor:
     settled circuit, or the "output" layer alone. Under "scheduled" the errors are those that first arrive."""
     errors = state.errors if which == "all" else state.errors[-1:]
     return th.stack([error.square().sum(1) for error in errors]).sum(0)
+
+
+class RewardSignal(ABC):
+    """
+    An internal reward: how a transition is scored, and how the signal learns. Normalizers and weights are the agent's.
+
+    What a signal learns is saved with the agent when the signal is an ``nn.Module`` too.
+
+    :param circuit: the generator for the epistemic signal, the prior for the instrumental one; both know the sizes
+    :param diagnostics: takes what is logged
+    :param errors: whether the squared errors of "all" layers are summed, or those of the "output"
+    """
+
+    def __init__(self, circuit: NGCCircuit, diagnostics: Diagnostics, errors: str = "all") -> None:
+        super().__init__()
+        self.diagnostics = diagnostics
+        self.errors = errors
+
+    @abstractmethod
+    def score(self, features: th.Tensor, actions: th.Tensor, next_features: th.Tensor, memory: th.Tensor | None) -> th.Tensor:
+        """
+        r̂ of transitions, before it is normalized.
+
+        :param features: (B, n_features)
+        :param actions: (B, A), in [-1, 1]
+        :param next_features: (B, n_features)
+        :param memory: m_t, (B, n_memory), or None
+        :return: (B,), not negative
+        """
+
+    @abstractmethod
+    def update(self, features: th.Tensor, actions: th.Tensor, next_features: th.Tensor, memory: th.Tensor | None) -> None:
+        """One update on a batch of transitions; shapes as for :meth:`score`."""
+
+
+class CircuitSignal(RewardSignal):
+    """A signal of one of the policy's circuits, which is saved there."""
+
+    def __init__(self, circuit: NGCCircuit, diagnostics: Diagnostics, errors: str = "all") -> None:
+        super().__init__(circuit, diagnostics, errors)
+        self.circuit = circuit
+
+
+class GeneratorSurprise(CircuitSignal):
+    """The epistemic signal: how badly the generator predicts the next observation (Algorithm 1, lines 10, 12 and 24)."""
+
+    def score(self, features: th.Tensor, actions: th.Tensor, next_features: th.Tensor, memory: th.Tensor | None) -> th.Tensor:
+        """The summed squared errors of the settled generator."""
+        inputs = th.cat([features, actions], dim=1)
+        return summed_squared_errors(self.circuit.settle(inputs, next_features, memory), self.errors)
+
+    def update(self, features: th.Tensor, actions: th.Tensor, next_features: th.Tensor, memory: th.Tensor | None) -> None:
+        """The generator settles on the next observation and changes: ΔW = e φ(z)ᵀ."""
+        inputs = th.cat([features, actions], dim=1)
+        state = self.circuit.settle(inputs, next_features, memory)
+        self.diagnostics.settled("generator", state)
+        self.circuit.apply_changes(self.circuit.hebbian_update(state))
+
+
+class PriorError(CircuitSignal):
+    """The instrumental signal: how far a step is from the demonstrated ones (Algorithm 1, lines 10 and 13)."""
+
+    def score(self, features: th.Tensor, actions: th.Tensor, next_features: th.Tensor, memory: th.Tensor | None) -> th.Tensor:
+        """The summed squared errors of the settled prior."""
+        state = self.circuit.settle(features, next_features, memory)
+        self.diagnostics.settled("prior", state)
+        return summed_squared_errors(state, self.errors)
+
+    def update(self, features: th.Tensor, actions: th.Tensor, next_features: th.Tensor, memory: th.Tensor | None) -> None:
+        """The prior settles on the demonstrated next observation and changes; only before learning, then it is frozen."""
+        state = self.circuit.settle(features, next_features, memory)
+        self.circuit.apply_changes(self.circuit.hebbian_update(state))
 
 
 def instrumental_reward(normalized: np.ndarray, form: str = "penalty") -> np.ndarray:
@@ -83,6 +157,12 @@ class RunningQuantile:
 Normalizer = RunningMaximum | Saturating | RunningQuantile
 
 
+def check_signal(name: str, kind: Any) -> None:
+    """:raises ValueError: for anything but a subclass of :class:`RewardSignal`"""
+    if not isinstance(kind, type) or not issubclass(kind, RewardSignal):
+        raise ValueError(f"{name}={kind!r} must be a subclass of {RewardSignal.__name__}, which has score and update")
+
+
 class InternalSignals:
     """What both signals are made of, and what their normalisers have seen.
 
@@ -92,6 +172,8 @@ class InternalSignals:
         "stored" (once, when it is seen, the paper)
     :param instrumental_form: see :func:`instrumental_reward`
     :param errors: the squared errors of "all" layers are summed (the paper) or of the "output" alone
+    :param epistemic_class: what scores how new a transition is
+    :param instrumental_class: what scores how far a transition is from the demonstrations
     :raises ValueError: for another value
     """
 
@@ -102,11 +184,14 @@ class InternalSignals:
         normalization: Literal["sampled", "stored"] = "sampled",
         instrumental_form: Literal["penalty", "unit"] = "penalty",
         errors: Literal["all", "output"] = "all",
+        epistemic_class: Annotated[type[RewardSignal], check_signal] = GeneratorSurprise,
+        instrumental_class: Annotated[type[RewardSignal], check_signal] = PriorError,
     ) -> None:
-        self.settings = normalizer, normalization, instrumental_form, errors
+        self.settings = normalizer, normalization, instrumental_form, errors, epistemic_class, instrumental_class
         kinds: dict[str, type[Normalizer]] = {"max": RunningMaximum, "saturating": Saturating, "quantile": RunningQuantile}
         self.epistemic, self.instrumental = kinds[normalizer](), kinds[normalizer]()
         self.normalization, self.instrumental_form, self.errors = normalization, instrumental_form, errors
+        self.epistemic_class, self.instrumental_class = epistemic_class, instrumental_class
 
     def score(
         self, epistemic: np.ndarray, instrumental: np.ndarray, alpha_ep: float, alpha_in: float

@@ -6,17 +6,16 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv, RolloutReturn
-from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_actpc.baselines.demonstration_buffers import WithDemonstrations, demonstration_buffer_class
 from sb3_actpc.demonstrations.mixin import LearnsFromDemonstrations
 from sb3_actpc.utils.arguments import Share, checked
+from sb3_actpc.utils.rollouts import StoresLastTransition
 
 
-class DemonstratedAlgorithm(LearnsFromDemonstrations, OffPolicyAlgorithm):
+class DemonstratedAlgorithm(LearnsFromDemonstrations, StoresLastTransition):
     """An off-policy algorithm whose replay buffer is one of :mod:`sb3_actpc.baselines.demonstration_buffers`.
 
     An agent that is loaded without an environment, to be played, gets a buffer of one transition and does not look for its
@@ -72,37 +71,23 @@ class DemonstratedAlgorithm(LearnsFromDemonstrations, OffPolicyAlgorithm):
             **kwargs,
         )
 
-    def collect_rollouts(self, env: VecEnv, callback: BaseCallback, *args: Any, **options: Any) -> RolloutReturn:
-        """As SB3's, which drops the transition at which a callback stops the training: here it is stored and counted.
-
-        After an exception or Ctrl-C the state of the environment is unknown, so the next ``learn`` resets it.
-        """
+    def collect_rollouts(self, *args: Any, **options: Any) -> RolloutReturn:
+        """As SB3's. After an exception or Ctrl-C the state of the environment is unknown: the next ``learn`` resets it."""
         try:
-            rollout = super().collect_rollouts(env, callback, *args, **options)
+            return super().collect_rollouts(*args, **options)
         except BaseException:
-            self._abandon_episode()
+            self._cut_running_episodes()
+            self._last_obs = None
             raise
-        if not rollout.continue_training:
-            step = callback.locals
-            self._update_info_buffer(step["infos"], step["dones"])
-            names = ("replay_buffer", "buffer_actions", "new_obs", "rewards", "dones", "infos")
-            self._store_transition(*(step[name] for name in names))
-            self._on_step()
-            self._episode_num += int(np.sum(step["dones"]))
-            if self.action_noise is not None and np.any(step["dones"]):
-                self.action_noise.reset()
-        return rollout
 
     def _setup_learn(
         self, total_timesteps: int, callback: Any = None, reset_num_timesteps: bool = True, *args: Any, **options: Any
     ) -> tuple[int, BaseCallback]:
         if reset_num_timesteps:  # SB3 resets the environment
-            self._abandon_episode()
+            self._cut_running_episodes()
         return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, *args, **options)
 
-    def _abandon_episode(self) -> None:
-        """Start a new episode at the next step, which the buffer must not join to the last transition that it holds."""
-        self._last_obs = None
+    def _cut_running_episodes(self) -> None:
         buffer = self.replay_buffer
         if isinstance(buffer, HerReplayBuffer):
             with warnings.catch_warnings():

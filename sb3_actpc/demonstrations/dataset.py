@@ -25,10 +25,10 @@ from sb3_actpc.demonstrations.rows import (
     flat_size,
     outside_bounds,
     unchained_indices,
-    warn_of_indistinguishable,
     whole_columns,
 )
 from sb3_actpc.envs import SPARSE_IDS
+from sb3_actpc.utils.precision import warn_of_indistinguishable
 
 if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecEnv

@@ -16,10 +16,10 @@ from sb3_actpc.demonstrations.rows import (
     join_observations,
     outside_bounds,
     transition_columns,
-    warn_of_indistinguishable,
 )
 from sb3_actpc.demonstrations.wrappers import wrapping_of
 from sb3_actpc.utils.extras import installed_version
+from sb3_actpc.utils.precision import warn_of_indistinguishable
 
 Columns = dict[str, np.ndarray]
 Report = Callable[[str], None]

@@ -25,6 +25,7 @@ class GuidanceConfig:
     :param gate: whether the deployed policy changes only after evaluation episodes; else the actor is deployed
     :param evaluation_share: largest share of environment steps in evaluation episodes
     :param averaging_rate: step of the actor's moving average per update of the actor
+    :param challenger_interval: updates before the average may be copied for evaluation, after the warm-up and after a copy
     :raises ValueError: for a value out of range
     """
 
@@ -35,9 +36,10 @@ class GuidanceConfig:
     gate: bool = True
     evaluation_share: float = 0.25
     averaging_rate: float = 0.001
+    challenger_interval: int = 4000
 
     def __post_init__(self) -> None:
-        for name in ("bc_updates", "critic_warmup", "imitation_half_life"):
+        for name in ("bc_updates", "critic_warmup", "imitation_half_life", "challenger_interval"):
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int) or value < 0:
                 raise ValueError(f"guidance_kwargs[{name!r}]={value!r} must be a whole number of at least 0")
@@ -68,6 +70,7 @@ class BehaviorGuidance(ActorGuidance):
         self.weighting = config.weighting
         self.has_gate = config.gate
         self.selection: PolicySelection | None = None
+        self.copied_at = config.critic_warmup  # update of the last challenger
 
     def on_training_start(self, context: GuidanceContext, is_pretrained: bool) -> None:
         """BC pre-training, once."""
@@ -112,8 +115,10 @@ class BehaviorGuidance(ActorGuidance):
                 copy_circuit(circuits["challenger"], circuits["deployed"])
             elif decision == "rolled back":
                 copy_circuit(circuits["previous"], circuits["deployed"])
-            if selection.begin_episode(env, n_updates > self.config.critic_warmup):
+            actor_differs = n_updates > self.copied_at + self.config.challenger_interval
+            if selection.begin_episode(env, actor_differs):
                 copy_circuit(circuits["average"], circuits["challenger"])
+                self.copied_at = n_updates
 
     def on_reset(self) -> None:
         """Cut episodes have no return."""
@@ -160,12 +165,16 @@ class BehaviorGuidance(ActorGuidance):
 
     def state_dict(self) -> dict[str, Any]:
         """The gate's fields."""
-        return {"selection": None if self.selection is None else self.selection.state_dict()}
+        return {
+            "selection": None if self.selection is None else self.selection.state_dict(),
+            "copied_at": self.copied_at,
+        }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """As stored."""
         stored = state["selection"]
         self.selection = None if stored is None else PolicySelection(**stored)
+        self.copied_at = state["copied_at"]
 
 
 def copy_circuit(source: NGCCircuit, target: NGCCircuit) -> None:

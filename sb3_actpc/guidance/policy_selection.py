@@ -1,8 +1,9 @@
 """The deployment gate: which policy ``predict`` uses, decided by evaluation episodes without noise during learning.
 
-An *incumbent* is deployed. A *challenger*, a frozen copy of the actor's moving average, plays evaluation episodes next to it.
-The arms take turns, and a sequential test on the difference of mean returns promotes or rejects the challenger. An incumbent
-that turns out worse than the one before it is rolled back.
+An *incumbent* is deployed. A *challenger*, a frozen copy of the actor's moving average, plays evaluation episodes until it has
+as many as the incumbent; then both take turns. A group sequential test on the difference of mean returns promotes or rejects
+the challenger; its threshold falls with the number of episodes (O'Brien and Fleming, Biometrics 1979). An incumbent that turns
+out worse than the one before it is rolled back.
 """
 
 from dataclasses import asdict, dataclass, field
@@ -20,17 +21,18 @@ class PolicySelection:
 
     :param n_envs: environments
     :param share: largest share of environment steps in evaluation episodes
-    :param promote: standard errors by which the challenger's mean return must exceed the incumbent's
-    :param reject: standard errors by which it must fall short
-    :param budget: evaluation episodes of a challenger, after which the sign of the difference decides
-    :param min_episodes: evaluation episodes of a challenger before any decision
+    :param promote: standard errors by which the challenger's mean return must exceed the incumbent's after ``budget``
+        episodes; after n of them sqrt(budget / n) times as many
+    :param reject: standard errors by which it, or a new incumbent that is rolled back, must fall short
+    :param budget: evaluation episodes of a policy at most
+    :param min_episodes: evaluation episodes of a policy before any decision
     """
 
     n_envs: int
     share: float = 0.25
-    promote: float = 1.0
+    promote: float = 0.2
     reject: float = 0.5
-    budget: int = 10
+    budget: int = 20
     min_episodes: int = 2
     steps: int = 0
     evaluation_steps: int = 0
@@ -39,7 +41,7 @@ class PolicySelection:
     challenger_returns: list[float] = field(default_factory=list)
     previous_returns: list[float] = field(default_factory=list)
     worst: float | None = None  # return of any episode, exploration episodes included
-    turns: int = 0  # of the incumbent since the present challenger began
+    n_needed: int = 0  # returns of the incumbent before the next challenger begins: a lucky promotion shows in further ones
     roles: list[Role] = field(default_factory=list)
     running: list[float] = field(default_factory=list)
     n_promoted: int = 0
@@ -47,6 +49,7 @@ class PolicySelection:
     n_rolled_back: int = 0
 
     def __post_init__(self) -> None:
+        self.n_needed = max(self.n_needed, self.min_episodes)
         if len(self.roles) != self.n_envs:
             self.reset()
 
@@ -69,46 +72,54 @@ class PolicySelection:
         self.running[env] = 0.0
         self.roles[env] = "actor"
         self.worst = episode_return if self.worst is None else min(self.worst, episode_return)
+        if role == "actor":
+            return None
         if role == "incumbent":
-            self.incumbent_returns = [*self.incumbent_returns, episode_return][-2 * self.budget :]
-            self.turns += 1
-        if role == "challenger" and self.has_challenger:
+            self.incumbent_returns.append(episode_return)
+        elif self.has_challenger:
             self.challenger_returns.append(episode_return)
-        return self._decide() if role != "actor" else None
+        return self._decide()
 
-    def begin_episode(self, env: int, challenger_is_ready: bool) -> bool:
+    def begin_episode(self, env: int, actor_differs: bool) -> bool:
         """
         Choose who plays the next episode of ``env``.
 
         :param env: which environment
-        :param challenger_is_ready: whether the actor's average may become a challenger
+        :param actor_differs: whether the actor has learned since it was last copied
         :return: whether a new challenger begins: the caller then copies the average
         """
         if self.evaluation_steps > self.share * self.steps:
             return False
-        begins = challenger_is_ready and not self.has_challenger and bool(self.incumbent_returns)
+        n_incumbent = len(self.incumbent_returns)
+        begins = actor_differs and not self.has_challenger and n_incumbent >= self.n_needed
         if begins:
             self.has_challenger = True
             self.challenger_returns = []
-            self.turns = 0
-        plays_challenger = self.has_challenger and len(self.challenger_returns) <= self.turns
-        self.roles[env] = "challenger" if plays_challenger else "incumbent"
+            # running episodes of the one before count for nobody
+            self.roles = ["actor" if role == "challenger" else role for role in self.roles]
+        # steps that the incumbent does not need are saved for the challenger
+        n_needed = self.budget if self.has_challenger else self.n_needed
+        if self.has_challenger and (len(self.challenger_returns) <= n_incumbent or n_incumbent >= n_needed):
+            self.roles[env] = "challenger"
+        elif n_incumbent < n_needed:
+            self.roles[env] = "incumbent"
         return begins
 
     def _decide(self) -> Decision | None:
-        if self.has_challenger and len(self.challenger_returns) >= self.min_episodes:
+        n_episodes = len(self.challenger_returns)
+        if self.has_challenger and n_episodes >= self.min_episodes:
             gain, error = compare(self.challenger_returns, self.incumbent_returns, self.worst)
-            is_last = len(self.challenger_returns) >= self.budget
-            if gain > self.promote * error or (is_last and gain > 0.0):
+            if gain > self.promote * (self.budget / n_episodes) ** 0.5 * error:
                 return self._promote()
             loss, error = compare(self.incumbent_returns, self.challenger_returns)
-            if loss > self.reject * error or is_last:
+            if loss > self.reject * error or n_episodes >= self.budget:
                 self.has_challenger = False
+                self.n_needed = min(len(self.incumbent_returns) + 1, self.budget)
                 self.n_rejected += 1
                 return "rejected"
         if self.previous_returns and len(self.incumbent_returns) >= self.min_episodes:
             loss, error = compare(self.previous_returns, self.incumbent_returns)
-            if loss > self.promote * error:
+            if loss > self.reject * error:
                 self.incumbent_returns = self.previous_returns
                 self.previous_returns = []
                 self.has_challenger = False
@@ -119,6 +130,7 @@ class PolicySelection:
     def _promote(self) -> Decision:
         self.previous_returns = self.incumbent_returns
         self.incumbent_returns = self.challenger_returns
+        self.n_needed = min(2 * len(self.challenger_returns), self.budget)
         self.challenger_returns = []
         self.has_challenger = False
         # episodes of the old incumbent that are still running count for nobody

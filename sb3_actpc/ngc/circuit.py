@@ -70,6 +70,7 @@ class NGCCircuit(nn.Module):
     :raises ValueError: when a keyword has a value that is not allowed, or conflicts with ``settling="scheduled"``
     """
 
+    chain_class: type[SettlingChain] = SettlingChain  # how errors come back; a subclass of the circuit may have another
     rates: th.Tensor
     optimizer: th.optim.Optimizer  # of :meth:`parameter_groups`; set by whoever wants the circuit to learn
 
@@ -316,7 +317,7 @@ class NGCCircuit(nn.Module):
             self.memory_weight,
             self.normalization == "layer",
         )
-        return SettlingChain(self.synapses, settings, x, memory)
+        return self.chain_class(self.synapses, settings, x, memory)
 
     def _as_input(self, x: th.Tensor) -> th.Tensor:
         """``x``, checked; of an ensemble the same for every member, (M, B, n_inputs)."""
@@ -382,7 +383,7 @@ class NGCCircuit(nn.Module):
         Hand the changes to the circuit's ``optimizer``, which its owner has set (see :meth:`parameter_groups`), bound the step
         it takes, and keep the settling rates stable.
 
-        The one place where a change becomes minus a gradient.
+        The one place where a change becomes a gradient to ascend.
 
         :param changes: of this circuit's synapses
         :param weight_decay: λ of this once; None for the circuit's own
@@ -396,7 +397,8 @@ class NGCCircuit(nn.Module):
         self._decay_synapses(self.weight_decay if weight_decay is None else weight_decay)
         old = [parameter.clone() for parameter in self._scaled_synapses()] if self.synaptic_scaling == "soft_bound" else []
         targets = [*self.synapses.weights, *self.synapses.biases, *self.synapses.memory]
-        for parameter, gradient in zip(targets, th._foreach_neg(changes.tensors()), strict=True):
+        given = changes.tensors() if self._ascends() else th._foreach_neg(changes.tensors())
+        for parameter, gradient in zip(targets, given, strict=True):
             parameter.grad = gradient
         above = self.synapses.weights[0 if self.n_feedback_inputs else 1 :]
         # E^T is stored in the layout of W, so that its change is ΔW itself
@@ -407,6 +409,14 @@ class NGCCircuit(nn.Module):
         self._scale_synapses(old)
         if self._keep_rates:
             self.update_settling_rates()
+
+    def _ascends(self) -> bool:
+        """Whether the optimizer adds what it is given, as torch's own can: no product for the sign."""
+        if "maximize" not in self.optimizer.defaults:
+            return False
+        for group in self.optimizer.param_groups:
+            group["maximize"] = True
+        return True
 
     def _decay_synapses(self, weight_decay: float) -> None:
         if not weight_decay:

@@ -112,13 +112,13 @@ class SettlingChain:
         self.activations[layer] = self.settings.activation.apply(latents, self.activations[layer])
 
     def damp(self, layer: int, signal: th.Tensor) -> th.Tensor:
-        """Multiply ``signal``, (B, n), in place by the transposed derivative of a hidden layer's activation."""
+        """``signal``, (B, n), which is overwritten, times the transposed derivative of a hidden layer's activation."""
         activation = self.settings.activation
         normalized = self.normalized[layer]
         if normalized is None:
             return activation.damp(signal, self.latents[layer], self.activations[layer])
         activation.damp(signal, normalized.values, self.activations[layer])
-        return signal.copy_(jacobian_product(signal, self.latents[layer], normalized))
+        return jacobian_product(signal, self.latents[layer], normalized)
 
     def slope(self, layer: int, move: th.Tensor) -> th.Tensor:
         """How much a hidden layer's activation changes, to first order, when its latents move by ``move``, (B, n)."""
@@ -179,7 +179,7 @@ class SettlingChain:
         matrix = self.synapses.feedback_matrix(layer, settings.feedback_scale, tied=exact)
         signal = th.matmul(below, matrix, out=out)
         if exact or not settings.derivative_free:
-            self.damp(layer, signal)
+            return self.damp(layer, signal)
         return signal
 
     def integrate(self, rates: Rates) -> None:
@@ -241,9 +241,11 @@ class SettlingChain:
         the step when the error first reaches it. With tied feedback it is, numerically, the gradient of the output's loss;
         with learned error synapses no W^T is used anywhere. With ``exact`` it is that gradient for every circuit.
         """
-        self.errors = self.signals = [th.empty_like(z) for z in self.latents[1:]]
+        self.errors = list(self.latents[1:])
+        below = self.drive
         for layer in range(self.n_hidden, 0, -1):
-            self.feedback_to(layer, exact)
+            below = self.feedback(layer, below, exact)
+            self.errors[layer - 1] = below
 
     def state(self) -> SettledState:
         """The state reached so far (tensors are handed over, not copied)."""

@@ -1,13 +1,16 @@
-"""Rollouts that store their last transition, whoever stops them."""
+"""Rollouts that store their last transition, and that join no two episodes, whoever stops or disturbs them."""
 
 from typing import Any, cast
 
+import numpy as np
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.type_aliases import RolloutReturn, TrainFreq
+from stable_baselines3.common.type_aliases import MaybeCallback, RolloutReturn, TrainFreq
 from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_actpc.utils.env_hooks import WatchedVecEnv, copied
 
 
 class _Frequency:
@@ -21,9 +24,10 @@ class _Frequency:
 class _Deferred:
     """A callback whose wish to stop, or whose error, takes effect after the present transition is stored."""
 
-    def __init__(self, callback: BaseCallback, frequency: _Frequency) -> None:
+    def __init__(self, callback: BaseCallback, frequency: _Frequency, env: WatchedVecEnv) -> None:
         self.callback = callback
         self.frequency = frequency
+        self.env = env
         self.stops = False
         self.error: BaseException | None = None
 
@@ -33,6 +37,7 @@ class _Deferred:
         except BaseException as error:
             self.stops = True
             self.error = error
+        self.env.put_back()
         if self.stops:
             self.frequency.frequency = 0
         return True
@@ -43,11 +48,68 @@ class _Deferred:
 
 class StoresLastTransition(OffPolicyAlgorithm):
     """
-    SB3 asks the callback between the environment's step and its storage, so a callback that stops loses the transition.
+    Every transition is stored, as it was when it arrived, and none joins two episodes.
 
-    Here that transition is stored, and the episode is counted, before ``collect_rollouts`` returns; the same holds for an
-    exception (Ctrl-C among them) that a callback raises. See SB3 issue 2056.
+    - SB3 asks the callback between the environment's step and its storage, so a callback that stops loses the transition.
+      Here it is stored, and the episode is counted, before ``collect_rollouts`` returns; the same holds for an exception
+      (Ctrl-C among them) that a callback raises. See SB3 issue 2056.
+    - Someone else can step or reset the training environment, as ``evaluate_policy`` does: between two ``learn``, or in a
+      callback. Then the running episodes are cut off, and the environment is reset before the next action. See SB3 issue 1684.
+    - Observations are copied, since an environment may change the array that it has returned.
     """
+
+    _watched: WatchedVecEnv | None = None
+
+    def _watch(self) -> WatchedVecEnv:
+        """The training environment, watched."""
+        assert self.env is not None
+        if self._watched is None or self._watched.venv is not self.env:
+            self._watched = WatchedVecEnv(self.env)
+        return self._watched
+
+    @property
+    def is_disturbed(self) -> bool:
+        """Whether someone else has stepped or reset the training environment since the last transition."""
+        return self._watched is not None and self._watched.venv is self.env and self._watched.is_disturbed
+
+    def _cut_running_episodes(self) -> None:
+        """The environments are reset in mid-episode: what the replay buffer holds of these episodes has ended."""
+
+    def _setup_learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        reset_num_timesteps: bool = True,
+        *args: Any,
+        **options: Any,
+    ) -> tuple[int, BaseCallback]:
+        self._watch()
+        self._is_reset = reset_num_timesteps or self._last_obs is None  # by SB3, before it prepares the callbacks
+        result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, *args, **options)
+        self._last_obs = copied(self._last_obs)
+        self._last_original_obs = copied(self._last_original_obs)
+        return result
+
+    def _init_callback(self, *args: Any, **options: Any) -> BaseCallback:
+        if self._is_reset:
+            self._watch().mark()
+        return super()._init_callback(*args, **options)
+
+    def _restart_if_disturbed(self) -> None:
+        """Before an action is chosen: it must be for the observation in which the environment is."""
+        if not self.is_disturbed:
+            return
+        self._cut_running_episodes()
+        self._last_obs = self._watch().reset()
+        if self._vec_normalize_env is not None:
+            self._last_original_obs = copied(self._vec_normalize_env.get_original_obs())
+        self._last_episode_starts = np.ones(self.n_envs, dtype=bool)
+        if self.action_noise is not None:
+            self.action_noise.reset()
+
+    def _sample_action(self, *args: Any, **options: Any) -> tuple[np.ndarray, np.ndarray]:
+        self._restart_if_disturbed()
+        return super()._sample_action(*args, **options)
 
     def collect_rollouts(
         self,
@@ -61,9 +123,10 @@ class StoresLastTransition(OffPolicyAlgorithm):
     ) -> RolloutReturn:
         """As SB3's."""
         frequency = _Frequency(train_freq)
-        deferred = _Deferred(callback, frequency)
+        watched = self._watch()
+        deferred = _Deferred(callback, frequency, watched)
         rollout = super().collect_rollouts(
-            env,
+            watched,
             cast(BaseCallback, deferred),
             cast(TrainFreq, frequency),
             replay_buffer,
@@ -74,3 +137,6 @@ class StoresLastTransition(OffPolicyAlgorithm):
         if deferred.error is not None:
             raise deferred.error
         return RolloutReturn(rollout.episode_timesteps, rollout.n_episodes, not deferred.stops)
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_watched", "_is_reset"]

@@ -165,7 +165,7 @@ def test_demonstrated_transitions_are_normalised_when_they_are_sampled_as_replay
 
 
 def test_an_instrumental_signal_without_a_prior_is_named():
-    with pytest.warns(UserWarning, match="alpha_in=1 pays nothing without demonstrations="):
+    with pytest.warns(UserWarning, match="alpha_in=1 has no effect without demonstrations="):
         make(alpha_in=1.0).learn(5)
 
 
@@ -337,7 +337,7 @@ def test_targets_of_actor_and_critic_move_by_tau():
         for p in circuit.parameters():
             p.add_(1.0)
     before = [weights_of(target) for target, _ in pairs]
-    model._update_targets(model.tau)
+    model.update_targets()
     for olds, (target, circuit) in zip(before, pairs, strict=True):
         for old, new, source in zip(olds, target.parameters(), circuit.parameters(), strict=True):
             assert th.allclose(new, 0.75 * old + 0.25 * source, atol=1e-6)

@@ -88,7 +88,8 @@ def test_signals_are_summed_over_the_n_step_window_like_rewards():
     for step in range(12):
         obs, nothing = np.zeros((1, 2)), np.zeros(1)
         signals = np.array([step]), np.array([-step])
-        buffer.add(obs, obs, np.zeros((1, 1)), nothing, nothing, [{}], score=lambda *transition, found=signals: found)
+        buffer.add(obs, obs, np.zeros((1, 1)), nothing, nothing, [{}])
+        buffer.store_signals(*signals)
     batch = buffer._gather(np.array([2, 10]), np.zeros(2, int), None)
     assert np.allclose(batch.epistemic.ravel(), [2 + 0.9 * 3 + 0.81 * 4, 10 + 0.9 * 11])
     assert np.allclose(batch.instrumental, -batch.epistemic)
@@ -233,19 +234,18 @@ def test_an_episode_is_whole_when_the_ring_wraps_and_left_out_when_the_ring_has_
     assert np.allclose(episodes.actions[:, 0], np.arange(12) / 100)
 
 
-def test_signals_come_from_what_was_added_and_are_stored_with_it():
-    buffer, seen = CombinedReplayBuffer(4, *SPACES, n_envs=2, history=2, device="cpu"), []
-
-    def score(obs, action, next_obs, past, mask):
-        seen.append((obs, action, next_obs, past, mask))
-        return obs[:, 0] + 0.5, -next_obs[:, 0]
-
+def test_signals_are_stored_with_the_newest_transitions_which_come_back_as_they_were_added():
+    buffer = CombinedReplayBuffer(4, *SPACES, n_envs=2, history=2, device="cpu")
     obs, nothing = np.array([[1.0, 2.0], [3.0, 4.0]]), np.zeros(2)
     for step in range(2):
-        buffer.add(obs + step, obs + step + 1, np.full((2, 1), 0.25), nothing, nothing, [{}, {}], score=score)
+        buffer.add(obs + step, obs + step + 1, np.full((2, 1), 0.25), nothing, nothing, [{}, {}])
+        newest = buffer.newest_transitions()
+        assert np.array_equal(newest.observations, obs + step) and np.array_equal(newest.next_observations, obs + step + 1)
+        buffer.store_signals(newest.observations[:, 0] + 0.5, -newest.next_observations[:, 0])
     assert buffer.epistemic[:2].tolist() == [[1.5, 3.5], [2.5, 4.5]]
     assert buffer.instrumental[:2].tolist() == [[-2.0, -4.0], [-3.0, -5.0]]
-    assert (seen[1][1] == 0.25).all() and seen[1][4].tolist() == [[0, 1], [0, 1]] and np.array_equal(seen[1][3][:, 1], obs)
+    assert (newest.actions == 0.25).all() and newest.history_mask.tolist() == [[0, 1], [0, 1]]
+    assert np.array_equal(newest.history[:, 1], obs)
 
 
 def test_a_restored_memory_remembers_what_was_paid():

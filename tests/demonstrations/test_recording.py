@@ -13,7 +13,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_actpc.demonstrations import Demonstrations, fit_demonstrations, recording
-from sb3_actpc.demonstrations.rows import indistinguishable_features
+from sb3_actpc.utils.precision import indistinguishable_features
 from tests.recordings import record
 
 

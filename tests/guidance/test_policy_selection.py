@@ -32,7 +32,7 @@ class Game:
                 self.previous, self.deployed = self.deployed, candidate
             elif decision == "rolled back":
                 self.deployed = self.previous
-            self.selection.begin_episode(0, challenger_is_ready=True)
+            self.selection.begin_episode(0, actor_differs=True)
 
 
 def noisy(mean: float, std: float):

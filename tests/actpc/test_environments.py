@@ -1,0 +1,64 @@
+"""Environments in processes, of several kinds and numbers."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.wrappers import TimeLimit
+from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
+
+from sb3_actpc import ActPC
+from sb3_actpc.utils.tasks import task_id
+from tests.actpc.agents import imitating, make
+from tests.actpc.envs import CountingEnv, demonstrations
+
+
+def made_with_a_function():
+    gym.register("Counted-v3", CountingEnv)
+    env = gym.make("Counted-v3", returns=(0.0, 1.0), disable_env_checker=True)
+    env.spec.kwargs["reward"] = lambda: 0.0  # which no process can send to another
+    return env
+
+
+def test_environments_in_processes_need_not_send_what_they_were_made_with():
+    env = SubprocVecEnv([made_with_a_function] * 2, start_method="fork")
+    try:
+        assert task_id(env) == "Counted-v3"
+        imitating(env, demonstrations=demonstrations(env_id="Counted-v2")).learn(4)
+        with pytest.raises(ValueError, match=r"dataclasses.replace\(demonstrations, env_id='Counted-v3'\)"):
+            imitating(env, demonstrations=demonstrations(env_id="Other-v0"))
+    finally:
+        env.close()
+
+
+def test_the_task_of_an_environment():
+    assert task_id(DummyVecEnv([made_with_a_function])) == "Counted-v3"
+    assert task_id(DummyVecEnv([lambda: TimeLimit(CountingEnv(), 5)])) is None
+    in_process = SubprocVecEnv([lambda: TimeLimit(CountingEnv(), 5)], start_method="fork")
+    try:
+        assert task_id(in_process) is None
+    finally:
+        in_process.close()
+
+
+def test_noise_of_several_environments_is_that_of_one_in_another_number_of_them(tmp_path):
+    noise = NormalActionNoise(np.zeros(2), np.ones(2))
+    make(n_envs=2, action_noise=noise).learn(20).save(tmp_path / "agent")
+    for n_envs in (1, 3):
+        loaded = ActPC.load(tmp_path / "agent", env=DummyVecEnv([CountingEnv] * n_envs)).learn(30)
+        assert loaded.num_timesteps == 30 and getattr(loaded.action_noise, "n_envs", 1) == n_envs
+
+
+@pytest.mark.parametrize("answer", [NotImplementedError, AttributeError, False])
+def test_environments_that_nobody_can_ask_what_they_are_wrapped_in_are_learned_in(answer, monkeypatch):
+    """As those of some simulators that step many at once."""
+
+    def env_is_wrapped(self, kind, indices=None):
+        if answer:
+            raise answer
+        return False
+
+    env = DummyVecEnv([CountingEnv])
+    model = make(env)
+    monkeypatch.setattr(DummyVecEnv, "env_is_wrapped", env_is_wrapped)
+    assert model.learn(5).learn(5, reset_num_timesteps=False).num_timesteps == 10

@@ -1,0 +1,36 @@
+"""Keywords: numbers of NumPy, buffers that fit, misspelt names."""
+
+import numpy as np
+import pytest
+
+from sb3_actpc import ActPC
+from tests.actpc.agents import SMALL, make
+from tests.actpc.envs import CountingEnv
+
+
+def test_numpys_numbers_are_numbers():
+    settings = {"seed": np.int64(3), "learning_rate": np.float32(1e-3), "gamma": np.float64(0.9)}
+    model = make(train_freq=np.int64(2), stats_window_size=np.int64(5), **settings).learn(15)
+    assert model.num_timesteps == 16 and model._n_updates > 0
+    assert [type(getattr(model, name)) for name in settings] == [int, float, float]
+    assert make(train_freq=(np.int64(2), "episode")).learn(15).train_freq.frequency == 2
+
+
+def test_misspelt_keywords_of_the_buffer_are_named():
+    with pytest.raises(ValueError, match=r"has 'combine', which CombinedReplayBuffer does not take.*'combined'"):
+        make(replay_buffer_kwargs={"combine": True})
+
+
+@pytest.mark.parametrize("kind", ["ReplayBuffer", "NStepReplayBuffer", "DictReplayBuffer", "HerReplayBuffer"])
+@pytest.mark.parametrize("dict_observations", [False, True])
+def test_a_buffer_must_fit_the_observations(kind, dict_observations):
+    env = CountingEnv(dict_observations=dict_observations)
+    fits = dict_observations == (kind in ("DictReplayBuffer", "HerReplayBuffer"))
+    policy = "MultiInputPolicy" if dict_observations else "MlpPolicy"
+    if fits and kind != "HerReplayBuffer":
+        assert ActPC(policy, env, replay_buffer_class=kind, **SMALL).learn(15).replay_buffer.pos == 15
+        return
+    use = "DictReplayBuffer, HerReplayBuffer" if dict_observations else "ReplayBuffer"
+    wrong = "goals" if fits else f"replay_buffer_class={kind} does not keep observations of .*: use {use} or None"
+    with pytest.raises(ValueError, match=wrong):
+        ActPC(policy, env, replay_buffer_class=kind, **SMALL)

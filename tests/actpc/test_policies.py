@@ -1,0 +1,64 @@
+"""Policies, extractors and optimizers of the user."""
+
+import pytest
+import torch as th
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+
+from sb3_actpc import ActPC
+from sb3_actpc.actpc.policies import ActPCPolicy
+from tests.actpc.agents import imitating, make
+from tests.actpc.envs import CountingEnv, demonstrations
+
+
+class Dropping(BaseFeaturesExtractor):
+    """Half of the observation drops out while it is trained, and it counts what it has seen."""
+
+    def __init__(self, observation_space):
+        super().__init__(observation_space, 3)
+        self.layers = th.nn.Sequential(th.nn.Flatten(), th.nn.BatchNorm1d(3), th.nn.Dropout(0.5))
+
+    def forward(self, observations):
+        return self.layers(observations)
+
+
+def test_an_extractor_is_fixed():
+    model = imitating(policy_kwargs={"features_extractor_class": Dropping})
+    norm = model.actor.features_extractor.layers[1]
+    before = norm.running_mean.clone()
+    observations = th.randn(50, 3)
+    features = model.actor.features(observations)
+    model.policy.set_training_mode(True)
+    assert th.equal(model.actor.features(observations), features)
+    model.learn(30)
+    assert th.equal(norm.running_mean, before)
+
+
+@pytest.mark.parametrize("given", [{"foreach": True}, {"fused": False}, {}])
+def test_adam_takes_the_form_that_it_is_given(given):
+    model = make(policy_kwargs={"optimizer_kwargs": given})
+    assert bool(model.actor.circuit.optimizer.defaults["fused"]) == (not given)
+    model.learn(15)
+
+
+def test_an_optimiser_that_asks_for_losses_is_refused():
+    with pytest.raises(ValueError, match="asks for a loss"):
+        make(policy_kwargs={"optimizer_class": th.optim.LBFGS})
+
+
+class Closed(ActPCPolicy):
+    """Takes nothing but what it names."""
+
+    def __init__(self, observation_space, action_space, lr_schedule, net_arch=None):
+        super().__init__(observation_space, action_space, lr_schedule, net_arch=net_arch)
+
+
+def test_a_policy_has_to_pass_on_what_it_does_not_know():
+    with pytest.raises(ValueError, match=r"Closed does not take \['circuit_kwargs'\].*\*\*kwargs"):
+        ActPC(Closed, CountingEnv())
+    with pytest.raises(ValueError, match=r"Closed does not take \['circuit_kwargs', 'is_gated'\].*\*\*kwargs"):
+        ActPC(Closed, CountingEnv(), demonstrations=demonstrations())
+
+
+def test_nothing_is_imitated_where_nothing_is_shown_or_kept():
+    assert "self-imitation" in make(replay_buffer_kwargs={"self_imitation_size": 0}).describe().splitlines()[-1]
+    assert "self-imitation" not in make().describe()

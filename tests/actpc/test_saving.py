@@ -1,0 +1,109 @@
+"""Saved agents: without their demonstrations, with other keywords, and files of others."""
+
+import re
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from stable_baselines3 import TD3
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+from sb3_actpc import ActPC
+from tests.actpc.agents import imitating, make
+from tests.actpc.envs import CountingEnv, demonstrations
+
+
+@pytest.mark.parametrize("found", ["another task", "damaged", "minari"])
+def test_a_trained_agent_acts_whatever_has_become_of_its_demonstrations(found, tmp_path, monkeypatch):
+    data, path = demonstrations(), tmp_path / "shown.npz"
+    data.save(path)
+    model = imitating(demonstrations=path)
+    model.learn(20)
+    if found == "minari":
+        model.demonstrations = "nobodys/data-v0"
+    model.save(tmp_path / "agent")
+    if found == "another task":
+        wider = np.concatenate([data.observations, data.observations], axis=1)
+        type(data)(**{**vars(data), "observations": wider, "next_observations": wider}).save(path)
+    elif found == "damaged":
+        path.write_bytes(b"rubbish")
+    observations = np.ones((4, 3), dtype=np.float32)
+    loaded = ActPC.load(tmp_path / "agent")
+    assert np.array_equal(loaded.predict(observations)[0], model.predict(observations)[0])
+    with pytest.raises((ValueError, FileNotFoundError, ImportError)):
+        loaded.set_env(DummyVecEnv([CountingEnv]))
+        loaded.learn(5)
+
+
+def test_a_trained_agent_goes_on_without_demonstrations_where_that_is_asked(tmp_path):
+    model = imitating()
+    model.learn(20)
+    model.save(tmp_path / "agent")
+    loaded = ActPC.load(tmp_path / "agent", env=CountingEnv(), demonstrations=None)
+    observations = np.ones((4, 3), dtype=np.float32)
+    assert np.array_equal(loaded.predict(observations)[0], model.predict(observations)[0])
+    with pytest.warns(UserWarning, match="goes on without"):
+        loaded.learn(10)
+    with pytest.raises(ValueError, match="need demonstrations="):
+        ActPC("MlpPolicy", CountingEnv(), demonstration_fraction=0.5)
+
+
+def test_a_circuits_own_learning_rate_outlasts_another_of_the_agent(tmp_path):
+    make(policy_kwargs={"actor_kwargs": {"learning_rate": 1e-4}}, learning_rate=4e-4).save(tmp_path / "agent")
+    loaded = ActPC.load(tmp_path / "agent", env=CountingEnv(), learning_rate=1e-3)
+    loaded.learn(15)
+    assert loaded.actor.circuit.optimizer.param_groups[0]["lr"] == pytest.approx(1e-4)
+    assert loaded.critic.optimizer.param_groups[0]["lr"] == pytest.approx(1e-3)
+
+
+def test_buffers_of_others_are_refused(tmp_path):
+    other = TD3("MlpPolicy", CountingEnv(), buffer_size=50, learning_starts=10)
+    other.save_replay_buffer(tmp_path / "td3")
+    make(n_envs=2).save_replay_buffer(tmp_path / "two")
+    model = make()
+    model.learn(12)
+    mine = model.replay_buffer
+    for name, kind in (("td3", "a ReplayBuffer of 1"), ("two", "a CombinedReplayBuffer of 2")):
+        with pytest.raises(ValueError, match=kind):
+            model.load_replay_buffer(tmp_path / name)
+        assert model.replay_buffer is mine
+    model.save_replay_buffer(tmp_path / "own")
+    model.load_replay_buffer(tmp_path / "own")
+    assert model.replay_buffer is not mine and model.replay_buffer.pos == 12
+    pendulum = ActPC("MlpPolicy", "Pendulum-v1", policy_kwargs={"net_arch": [4]})
+    with pytest.raises(ValueError, match=r"observations of \(3,\) and 2 actions: this agent, of .* and 1 actions"):
+        pendulum.load_replay_buffer(tmp_path / "own")
+
+
+def test_a_buffer_remembers_as_much_as_the_agent_that_loads_it(tmp_path):
+    model = make().learn(12)
+    model.save_replay_buffer(tmp_path / "own")
+    remembers = make(policy_kwargs={"memory_history": 3})
+    remembers.load_replay_buffer(tmp_path / "own")
+    remembers.learn(20, reset_num_timesteps=False)
+    assert remembers.replay_buffer.history == 3 and remembers.replay_buffer.sample(4).history.shape == (4, 3, 3)
+
+
+def test_the_keywords_of_an_agents_policy_are_those_of_the_loaded_one(tmp_path):
+    """The deployment gate is guidance's, not the user's."""
+    imitating().save(tmp_path / "agent")
+    assert ActPC.load(tmp_path / "agent", policy_kwargs={"net_arch": [16, 16]}).policy.is_gated
+    with pytest.raises(ValueError, match=re.escape("specified kwargs: {'net_arch': [8]}")):
+        ActPC.load(tmp_path / "agent", policy_kwargs={"net_arch": [8]})
+    with pytest.raises(ValueError, match="policy_kwargs has 'is_gated', which guidance sets"):
+        imitating(policy_kwargs={"is_gated": False})
+
+
+def test_a_trained_agent_in_another_task_is_told_that_it_can_do_without_demonstrations(tmp_path):
+    gym.register("OtherCounted-v0", CountingEnv)
+    other = gym.make("OtherCounted-v0", disable_env_checker=True)
+    imitating().learn(10).save(tmp_path / "agent")
+    with pytest.raises(ValueError, match=r"env_id.*A trained agent can do without: demonstrations=None"):
+        ActPC.load(tmp_path / "agent", env=other)
+    assert ActPC.load(tmp_path / "agent", env=other, demonstrations=None).expert is None
+
+
+def test_a_file_of_another_algorithm_is_refused(tmp_path):
+    TD3("MlpPolicy", "Pendulum-v1", policy_kwargs={"net_arch": [4]}, buffer_size=10).save(tmp_path / "td3")
+    with pytest.raises(ValueError, match=r"td3 holds no ActPC: load it with the class that saved it .policy=<class"):
+        ActPC.load(tmp_path / "td3")

@@ -1,0 +1,324 @@
+"""Other callers in the training environment, and environments that return one and the same array: no transition is wrong."""
+
+import copy
+import pickle
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import (
+    DummyVecEnv,
+    SubprocVecEnv,
+    VecCheckNan,
+    VecEnvWrapper,
+    VecFrameStack,
+    VecMonitor,
+    VecNormalize,
+)
+
+from sb3_actpc import ActPC
+from sb3_actpc.baselines.her import HER
+from sb3_actpc.baselines.td3 import TD3Demo
+
+LENGTH = 7
+GOAL_KEYS = ("observation", "achieved_goal", "desired_goal")
+
+
+class OneArray(gym.Env):
+    """Episodes of seven steps. Observes (episode, step) in an array that is the same one, changed in place, all the time."""
+
+    def __init__(self, kind: str = "box", is_truncated: bool = True) -> None:
+        box = spaces.Box(-1.0, 1e4, (2,), np.float32)
+        self.kind, self.is_truncated = kind, is_truncated
+        keys = {"dict": ("seen", "other"), "goal": GOAL_KEYS}.get(kind, ())
+        self.observation_space = spaces.Dict({key: box for key in keys}) if keys else box
+        self.action_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
+        self.row = np.zeros(2, np.float32)
+        self.seen = {key: self.row for key in keys} or self.row
+        self.report = {"is_last": False}
+
+    def compute_reward(self, achieved_goal, desired_goal, info):
+        return np.zeros(len(achieved_goal), np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.row += (1.0, 0.0)
+        self.row[1] = 0.0
+        self.report["is_last"] = False
+        return self.seen, self.report
+
+    def step(self, action):
+        self.row[1] += 1.0
+        ends = bool(self.row[1] == LENGTH)
+        self.report["is_last"] = ends
+        return self.seen, 0.0, ends and not self.is_truncated, ends and self.is_truncated, self.report
+
+
+class Plays(BaseCallback):
+    """Moves the training environment at every fifth step, in one of SB3's hooks."""
+
+    def __init__(self, move, when: str) -> None:
+        super().__init__()
+        self.move, self.when, self.infos_of_ends = move, when, []
+
+    def _maybe(self, when: str) -> bool:
+        if when == self.when and self.num_timesteps % 5 == 4:
+            self.move(self.model)
+        return True
+
+    def _on_step(self) -> bool:
+        self.infos_of_ends += [self.locals["infos"][env]["is_last"] for env in np.flatnonzero(self.locals["dones"])]
+        return self._maybe("step")
+
+    def _on_rollout_start(self) -> None:
+        self._maybe("rollout start")
+
+    def _on_rollout_end(self) -> None:
+        self._maybe("rollout end")
+
+
+def vec_env(kind="box", n_envs=1, is_truncated=True, monitor=True, vec=DummyVecEnv, wrapper=None):
+    def make():
+        env = OneArray(kind, is_truncated)
+        return Monitor(env) if monitor else env
+
+    env = vec([make for _ in range(n_envs)])
+    if wrapper == "normalize":
+        return VecNormalize(env, norm_reward=False, clip_obs=1e6)
+    return VecMonitor(env) if wrapper == "monitor" else env
+
+
+def agent(algorithm, env, **keywords):
+    policy = "MultiInputPolicy" if isinstance(env.observation_space, spaces.Dict) else "MlpPolicy"
+    common = {"policy_kwargs": {"net_arch": [8]}, "learning_starts": 5, "batch_size": 4, "buffer_size": 300, "seed": 0}
+    return algorithm(policy, env, gradient_steps=1, **{**common, **keywords})
+
+
+def assert_no_transition_is_wrong(model, n_steps: int | None = None) -> None:
+    buffer = model.replay_buffer
+    assert buffer.pos == (n_steps or model.num_timesteps) // model.n_envs
+    parts = buffer.observations if isinstance(buffer.observations, dict) else {"": buffer.observations}
+    following = buffer.next_observations if isinstance(buffer.observations, dict) else {"": buffer.next_observations}
+    for key, observed in parts.items():
+        before, after = observed[: buffer.pos], following[key][: buffer.pos]
+        assert np.allclose(after[..., 0], before[..., 0], atol=1e-3), "the two observations are of two episodes"
+        assert np.allclose(after[..., 1], before[..., 1] + 1.0, atol=1e-3)
+        ends = after[..., 1] > LENGTH - 0.5
+        assert (buffer.dones[: buffer.pos][ends] == 1.0).all()
+
+
+def test_the_environment_of_these_tests_misleads_sb3_itself():
+    """Without this package the stored last observation is the first one of the next episode."""
+    env = DummyVecEnv([OneArray])
+    env.reset()
+    for _ in range(LENGTH):
+        _, _, _, infos = env.step(np.zeros((1, 1), np.float32))
+    assert infos[0]["terminal_observation"][1] == 0.0
+
+
+@pytest.mark.parametrize("algorithm", [ActPC, TD3Demo])
+@pytest.mark.parametrize("kind", ["box", "dict"])
+@pytest.mark.parametrize("wrapper", [None, "normalize"])
+@pytest.mark.parametrize("is_truncated", [True, False])
+def test_an_observation_that_is_changed_in_place_is_stored_as_it_was(algorithm, kind, wrapper, is_truncated):
+    callback = Plays(lambda model: None, "")
+    model = agent(algorithm, vec_env(kind, 2, is_truncated, monitor=False, wrapper=wrapper))
+    model.learn(60, callback=callback)
+    assert_no_transition_is_wrong(model)
+    assert all(callback.infos_of_ends) and len(callback.infos_of_ends) == 2 * (30 // LENGTH)
+
+
+@pytest.mark.parametrize("algorithm", [ActPC, HER, TD3Demo])
+@pytest.mark.parametrize("vec", [DummyVecEnv, SubprocVecEnv])
+def test_in_place_observations_of_goal_tasks_in_other_processes(algorithm, vec):
+    env = vec_env("goal", 2, vec=vec)
+    model = agent(algorithm, env, learning_starts=40)
+    model.learn(60)
+    assert_no_transition_is_wrong(model)
+    env.close()
+
+
+def test_an_environment_without_a_wrapper_in_another_process_cannot_be_mended_and_is_named():
+    env = vec_env(monitor=False, vec=SubprocVecEnv)
+    with pytest.warns(UserWarning, match="must return a copy of it, or be wrapped in stable_baselines3's Monitor"):
+        agent(TD3Demo, env).learn(20)
+    env.close()
+
+
+def test_observations_of_a_vectorized_environment_that_reuses_its_own_array():
+    class OneBuffer(DummyVecEnv):
+        def _obs_from_buf(self):
+            return self.buf_obs[None]
+
+    for algorithm in (ActPC, TD3Demo):
+        for wrap in (lambda env: env, lambda env: VecNormalize(env, norm_reward=False, clip_obs=1e6)):
+            model = agent(algorithm, wrap(OneBuffer([OneArray])))
+            model.learn(30)
+            assert_no_transition_is_wrong(model)
+
+
+def evaluates(model) -> None:
+    evaluate_policy(model, model.get_env(), n_eval_episodes=1, warn=False)
+
+
+def resets(model) -> None:
+    model.get_env().reset()
+
+
+def steps_one_directly(model) -> None:
+    env = model.get_env().unwrapped.envs[-1].unwrapped
+    env.step(env.action_space.sample())
+
+
+def resets_by_name(model) -> None:
+    model.get_env().env_method("reset")
+
+
+MOVES = [evaluates, resets, steps_one_directly, resets_by_name]
+
+
+@pytest.mark.parametrize("algorithm", [ActPC, TD3Demo])
+@pytest.mark.parametrize("move", MOVES)
+@pytest.mark.parametrize(("monitor", "wrapper"), [(False, None), (True, None), (False, "monitor"), (False, "normalize")])
+def test_no_transition_joins_two_episodes_when_others_play_between_two_learns(algorithm, move, monitor, wrapper):
+    model = agent(algorithm, vec_env(n_envs=2, monitor=monitor, wrapper=wrapper))
+    for _ in range(4):
+        model.learn(10, reset_num_timesteps=False)
+        move(model)
+    assert_no_transition_is_wrong(model)
+    model.learn(10, reset_num_timesteps=False)
+    if wrapper == "monitor" or monitor:
+        assert all(episode["l"] <= LENGTH for episode in model.ep_info_buffer)
+
+
+@pytest.mark.parametrize("algorithm", [ActPC, TD3Demo])
+@pytest.mark.parametrize("move", MOVES)
+@pytest.mark.parametrize("when", ["step", "rollout start", "rollout end"])
+@pytest.mark.parametrize("wrapper", [None, "normalize"])
+def test_no_transition_joins_two_episodes_when_a_callback_plays(algorithm, move, when, wrapper):
+    model = agent(algorithm, vec_env(monitor=False, wrapper=wrapper), train_freq=3)
+    model.learn(40, callback=Plays(move, when))
+    assert_no_transition_is_wrong(model)
+
+
+@pytest.mark.parametrize("algorithm", [ActPC, HER])
+@pytest.mark.parametrize("vec", [DummyVecEnv, SubprocVecEnv])
+@pytest.mark.parametrize("move", [evaluates, resets_by_name])
+def test_hindsight_relabels_within_an_episode_when_a_callback_plays(algorithm, vec, move):
+    keywords = {"replay_buffer_class": "HerReplayBuffer"} if algorithm is ActPC else {}
+    env = vec_env("goal", vec=vec)
+    model = agent(algorithm, env, learning_starts=30, **keywords)
+    model.learn(50, callback=Plays(move, "step"))
+    assert_no_transition_is_wrong(model)
+    buffer = model.replay_buffer
+    for start in np.flatnonzero(buffer.ep_length[: buffer.pos, 0]):
+        episode = slice(buffer.ep_start[start, 0], buffer.ep_start[start, 0] + buffer.ep_length[start, 0])
+        assert len(set(buffer.observations["observation"][episode, 0, 0])) == 1
+    env.close()
+
+
+@pytest.mark.parametrize("algorithm", [ActPC, TD3Demo])
+def test_returns_of_several_steps_stay_within_an_episode_when_others_play(algorithm):
+    model = agent(algorithm, vec_env(n_envs=2, monitor=False), n_steps=3)
+    for _ in range(4):
+        model.learn(10, reset_num_timesteps=False)
+        resets(model)
+    model.learn(10, reset_num_timesteps=False)
+    for _ in range(20):
+        batch = model.replay_buffer.sample(8)
+        assert (batch.observations[:, 0] == batch.next_observations[:, 0]).all()
+
+
+def test_the_environment_that_was_passed_is_played_below_the_monitor_that_sb3_adds():
+    """``evaluate_policy(model, env)`` steps the passed environment, of which the agent's Monitor knows nothing."""
+    env = OneArray()
+    for algorithm in (ActPC, TD3Demo):
+        model = agent(algorithm, env)
+        for _ in range(4):
+            model.learn(10, reset_num_timesteps=False)
+            evaluate_policy(model, Monitor(env), n_eval_episodes=1)
+        assert_no_transition_is_wrong(model)
+
+
+def test_an_episode_goes_on_where_nobody_else_played():
+    for algorithm in (ActPC, TD3Demo):
+        model = agent(algorithm, vec_env(n_envs=2))
+        for _ in range(9):
+            model.learn(6, reset_num_timesteps=False)
+        assert_no_transition_is_wrong(model)
+        assert [episode["l"] for episode in model.ep_info_buffer] == [LENGTH] * 2 * (27 // LENGTH)
+
+
+def test_a_copy_of_a_training_environment_is_an_environment_of_its_own():
+    """Copies, of memory or of a pickle, step themselves, and playing them is no disturbance."""
+    env = OneArray()
+    model = agent(ActPC, env)
+    model.learn(10)
+    for twin in (copy.deepcopy(env), pickle.loads(pickle.dumps(env))):
+        step = env.row.copy()
+        twin.reset()
+        twin.step(np.zeros(1, np.float32))
+        assert np.array_equal(env.row, step)
+        assert twin.row[1] == 1.0
+    model.learn(10, reset_num_timesteps=False)
+    assert model.replay_buffer.dones[:20, 0].tolist() == [float(step % LENGTH == 0) for step in range(1, 21)]
+
+
+def test_frame_stacks_hold_frames_of_one_episode():
+    for algorithm in (ActPC, TD3Demo):
+        model = agent(algorithm, VecFrameStack(DummyVecEnv([OneArray]), 2))
+        model.learn(16)
+        resets(model)
+        model.learn(16, reset_num_timesteps=False)
+        buffer = model.replay_buffer
+        rows = buffer.next_observations[: buffer.pos, 0]  # (episode, step) twice, the older first
+        assert all(row[0] in (0.0, row[2]) for row in rows)
+        assert (rows[:, 3] == buffer.observations[: buffer.pos, 0, 3] + 1.0).all()
+
+
+class Shifts(VecEnvWrapper):
+    """Adds to observations or rewards, of the same space."""
+
+    def __init__(self, venv, observation: float = 0.0, reward: float = 0.0) -> None:
+        super().__init__(venv)
+        self.observation, self.reward = observation, reward
+
+    def reset(self):
+        return self.venv.reset() + self.observation
+
+    def step_wait(self):
+        observations, rewards, dones, infos = self.venv.step_wait()
+        return observations + self.observation, rewards + self.reward, dones, infos
+
+
+@pytest.mark.parametrize("algorithm", [ActPC, TD3Demo])
+@pytest.mark.parametrize(
+    ("wrap", "name", "changed"),
+    [
+        (lambda env: VecFrameStack(env, 2), "VecFrameStack", "observations"),
+        (lambda env: Shifts(env, observation=1.0), "Shifts", "observations"),
+        (lambda env: Shifts(env, reward=1.0), "Shifts", "rewards"),
+        (lambda env: VecMonitor(VecFrameStack(env, 2)), "VecFrameStack", "observations"),
+    ],
+)
+def test_a_wrapper_outside_vec_normalize_that_changes_something_is_refused(algorithm, wrap, name, changed):
+    """The example of SB3 issue 693."""
+    model = agent(algorithm, wrap(VecNormalize(DummyVecEnv([OneArray]))))
+    message = rf"changes the {changed}, .*VecNormalize goes outside: VecNormalize\({name}\(...\)\)"
+    with pytest.raises(ValueError, match=message):
+        model.learn(10)
+
+
+@pytest.mark.parametrize("algorithm", [ActPC, TD3Demo])
+def test_a_wrapper_outside_vec_normalize_that_changes_nothing_is_none_of_our_business(algorithm):
+    for wrap in (VecMonitor, VecCheckNan, Shifts):
+        model = agent(algorithm, wrap(VecNormalize(DummyVecEnv([OneArray]), clip_obs=1e6)))
+        model.learn(20)
+        assert_no_transition_is_wrong(model)
+    model = agent(algorithm, VecNormalize(VecFrameStack(DummyVecEnv([OneArray]), 2)))
+    model.learn(20)
+    assert model.replay_buffer.observations.shape[-1] == 4
