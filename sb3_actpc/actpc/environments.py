@@ -34,4 +34,3 @@ def last_observations(
         else:
             copies[index] = terminal
     return copies
-

@@ -115,10 +115,10 @@ def fit_demonstrations(
 
 def _compare_lengths(demonstrations: Demonstrations, env: "VecEnv") -> None:
     """A UserWarning for episodes that are longer than the environment lets an episode be."""
-    spec = env.get_attr("spec", indices=[0])[0] if env.has_attr("spec") else None
-    limit = getattr(spec, "max_episode_steps", None)
+    name = "_max_episode_steps"  # of TimeLimit; not every specification can be sent from another process
+    limit = env.get_attr(name, indices=[0])[0] if env.has_attr(name) else None
     longest = int(np.diff(demonstrations.episode_bounds, axis=1).max())
-    if limit is not None and longest > limit:
+    if isinstance(limit, int) and longest > limit:
         warnings.warn(
             f"demonstrated episodes have up to {longest} steps, the environment's at most {limit}: their returns cannot be "
             f"compared. Make it with gymnasium.make(..., max_episode_steps={longest}), or record in it as it is",
