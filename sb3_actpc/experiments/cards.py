@@ -194,9 +194,9 @@ def _bundle(folder: Path, target: Path) -> Path:
         raise ValueError(f"{folder} holds {run.algo}: only runs of actpc without VecNormalize can be bundled")
     result = read_result(folder)
     path = save_agent(model, target / f"{folder_name(run.env)}.safetensors")
-    row = {"file": path.name, "sha256": file_hash(path), "env_kwargs": run.env_kwargs, "preset": run.preset_name}
+    row: dict[str, Any] = {"file": path.name, "sha256": file_hash(path), "env_kwargs": run.env_kwargs}
+    row |= {"preset": run.preset_name, "git_commit": run.git_commit}
     row |= {key: result[key] for key in RESULT_KEYS}
-    row["git_commit"] = run.git_commit
     index = {**read_index(target), run.env: row}
     _write_json(target / INDEX, dict(sorted(index.items())))
     return path
