@@ -36,7 +36,7 @@ from sb3_actpc.actpc.policies import POLICIES, ActPCActor, ActPCPolicy, check_po
 from sb3_actpc.actpc.reward_signals import InternalSignals, summed_squared_errors
 from sb3_actpc.actpc.self_imitation import Episodes, Observations, sample_union
 from sb3_actpc.actpc.transfer import to_device
-from sb3_actpc.checkpoints import Restored, between_updates, load_checkpoint, load_weights, save_weights
+from sb3_actpc.checkpoints import Restored, load_checkpoint
 from sb3_actpc.demonstrations import fit_demonstrations
 from sb3_actpc.demonstrations.dataset import Demonstrations
 from sb3_actpc.demonstrations.recording import ENDLESS
@@ -58,10 +58,12 @@ from sb3_actpc.utils.arguments import (
     check_train_freq,
     checked,
 )
+from sb3_actpc.utils.callbacks import between_updates
 from sb3_actpc.utils.checks import Settings, check_finite, check_kind, named_in_errors, nearest
 from sb3_actpc.utils.constructors import constructor_keywords
 from sb3_actpc.utils.nested import map_observations
 from sb3_actpc.utils.rollouts import StoresLastTransition
+from sb3_actpc.utils.weights import load_weights, save_weights
 
 SelfActPC = TypeVar("SelfActPC", bound="ActPC")
 # of the mean absolute action-value that divides the critic term: before any reward was seen, the critic's noise must not
