@@ -43,9 +43,15 @@ _FROM_ARRAY: dict[str, Callable[[np.ndarray], Any]] = {
     "bytes": lambda array: array.tobytes(),
     "empty": lambda array: array.astype(object),
 }
+
+
+def _new_generator(kind: Callable[[], Any]) -> np.random.Generator:
+    return np.random.Generator(kind())
+
+
 _BIT_GENERATORS: tuple[Any, ...] = (np.random.MT19937, np.random.PCG64, np.random.PCG64DXSM, np.random.Philox, np.random.SFC64)
 _NEW: dict[str, Callable[[], Any]] = {
-    **{kind.__name__: lambda kind=kind: np.random.Generator(kind()) for kind in _BIT_GENERATORS},
+    **{kind.__name__: functools.partial(_new_generator, kind) for kind in _BIT_GENERATORS},
     "RandomState": np.random.RandomState,
     "Random": random.Random,
 }
