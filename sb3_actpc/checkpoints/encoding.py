@@ -115,6 +115,7 @@ class Encoder:
     def __init__(self) -> None:
         self.nodes: list[Node] = []
         self.arrays: dict[str, np.ndarray] = {}
+        self.keeps_views = False  # whether views of the same memory stay views, as an environment may need
         self._numbers: dict[int, tuple[int, Any]] = {}  # by id; the value is kept, so that no other one gets its id
 
     def add(self, value: Any, node: Node) -> int:
@@ -131,7 +132,7 @@ class Encoder:
         :return: itself or a reference, as JSON
         :raises OpaqueValue: when it, or something in it, cannot be written; the table is as before then
         """
-        if value is None or type(value) in (bool, int, float, str):
+        if value is None or type(value) in (bool, int, float) or (isinstance(value, str) and not isinstance(value, Enum)):
             return value
         if id(value) in self._numbers:
             return [self._numbers[id(value)][0]]
@@ -184,9 +185,9 @@ class Encoder:
         if isinstance(value, np.generic):
             return self._stored("scalar", np.asarray(value))
         owner = value
-        while isinstance(owner.base, np.ndarray):
+        while self.keeps_views and isinstance(owner.base, np.ndarray):
             owner = owner.base
-        if type(owner.base).__name__ == "PyCapsule":
+        if self.keeps_views and type(owner.base).__name__ == "PyCapsule":
             raise OpaqueValue(f"{where}, which shares memory with another object", value)
         if owner is value or not owner.flags.c_contiguous or owner.dtype != value.dtype:
             return self._stored("array", value)

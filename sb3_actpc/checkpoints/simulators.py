@@ -108,6 +108,7 @@ def _capture_env(env: gym.Env[Any, Any], encoder: Encoder, where: str) -> dict[s
         {"class": name, "number": encoder.add(layer, {"kind": "layer"}), "attributes": {}, "is_lost": False}
         for name, layer in layers
     ]
+    encoder.keeps_views = True
     for (kind, layer), entry in zip(layers, entries, strict=True):
         for name, value in _layer_values(layer).items():
             try:
@@ -115,6 +116,7 @@ def _capture_env(env: gym.Env[Any, Any], encoder: Encoder, where: str) -> dict[s
             except OpaqueValue as error:
                 reasons.append(str(error))
                 entry["is_lost"] = True
+    encoder.keeps_views = False
     return {"reasons": reasons, "layers": entries}
 
 

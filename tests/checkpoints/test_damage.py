@@ -167,8 +167,8 @@ def test_a_folder_that_cannot_be_written_is_refused_before_training(tmp_path: Pa
     [
         (lambda: make_actpc("Pendulum-v1"), "env='CountingEnv', the agent has env='Pendulum-v1'"),
         (lambda: make_actpc(CountingEnv, n_envs=2), "n_envs=1"),
-        (lambda: make_actpc(CountingEnv, policy_kwargs={"net_arch": [8, 16]}), "another network: .* has shape"),
-        (lambda: make_actpc(CountingEnv, policy_kwargs={"net_arch": [16, 16], "n_critics": 3}), "another network"),
+        (lambda: make_actpc(CountingEnv, policy_kwargs={"net_arch": [8, 16]}), "with shape of .*, the agent has shape of"),
+        (lambda: make_actpc(CountingEnv, policy_kwargs={"net_arch": [16, 16], "n_critics": 3}), "the agent has shape of"),
         (lambda: make_actpc(CountingEnv, buffer_size=100), "buffer_size=200"),
         (lambda: TD3("MlpPolicy", make_vec_env(CountingEnv), buffer_size=200), "algorithm='ActPC'"),
     ],
