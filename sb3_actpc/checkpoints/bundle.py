@@ -8,7 +8,7 @@ import shutil
 import uuid
 import warnings
 from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,7 @@ MANIFEST = "manifest.json"
 _NAME = re.compile(r"(\d{6,})_step_(\d+)")
 _TEMPORARY = ".writing-"
 Report = Callable[[str], None]
+Write = Callable[[str, bytes | np.ndarray], None]
 
 
 class DamagedCheckpoint(ValueError):
@@ -34,7 +35,7 @@ def warn(line: str) -> None:
     warnings.warn(line, stacklevel=3)
 
 
-def write_file(path: Path, content: bytes | np.ndarray) -> None:
+def _write_file(path: Path, content: bytes | np.ndarray) -> None:
     """Write bytes, or an array as ``.npy`` straight from its memory; OSError, with the file's name, when the disk is full."""
     with named_errors(path):
         if isinstance(content, bytes):
@@ -82,22 +83,27 @@ class Bundle:
 
 
 @contextmanager
-def write_bundle(folder: Path, num_timesteps: int, keep: int, manifest: Mapping[str, Any]) -> Iterator[Path]:
-    """Write a checkpoint: the block writes files into the folder that it is given. It appears among the checkpoints of a run,
-    in ``folder``, when everything has worked, and ``keep`` of them stay. OSError when the disk is full or the folder cannot be
-    written; nothing is left behind then."""
+def write_bundle(folder: Path, num_timesteps: int, keep: int, manifest: Mapping[str, Any]) -> Iterator[Write]:
+    """Write a checkpoint: the block is given a function of a file's name and content. It appears among the checkpoints of the
+    run, in ``folder``, when everything has worked, and ``keep`` of them stay. Each file is flushed and hashed while the next
+    one is written. OSError when the disk is full or the folder cannot be written; nothing is left behind then."""
     folder.mkdir(parents=True, exist_ok=True)
     for left in folder.glob(f"{_TEMPORARY}*"):  # of a killed process
         shutil.rmtree(left, ignore_errors=True)
     temporary = folder / f"{_TEMPORARY}{uuid.uuid4().hex[:12]}"
     temporary.mkdir()
     try:
-        yield temporary
-        paths = sorted(temporary.iterdir())
         with ThreadPoolExecutor(max_workers=4) as workers:
-            files = dict(zip((path.name for path in paths), workers.map(_seal, paths), strict=True))
+            sealed: dict[str, Future[str]] = {}
+
+            def write(name: str, content: bytes | np.ndarray) -> None:
+                _write_file(temporary / name, content)
+                sealed[name] = workers.submit(_seal, temporary / name)
+
+            yield write
+            files = {name: digest.result() for name, digest in sealed.items()}
         record = {"format": FORMAT, "version": VERSION, "num_timesteps": num_timesteps, **manifest, "files": files}
-        write_file(temporary / MANIFEST, json.dumps({**record, "sha256": manifest_hash(record)}).encode())
+        _write_file(temporary / MANIFEST, json.dumps({**record, "sha256": manifest_hash(record)}).encode())
         _seal(temporary / MANIFEST)
         _sync_folder(temporary)
         number = 1 + max(map(_number, list_bundles(folder)), default=0)

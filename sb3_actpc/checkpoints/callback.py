@@ -80,8 +80,8 @@ class CheckpointCallback(BaseCallback):
         written: those there before stay."""
         model = self.model
         manifest = {**describe_model(model), "settings": constructor_settings(model)}
-        with write_bundle(self.folder, model.num_timesteps, self.keep, manifest) as folder:
-            capture_model(model, self._others, folder)
+        with write_bundle(self.folder, model.num_timesteps, self.keep, manifest) as write:
+            capture_model(model, self._others, write)
         self._last_saved = model.num_timesteps
         path = list_bundles(self.folder)[-1]
         if self.verbose:

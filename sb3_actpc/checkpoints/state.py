@@ -21,7 +21,7 @@ from stable_baselines3.common.save_util import recursive_getattr
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
-from sb3_actpc.checkpoints.bundle import Bundle, Report, write_file
+from sb3_actpc.checkpoints.bundle import Bundle, Report, Write
 from sb3_actpc.checkpoints.encoding import Decoder, Encoder
 from sb3_actpc.checkpoints.simulators import capture_vec_env, env_name, restore_vec_env, set_attributes, vec_env_layers
 from sb3_actpc.utils.extras import installed_version
@@ -51,7 +51,7 @@ class Restored:
     starts_again: bool = False
 
 
-def capture_model(model: BaseAlgorithm, callbacks: Sequence[BaseCallback], folder: Path) -> None:
+def capture_model(model: BaseAlgorithm, callbacks: Sequence[BaseCallback], write: Write) -> None:
     """Write everything that the rest of the training depends on, between two rollouts, or between two updates before the
     first; ValueError when a weight is not finite."""
     check_weights(model)
@@ -71,13 +71,13 @@ def capture_model(model: BaseAlgorithm, callbacks: Sequence[BaseCallback], folde
     state = {
         "env": capture_vec_env(model.env, encoder, "env"),
         **{name: encoder.encode(value, name) for name, value in values.items()},
-        "buffer": _capture_buffer(model, encoder, folder),
+        "buffer": _capture_buffer(model, encoder, write),
         "callbacks": {name: _capture_callback(one, encoder, name) for name, one in _named(callbacks).items()},
         "logger": _capture_logger(model, encoder),
     }
     arrays = {name: np.ascontiguousarray(array).reshape(array.shape) for name, array in encoder.arrays.items()}
-    write_file(folder / ARRAYS, safetensors.numpy.save(arrays))
-    write_file(folder / STATE, json.dumps({**state, "nodes": encoder.nodes}).encode())
+    write(ARRAYS, safetensors.numpy.save(arrays))
+    write(STATE, json.dumps({**state, "nodes": encoder.nodes}).encode())
 
 
 def describe_model(model: BaseAlgorithm) -> dict[str, Any]:
@@ -222,14 +222,14 @@ def buffer_arrays(buffer: ReplayBuffer) -> dict[str, np.ndarray]:
     return {name: array for name, array in arrays.items() if array.shape[:1] == (buffer.buffer_size,)}
 
 
-def _capture_buffer(model: BaseAlgorithm, encoder: Encoder, folder: Path) -> dict[str, Any] | None:
+def _capture_buffer(model: BaseAlgorithm, encoder: Encoder, write: Write) -> dict[str, Any] | None:
     buffer = replay_buffer(model)
     if buffer is None:
         return None
     # with ``optimize_memory_usage`` the row after the last holds an observation
     rows = buffer.buffer_size if buffer.full else min(buffer.pos + 1, buffer.buffer_size)
     for index, array in enumerate(buffer_arrays(buffer).values()):
-        write_file(folder / f"buffer_{index:02d}.npy", array[:rows])
+        write(f"buffer_{index:02d}.npy", array[:rows])
     infos = buffer.infos[:rows].tolist() if isinstance(buffer, HerReplayBuffer) and buffer.copy_info_dict else []
     return {
         "rows": rows,
