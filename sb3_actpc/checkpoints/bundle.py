@@ -22,6 +22,7 @@ VERSION = 9
 MANIFEST = "manifest.json"
 _NAME = re.compile(r"(\d{6,})_step_(\d+)")
 _TEMPORARY = ".writing-"
+_USE_ANOTHER = "use another checkpoint of the run"
 Report = Callable[[str], None]
 Write = Callable[[str, bytes | np.ndarray], None]
 
@@ -68,9 +69,9 @@ class Bundle:
         """The checkpoint itself; DamagedCheckpoint names the first file that is missing or not what was written."""
         for name, digest in self.manifest["files"].items():
             if not (self.path / name).is_file():
-                raise DamagedCheckpoint(f"{self.path}: {name} is missing")
+                raise DamagedCheckpoint(f"{self.path}: {name} is missing; {_USE_ANOTHER}")
             if file_hash(self.path / name) != digest:
-                raise DamagedCheckpoint(f"{self.path}: {name} does not have the recorded SHA-256")
+                raise DamagedCheckpoint(f"{self.path}: {name} does not have the recorded SHA-256; {_USE_ANOTHER}")
         return self
 
     def read_bytes(self, name: str) -> bytes:
@@ -154,13 +155,13 @@ def _read_manifest(path: Path) -> dict[str, Any]:
     try:
         manifest = json.loads((path / MANIFEST).read_bytes())
     except (OSError, ValueError) as error:
-        raise DamagedCheckpoint(f"{path}: {MANIFEST} cannot be read ({error})") from error
+        raise DamagedCheckpoint(f"{path}: {MANIFEST} cannot be read ({error}); {_USE_ANOTHER}") from error
     if not isinstance(manifest, dict) or manifest.pop("sha256", None) != manifest_hash(manifest):
-        raise DamagedCheckpoint(f"{path}: {MANIFEST} is not what was written")
+        raise DamagedCheckpoint(f"{path}: {MANIFEST} is not what was written; {_USE_ANOTHER}")
     if manifest["version"] != VERSION:
         raise ValueError(
             f"{path} has format version {manifest['version']}, this sb3_actpc reads {VERSION}: go on with the version that "
-            f"wrote it ({manifest.get('versions', {}).get('sb3-actpc', 'unknown')}), or begin the run anew"
+            f"wrote it ({manifest.get('versions', {}).get('sb3-actpc', 'unknown')}), or begin the run again"
         )
     return manifest
 

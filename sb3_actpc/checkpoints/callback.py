@@ -211,7 +211,7 @@ def continue_learning(restored: Restored, callback: MaybeCallback = None, **opti
     """Learn until the step that the stopped run was to reach.
 
     :param restored: what :func:`restore` or ``load_checkpoint`` returned
-    :param callback: those of the stopped run, made anew, a :class:`CheckpointCallback` among them
+    :param callback: new ones like those of the stopped run, a :class:`CheckpointCallback` among them
     :param options: further keywords of ``learn``, such as ``log_interval``
     :return: the agent
     :raises ValueError: without a :class:`CheckpointCallback`, which puts back what ``learn`` itself sets up
