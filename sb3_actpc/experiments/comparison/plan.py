@@ -117,7 +117,7 @@ def _fill(shared: Run, task: Run, variant: Run) -> Run:
 
 def _check_environment(run: Run) -> None:
     """Keywords and demonstrations that were given for it: wrong ones are to end the command and not each of its runs."""
-    own_demonstrations = run.demonstrations not in ("shipped", "weak", "none")
+    own_demonstrations = run.demonstrations not in ("shipped", "none")
     if not (own_demonstrations or run.env_kwargs):
         return
     try:

@@ -223,12 +223,10 @@ def with_changes(settings: Mapping[str, Any], changes: Mapping[str, Any]) -> dic
 
 def find_demonstrations(env_id: str, choice: str) -> Path | str | None:
     """The demonstrations of a run, a file or the id of a Minari dataset, None for none: ``"shipped"`` (for a task whose name
-    begins with ``Sparse``, or its goal version), ``"weak"`` (a weaker demonstrator's), ``"none"``, a path, or such an id.
+    begins with ``Sparse``, or its goal version), ``"none"``, a path, or such an id.
     FileNotFoundError when the path does not exist, or a sparse task has no shipped file."""
     if choice == "none":
         return None
-    if choice == "weak":
-        return shipped_demonstrations(sparse_env_id(env_id), weak=True)
     if is_minari_id(choice):
         return choice
     if choice != "shipped":

@@ -101,7 +101,7 @@ class Run(Schema):
     # environment steps to train for
     n_timesteps: Count | None = Field(default=None, validation_alias=AliasChoices("n_timesteps", "steps"))
     seed: Seed = 0  # of the agent and of the training environment
-    # ``"shipped"`` or ``"weak"`` (the package's files for a sparse task), ``"none"``, a path, or the id of a Minari dataset
+    # ``"shipped"`` (the package's file for a sparse task), ``"none"``, a path, or the id of a Minari dataset
     demonstrations: str = "shipped"
     # the algorithm's keywords that replace the preset's; ``"policy_kwargs.net_arch"`` replaces one value in a mapping. Once
     # filled in: all of them
