@@ -23,7 +23,6 @@ from pathlib import Path
 from typing import Any
 
 import safetensors.numpy
-import safetensors.torch
 import torch as th
 from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
@@ -38,7 +37,8 @@ from tests.checkpoints.runs import START_METHOD, log_rows
 
 PROCESSES: Any = multiprocessing.get_context(START_METHOD)
 SAVE_FREQ = 10
-CLOCK = {"time/fps", "time/time_elapsed"}
+# times of the clock, names of folders, and what a resumed run has logged otherwise
+DIFFERENT = {"t", "episode_times", "log_path", "time/fps", "time/time_elapsed", "_num_timesteps_at_start", "logger"}
 
 
 def train(folder: Path, n_steps: int, started: Connection) -> None:
@@ -81,22 +81,32 @@ def start(folder: Path, n_steps: int) -> BaseProcess:
 
 
 def end_state(folder: Path) -> dict[str, Any]:
-    """What the run has come to, without times of the clock."""
+    """What the run has come to, without times of the clock and without names of folders."""
     bundle = find_bundle(folder / "checkpoints")
-    files = {name: bundle.read_bytes(name) for name in bundle.manifest["files"] if name != "state.json"}
-    arrays = safetensors.numpy.load(files.pop("arrays.safetensors"))
-    tensors = safetensors.torch.load(files.pop("tensors.safetensors"))
-    state = bundle.read_json("state.json")
-    del state["logger"]["values"], state["counters"]["_num_timesteps_at_start"]
-    state["logger"]["csv"] = None
+    state = json.loads(bundle.read_bytes("state.json"))
+    nodes, arrays = state.pop("nodes"), safetensors.numpy.load(bundle.read_bytes("arrays.safetensors"))
     return {
-        "files": files,
-        "arrays": {name: (str(array.dtype), array.tobytes()) for name, array in arrays.items()},
-        "tensors": {name: (str(tensor.dtype), tensor.numpy().tobytes()) for name, tensor in tensors.items()},
-        "state": json.loads(json.dumps(state), object_hook=_without_clock),
+        "files": {name: digest for name, digest in bundle.manifest["files"].items() if name.endswith(".npy")},
+        "state": resolved(state, nodes, arrays),
         "progress": log_rows(folder / "progress.csv"),
         "steps": bundle.num_timesteps,
     }
+
+
+def resolved(value: Any, nodes: list[Any], arrays: dict[str, Any], within: tuple[int, ...] = ()) -> Any:
+    """The state with each reference replaced by what it refers to, and without what differs between equal runs."""
+    if isinstance(value, dict):
+        if "array" in value:
+            array = arrays[value["array"]]
+            return value["kind"], str(array.dtype), array.shape, array.tobytes()
+        if any(isinstance(one, list) and len(one) == 2 for one in value.get("items", ())):
+            pairs = [pair for pair in value["items"] if pair[0] not in DIFFERENT]
+            value = {**value, "items": [{"key": key, "value": part} for key, part in pairs]}
+        return {key: resolved(part, nodes, arrays, within) for key, part in value.items() if key not in DIFFERENT}
+    if isinstance(value, list) and len(value) == 1 and type(value[0]) is int:
+        number = value[0]
+        return number if number in within else resolved(nodes[number], nodes, arrays, (*within, number))
+    return [resolved(part, nodes, arrays, within) for part in value] if isinstance(value, list) else value
 
 
 def differences(one: Any, two: Any, path: str = "") -> list[str]:
@@ -108,13 +118,6 @@ def differences(one: Any, two: Any, path: str = "") -> list[str]:
     else:
         return [] if one == two else [path]
     return [found for key, mine, theirs in parts for found in differences(mine, theirs, f"{path}/{key}")]
-
-
-def _without_clock(node: dict[str, Any]) -> dict[str, Any]:
-    """Drops the duration of episodes, which Monitor measures, and the folder's name."""
-    if "dict" in node:
-        node["dict"] = [pair for pair in node["dict"] if pair[0] not in {"t", "log_path", *CLOCK}]
-    return {key: value for key, value in node.items() if key != "episode_times"}
 
 
 def run_to_the_end(folder: Path, n_steps: int) -> float:

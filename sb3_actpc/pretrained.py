@@ -11,10 +11,10 @@ import torch as th
 from stable_baselines3.common.type_aliases import GymEnv
 
 from sb3_actpc.actpc import ActPC
-from sb3_actpc.checkpoints.settings import constructor_settings, read_settings
 from sb3_actpc.envs import register_envs
 from sb3_actpc.utils.checks import nearest
 from sb3_actpc.utils.files import atomic_write, file_hash
+from sb3_actpc.utils.settings import constructor_settings, read_settings
 
 AGENTS = Path(__file__).parent / "agents"
 INDEX = "index.json"

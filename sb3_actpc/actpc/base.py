@@ -35,11 +35,11 @@ from sb3_actpc.actpc.validation import (
     finite_bounds,
     warn_of_idle_settings,
 )
-from sb3_actpc.checkpoints import between_updates
 from sb3_actpc.demonstrations.mixin import LearnsFromDemonstrations
 from sb3_actpc.guidance import ActorGuidance, BehaviorGuidance, GuidanceConfig, GuidanceContext
 from sb3_actpc.guidance.base import ImitationBatch
 from sb3_actpc.utils.arguments import Between
+from sb3_actpc.utils.callbacks import between_updates
 from sb3_actpc.utils.checks import Settings, check_finite, check_kind, named_in_errors, nearest
 
 SelfBase = TypeVar("SelfBase", bound="ActPCBase")

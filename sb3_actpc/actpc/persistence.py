@@ -14,9 +14,10 @@ from sb3_actpc.actpc.diagnostics import Diagnostics
 from sb3_actpc.actpc.policies import ActPCPolicy
 from sb3_actpc.actpc.reward_signals import InternalSignals, RewardSignal
 from sb3_actpc.actpc.validation import check_expert_rows, check_loaded_buffer, named_file_errors
-from sb3_actpc.checkpoints import Restored, load_checkpoint, load_weights, save_weights
+from sb3_actpc.checkpoints import Restored, load_checkpoint
 from sb3_actpc.guidance import ActorGuidance
 from sb3_actpc.utils.rollouts import StoresLastTransition
+from sb3_actpc.utils.weights import load_weights, save_weights
 
 SelfPersistent = TypeVar("SelfPersistent", bound="Persistent")
 NEED_DEMONSTRATIONS = ("demonstration_fraction", "n_demonstrations", "n_demonstration_transitions")

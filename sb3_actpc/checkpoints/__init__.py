@@ -1,13 +1,12 @@
-"""Checkpoints that lose nothing, for algorithms of Stable-Baselines3, and files of weights that hold no code.
+"""Checkpoints that lose nothing, for algorithms of Stable-Baselines3.
 
-Nothing here uses pickle: weights are safetensors, buffers ``.npy``, everything else is JSON.
+Nothing here uses pickle: arrays are safetensors and ``.npy``, everything else is JSON.
 """
 
 from sb3_actpc.checkpoints.bundle import Bundle, DamagedCheckpoint, find_bundle, list_bundles
-from sb3_actpc.checkpoints.callback import CheckpointCallback, between_updates, continue_learning, restore, why_no_checkpoints
+from sb3_actpc.checkpoints.callback import CheckpointCallback, continue_learning, load_checkpoint, restore, why_no_checkpoints
 from sb3_actpc.checkpoints.interrupts import EXIT_STOPPED, StopSignals, TrainingStopped
 from sb3_actpc.checkpoints.state import Restored
-from sb3_actpc.checkpoints.weights import load_checkpoint, load_weights, save_weights
 
 __all__ = [
     "EXIT_STOPPED",
@@ -17,13 +16,10 @@ __all__ = [
     "Restored",
     "StopSignals",
     "TrainingStopped",
-    "between_updates",
     "continue_learning",
     "find_bundle",
     "list_bundles",
     "load_checkpoint",
-    "load_weights",
     "restore",
-    "save_weights",
     "why_no_checkpoints",
 ]

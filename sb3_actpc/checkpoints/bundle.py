@@ -18,11 +18,13 @@ import numpy as np
 from sb3_actpc.utils.files import file_hash, named_errors
 
 FORMAT = "sb3_actpc checkpoint"
-VERSION = 8
+VERSION = 9
 MANIFEST = "manifest.json"
 _NAME = re.compile(r"(\d{6,})_step_(\d+)")
 _TEMPORARY = ".writing-"
+_USE_ANOTHER = "use another checkpoint of the run"
 Report = Callable[[str], None]
+Write = Callable[[str, bytes | np.ndarray], None]
 
 
 class DamagedCheckpoint(ValueError):
@@ -34,35 +36,17 @@ def warn(line: str) -> None:
     warnings.warn(line, stacklevel=3)
 
 
-class BundleWriter:
-    """Files of one checkpoint; made by :func:`write_bundle`. Workers flush and hash a file while the next one is written."""
-
-    def __init__(self, folder: Path, workers: ThreadPoolExecutor) -> None:
-        self.folder, self.workers = folder, workers
-        self._sealed: dict[str, Future[str]] = {}
-
-    def files(self) -> dict[str, str]:
-        """Wait until everything is on the disk: name -> SHA-256."""
-        return {name: sealed.result() for name, sealed in self._sealed.items()}
-
-    def add_bytes(self, name: str, data: bytes) -> None:
-        """Write a file."""
-        with named_errors(self.folder / name):
-            (self.folder / name).write_bytes(data)
-        self._sealed[name] = self.workers.submit(_seal, self.folder / name)
-
-    def add_json(self, name: str, value: Any) -> None:
-        """Write plain values."""
-        self.add_bytes(name, json.dumps(value).encode())
-
-    def add_array(self, name: str, array: np.ndarray) -> None:
-        """Write numbers, as ``.npy``, straight from their memory where that is C-contiguous; ValueError for Python objects."""
-        with named_errors(self.folder / name):
-            np.save(self.folder / name, array, allow_pickle=False)
-        self._sealed[name] = self.workers.submit(_seal, self.folder / name)
+def _write_file(path: Path, content: bytes | np.ndarray) -> None:
+    """Write bytes, or an array as ``.npy`` straight from its memory; OSError, with the file's name, when the disk is full."""
+    with named_errors(path):
+        if isinstance(content, bytes):
+            path.write_bytes(content)
+        else:
+            np.save(path, content, allow_pickle=False)
 
 
 def _seal(path: Path) -> str:
+    """Flush a file to the disk, and return its SHA-256."""
     with named_errors(path), open(path, "rb+") as file:
         os.fsync(file.fileno())
     return file_hash(path)
@@ -85,18 +69,14 @@ class Bundle:
         """The checkpoint itself; DamagedCheckpoint names the first file that is missing or not what was written."""
         for name, digest in self.manifest["files"].items():
             if not (self.path / name).is_file():
-                raise DamagedCheckpoint(f"{self.path}: {name} is missing")
+                raise DamagedCheckpoint(f"{self.path}: {name} is missing; {_USE_ANOTHER}")
             if file_hash(self.path / name) != digest:
-                raise DamagedCheckpoint(f"{self.path}: {name} does not have the recorded SHA-256")
+                raise DamagedCheckpoint(f"{self.path}: {name} does not have the recorded SHA-256; {_USE_ANOTHER}")
         return self
 
     def read_bytes(self, name: str) -> bytes:
         """A file's content."""
         return (self.path / name).read_bytes()
-
-    def read_json(self, name: str) -> Any:
-        """Plain values."""
-        return json.loads(self.read_bytes(name))
 
     def read_array(self, name: str) -> np.ndarray:
         """An array, memory-mapped: nothing is read before it is used."""
@@ -104,10 +84,10 @@ class Bundle:
 
 
 @contextmanager
-def write_bundle(folder: Path, num_timesteps: int, keep: int, manifest: Mapping[str, Any]) -> Iterator[BundleWriter]:
-    """Write a checkpoint; it appears in ``folder``, that of a run's checkpoints, only when the block and everything after it
-    has worked. ``keep`` of them stay; ``manifest`` holds what else to record, plain values. OSError when the disk is full or
-    the folder cannot be written; nothing is left behind then."""
+def write_bundle(folder: Path, num_timesteps: int, keep: int, manifest: Mapping[str, Any]) -> Iterator[Write]:
+    """Write a checkpoint: the block is given a function of a file's name and content. It appears among the checkpoints of the
+    run, in ``folder``, when everything has worked, and ``keep`` of them stay. Each file is flushed and hashed while the next
+    one is written. OSError when the disk is full or the folder cannot be written; nothing is left behind then."""
     folder.mkdir(parents=True, exist_ok=True)
     for left in folder.glob(f"{_TEMPORARY}*"):  # of a killed process
         shutil.rmtree(left, ignore_errors=True)
@@ -115,12 +95,17 @@ def write_bundle(folder: Path, num_timesteps: int, keep: int, manifest: Mapping[
     temporary.mkdir()
     try:
         with ThreadPoolExecutor(max_workers=4) as workers:
-            writer = BundleWriter(temporary, workers)
-            yield writer
-            files = writer.files()
-            record = {"format": FORMAT, "version": VERSION, "num_timesteps": num_timesteps, **manifest, "files": files}
-            writer.add_json(MANIFEST, {**record, "sha256": _manifest_hash(record)})
-            writer.files()
+            sealed: dict[str, Future[str]] = {}
+
+            def write(name: str, content: bytes | np.ndarray) -> None:
+                _write_file(temporary / name, content)
+                sealed[name] = workers.submit(_seal, temporary / name)
+
+            yield write
+            files = {name: digest.result() for name, digest in sealed.items()}
+        record = {"format": FORMAT, "version": VERSION, "num_timesteps": num_timesteps, **manifest, "files": files}
+        _write_file(temporary / MANIFEST, json.dumps({**record, "sha256": manifest_hash(record)}).encode())
+        _seal(temporary / MANIFEST)
         _sync_folder(temporary)
         number = 1 + max(map(_number, list_bundles(folder)), default=0)
         os.replace(temporary, folder / f"{number:06d}_step_{num_timesteps}")
@@ -129,9 +114,8 @@ def write_bundle(folder: Path, num_timesteps: int, keep: int, manifest: Mapping[
         shutil.rmtree(temporary, ignore_errors=True)
         raise
     for old in list_bundles(folder)[:-keep]:  # renamed first: a bundle never has its name while half of it is gone
-        doomed = folder / f"{_TEMPORARY}{uuid.uuid4().hex[:12]}"
-        os.replace(old, doomed)
-        shutil.rmtree(doomed, ignore_errors=True)
+        os.replace(old, temporary)
+        shutil.rmtree(temporary, ignore_errors=True)
 
 
 def list_bundles(folder: str | os.PathLike[str]) -> list[Path]:
@@ -146,18 +130,21 @@ def find_bundle(path: str | os.PathLike[str], report: Report = warn) -> Bundle:
     that is, ValueError when the newest was written in another version of the format."""
     path = Path(path)
     bundles = list_bundles(path)
-    if not bundles and (path / MANIFEST).exists():
-        return Bundle(path).verify()
     if not bundles:
-        if _NAME.fullmatch(path.name) and path.is_dir():
-            raise DamagedCheckpoint(f"{path}: {MANIFEST} is missing")
+        if (path / MANIFEST).exists() or (_NAME.fullmatch(path.name) and path.is_dir()):
+            return Bundle(path).verify()
         raise FileNotFoundError(f"no checkpoint in {path}")
     for candidate in reversed(bundles):
         try:
             return Bundle(candidate).verify()
         except DamagedCheckpoint as error:
             report(f"damaged checkpoint skipped: {error}")
-    raise DamagedCheckpoint(f"{path}: all of its {len(bundles)} checkpoints are damaged")
+    raise DamagedCheckpoint(f"{path}: all of its {len(bundles)} checkpoints are damaged; begin the run again")
+
+
+def manifest_hash(manifest: Mapping[str, Any]) -> str:
+    """SHA-256 of a manifest's other entries."""
+    return hashlib.sha256(json.dumps(manifest, sort_keys=True).encode()).hexdigest()
 
 
 def _number(path: Path) -> int:
@@ -168,19 +155,15 @@ def _read_manifest(path: Path) -> dict[str, Any]:
     try:
         manifest = json.loads((path / MANIFEST).read_bytes())
     except (OSError, ValueError) as error:
-        raise DamagedCheckpoint(f"{path}: {MANIFEST} cannot be read ({error})") from error
-    if not isinstance(manifest, dict) or manifest.pop("sha256", None) != _manifest_hash(manifest):
-        raise DamagedCheckpoint(f"{path}: {MANIFEST} is not what was written")
+        raise DamagedCheckpoint(f"{path}: {MANIFEST} cannot be read ({error}); {_USE_ANOTHER}") from error
+    if not isinstance(manifest, dict) or manifest.pop("sha256", None) != manifest_hash(manifest):
+        raise DamagedCheckpoint(f"{path}: {MANIFEST} is not what was written; {_USE_ANOTHER}")
     if manifest["version"] != VERSION:
         raise ValueError(
             f"{path} has format version {manifest['version']}, this sb3_actpc reads {VERSION}: go on with the version that "
-            f"wrote it ({manifest.get('versions', {}).get('sb3-actpc', 'unknown')}), or begin the run anew"
+            f"wrote it ({manifest.get('versions', {}).get('sb3-actpc', 'unknown')}), or begin the run again"
         )
     return manifest
-
-
-def _manifest_hash(manifest: Mapping[str, Any]) -> str:
-    return hashlib.sha256(json.dumps(manifest, sort_keys=True).encode()).hexdigest()
 
 
 def _sync_folder(folder: Path) -> None:

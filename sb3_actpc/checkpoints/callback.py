@@ -2,31 +2,30 @@
 
 import os
 import tempfile
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
-from stable_baselines3.common.type_aliases import MaybeCallback
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 
 from sb3_actpc.checkpoints.bundle import Report, find_bundle, list_bundles, warn, write_bundle
 from sb3_actpc.checkpoints.interrupts import StopSignals, TrainingStopped
-from sb3_actpc.checkpoints.settings import constructor_settings
-from sb3_actpc.checkpoints.simulators import env_name
 from sb3_actpc.checkpoints.state import (
     Restored,
-    callback_arguments,
     capture_model,
     describe_model,
     restore_learning,
     restore_model,
     restore_tensorboard,
 )
+from sb3_actpc.utils.callbacks import callback_tree
 from sb3_actpc.utils.checks import check_finite
+from sb3_actpc.utils.settings import constructor_settings, read_settings
 
 
 class CheckpointCallback(BaseCallback):
@@ -34,11 +33,9 @@ class CheckpointCallback(BaseCallback):
     Saves everything that the training of an SB3 algorithm depends on, every ``save_freq`` steps and when the process is told
     to stop (SIGTERM, SIGINT); the latter raises :class:`~sb3_actpc.checkpoints.TrainingStopped`.
 
-    A checkpoint is taken between two rollouts (``train_freq`` steps), or between two updates of a pre-training (see
-    :func:`between_updates`) that a signal interrupts. The handlers that were there before come back when ``learn`` ends; after
-    an error, call :meth:`close`.
-
-    To go on, see :func:`restore` and :func:`continue_learning`.
+    A checkpoint is taken between two rollouts (``train_freq`` steps), or between two updates of a pre-training that a signal
+    interrupts. The handlers that were there before come back when ``learn`` ends; after an error, call :meth:`close`. To go
+    on, see :func:`restore` and :func:`continue_learning`.
 
     :param folder: of this run's checkpoints; made when it does not exist
     :param save_freq: environment steps between two checkpoints
@@ -72,8 +69,6 @@ class CheckpointCallback(BaseCallback):
         self.report, self.restored = report, restored
         self.signals = StopSignals()
         self._others: list[BaseCallback] = []
-        self._made_with: dict[int, dict[str, str]] = {}  # what these were made with, by their ids
-        self._env_id = ""
         self._last_saved = 0
 
     def close(self) -> None:
@@ -84,15 +79,22 @@ class CheckpointCallback(BaseCallback):
         """Write a checkpoint now, and return its folder; ValueError when a weight is not finite, OSError when it cannot be
         written: those there before stay."""
         model = self.model
-        manifest = describe_model(model, self._env_id or env_name(self.training_env))
-        manifest["settings"] = constructor_settings(model)
-        with write_bundle(self.folder, model.num_timesteps, self.keep, manifest) as writer:
-            capture_model(model, self._others, self._made_with, writer)
+        manifest = {**describe_model(model), "settings": constructor_settings(model)}
+        with write_bundle(self.folder, model.num_timesteps, self.keep, manifest) as write:
+            capture_model(model, self._others, write)
         self._last_saved = model.num_timesteps
         path = list_bundles(self.folder)[-1]
         if self.verbose:
             self.report(f"step {model.num_timesteps:>8}  saved in {path}")
         return path
+
+    def on_pretraining_update(self, callback: BaseCallback) -> None:
+        """Go on from a checkpoint taken in a pre-training, and save and stop on a signal.
+
+        :param callback: all callbacks of this ``learn``
+        """
+        self._others = self._beside(callback)
+        self._resume_or_stop()
 
     def _init_callback(self) -> None:
         if why_no_checkpoints(type(self.model)):
@@ -110,7 +112,7 @@ class CheckpointCallback(BaseCallback):
             self.signals.install()
 
     def _on_training_start(self) -> None:
-        self._follow(self.locals.get("callback"))
+        self._others = self._beside(self.locals.get("callback"))
         self._last_saved = self.num_timesteps
 
     def _on_rollout_start(self) -> None:
@@ -132,17 +134,13 @@ class CheckpointCallback(BaseCallback):
         if self.at_end and self._last_saved != self.model.num_timesteps:
             self._save_or_report()
 
-    def _follow(self, callback: Any) -> None:
-        """Take note of the task and of the callbacks beside this one."""
-        self._env_id = env_name(self.training_env)
-        others = [one for one in callback_tree(callback) if one is not self]
-        self._made_with = {id(one): self._made_with.get(id(one)) or callback_arguments(one) for one in others}
-        self._others = others
+    def _beside(self, callback: Any) -> list[BaseCallback]:
+        return [one for one in callback_tree(callback) if one is not self]
 
     def _resume(self) -> None:
         restored, self.restored = self.restored, None
         if restored is not None:
-            restore_learning(restored, self._others, self._made_with, self.report)
+            restore_learning(restored, self._others)
 
     def _resume_or_stop(self) -> None:
         self._resume()
@@ -170,21 +168,6 @@ def why_no_checkpoints(algorithm: type[BaseAlgorithm]) -> str:
     return "" if learns_by_rollouts and getattr(algorithm, "is_resumable", True) else "keeps no checkpoints"
 
 
-def between_updates(callback: BaseCallback) -> Callable[[], None]:
-    """For algorithms that learn before their first rollout, in ``_setup_learn``, where SB3 calls no callback: given what SB3's
-    ``_setup_learn`` returns, what is to be called before each of those updates. It goes on from a checkpoint taken there, and
-    saves and stops on a signal."""
-    savers = [one for one in callback_tree(callback) if isinstance(one, CheckpointCallback)]
-    for saver in savers:
-        saver._follow(callback)
-
-    def resume_or_stop() -> None:
-        for saver in savers:
-            saver._resume_or_stop()
-
-    return resume_or_stop
-
-
 def restore(model: BaseAlgorithm, path: str | os.PathLike[str], report: Report = warn) -> Restored:
     """
     Put a checkpoint back into an agent made with the settings of the stopped run; :func:`continue_learning` goes on with it.
@@ -199,11 +182,36 @@ def restore(model: BaseAlgorithm, path: str | os.PathLike[str], report: Report =
     return restore_model(model, find_bundle(path, report), report)
 
 
+def load_checkpoint(
+    algorithm: type[BaseAlgorithm],
+    path: str | os.PathLike[str],
+    env: GymEnv | str,
+    device: th.device | str = "auto",
+    report: Report = warn,
+    **overrides: Any,
+) -> Restored:
+    """Make an agent with the settings of a checkpoint and put everything back into it; no code is run from the file.
+
+    :param algorithm: the agent's class
+    :param path: a checkpoint, or the folder of several: the newest whole one is taken
+    :param env: an environment made as the stopped run's
+    :param report: given a line for each damaged checkpoint, and when episodes must start again
+    :param overrides: constructor keywords: those that could not be stored by name, and what may differ (``verbose``, ...)
+    :return: as :func:`restore` does, and raises the same
+    """
+    bundle = find_bundle(path, report)
+    stored = bundle.manifest["agent"]["algorithm"]
+    if stored != algorithm.__name__:
+        raise ValueError(f"{bundle.path} is a checkpoint of {stored}, not {algorithm.__name__}: load it with that class")
+    keywords = read_settings(bundle.manifest["settings"], overrides)
+    return restore_model(algorithm(env=env, device=device, **keywords), bundle, report)
+
+
 def continue_learning(restored: Restored, callback: MaybeCallback = None, **options: Any) -> BaseAlgorithm:
     """Learn until the step that the stopped run was to reach.
 
     :param restored: what :func:`restore` or ``load_checkpoint`` returned
-    :param callback: those of the stopped run, made anew, a :class:`CheckpointCallback` among them
+    :param callback: new ones like those of the stopped run, a :class:`CheckpointCallback` among them
     :param options: further keywords of ``learn``, such as ``log_interval``
     :return: the agent
     :raises ValueError: without a :class:`CheckpointCallback`, which puts back what ``learn`` itself sets up
@@ -221,13 +229,3 @@ def continue_learning(restored: Restored, callback: MaybeCallback = None, **opti
     finally:
         for saver in savers:
             saver.close()
-
-
-def callback_tree(callback: Any) -> list[BaseCallback]:
-    """A callback and all in it, lists left out, in the order in which they are called."""
-    if isinstance(callback, CallbackList):
-        return [one for child in callback.callbacks for one in callback_tree(child)]
-    if not isinstance(callback, BaseCallback):
-        return []
-    children = [getattr(callback, name, None) for name in ("callback", "callback_on_new_best")]  # SB3's EvalCallback has both
-    return [callback, *(one for child in children for one in callback_tree(child))]

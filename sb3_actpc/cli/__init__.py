@@ -43,7 +43,7 @@ def add_run_options(parser: argparse.ArgumentParser) -> None:
     """Options that ``train`` and ``compare`` share, keys of a run and ``--no-progress``; what is not given is None."""
     add = parser.add_argument
     add("--steps", metavar="N", help="environment steps of a run, such as 1e5 (default: the preset's)")
-    demonstrations = "file, id of a Minari dataset, 'weak' (the package's weaker) or 'none' (default: the package's)"
+    demonstrations = "file, id of a Minari dataset, or 'none' (default: the package's)"
     add("--demonstrations", metavar="FILE", help=demonstrations)
     modules = "import these, which register environments; also from this folder"
     add("--gym-packages", nargs="+", metavar="MODULE", help=modules)

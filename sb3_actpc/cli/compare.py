@@ -20,7 +20,12 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
     file = "YAML file with these options as keys; options replace its values, but not those of a task's or variant's own entry"
     add("file", nargs="?", metavar="FILE", help=file)
     add("--envs", nargs="+", metavar="ID", help="tasks, such as SparseHopper-v5")
-    add("--algos", nargs="+", metavar="NAME", help="algorithms or named variants, also FILE's own, such as actpc td3")
+    add(
+        "--algos",
+        nargs="+",
+        metavar="NAME",
+        help="algorithms, named variants, also FILE's own, or MODULE:CLASS, such as actpc td3",
+    )
     add("--seeds", type=int, metavar="N", help="how many seeds (default: 3)")
     add("--first-seed", type=int, metavar="N", help="the first of them (default: 0)")
     add("--output", metavar="DIR", help="folder of the comparison (default: runs/comparison)")

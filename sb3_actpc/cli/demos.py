@@ -103,6 +103,8 @@ def run(args: argparse.Namespace) -> int:
     from sb3_actpc.checkpoints import EXIT_STOPPED, TrainingStopped
 
     commands = {"collect": _collect, "convert": _convert, "download": _download, "info": _info}
+    if args.demos_command in ("convert", "download") and args.env is not None:
+        args.env = args.env.rpartition(":")[2]  # robosuite's tasks, also with this package's module
     try:
         return commands[args.demos_command](args)
     except TrainingStopped as stop:  # of a demonstrator

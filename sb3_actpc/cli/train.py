@@ -20,7 +20,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
     going_on = "go on with the run in this folder, with its settings; a finished one with --steps MORE"
     task.add_argument("--resume", metavar="DIR", help=going_on)
     add = parser.add_argument
-    add("--algo", help="algorithm (default: actpc)")
+    add("--algo", help="algorithm, or MODULE:CLASS of your own (default: actpc)")
     add("--preset", metavar="NAME", help="file of hyperparams/, or a path ending in .yml (default: ALGO)")
     setting = "replace a setting of the preset, such as gamma=0.98 or policy_kwargs.net_arch=[64,64]"
     add("--set", action="append", metavar="KEY=VALUE", help=setting)

@@ -16,7 +16,6 @@ import yaml
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_actpc.actpc import ActPC
-from sb3_actpc.checkpoints import save_weights
 from sb3_actpc.experiments.runs.evaluation import NormalizedPredictor, Predictor
 from sb3_actpc.experiments.runs.record import CONFIG, read_result
 from sb3_actpc.experiments.runs.run import evaluate_run, load_run
@@ -24,6 +23,7 @@ from sb3_actpc.experiments.runs.schema import Run
 from sb3_actpc.experiments.runs.video import RenderingUnavailable, record_video
 from sb3_actpc.pretrained import AGENTS, INDEX, read_index, save_agent
 from sb3_actpc.utils.files import atomic_write, file_hash, folder_name
+from sb3_actpc.utils.weights import save_weights
 
 RESULT_KEYS = ("return", "return_std", "dense_return", "dense_return_std", "success", "eval_episodes", "timesteps", "seed")
 
@@ -194,9 +194,9 @@ def _bundle(folder: Path, target: Path) -> Path:
         raise ValueError(f"{folder} holds {run.algo}: only runs of actpc without VecNormalize can be bundled")
     result = read_result(folder)
     path = save_agent(model, target / f"{folder_name(run.env)}.safetensors")
-    row = {"file": path.name, "sha256": file_hash(path), "env_kwargs": run.env_kwargs, "preset": run.preset_name}
+    row: dict[str, Any] = {"file": path.name, "sha256": file_hash(path), "env_kwargs": run.env_kwargs}
+    row |= {"preset": run.preset_name, "git_commit": run.git_commit}
     row |= {key: result[key] for key in RESULT_KEYS}
-    row["git_commit"] = run.git_commit
     index = {**read_index(target), run.env: row}
     _write_json(target / INDEX, dict(sorted(index.items())))
     return path

@@ -44,7 +44,10 @@ class ReferenceCircuit:
 
     def feedback(self, layer: int) -> th.Tensor:
         """What carries e[layer + 1] to a hidden layer, (n[layer + 1], n[layer]): λ_e W, or the learned Eᵀ."""
-        return self.circuit.synapses.feedback_matrix(layer, self.circuit.feedback_scale)
+        if self.circuit.feedback == "tied":
+            return self.circuit.feedback_scale * self.circuit.weights[layer]
+        learned = list(self.circuit.feedback_weights)
+        return learned[layer - self.n_layers]
 
     def prediction(self, layer: int, z: th.Tensor, memory: th.Tensor | None) -> th.Tensor:
         """What layer ``layer`` (1 to L) is expected to be, before g, from the layer below."""

@@ -30,12 +30,12 @@ class ShiftedEnv(CountingEnv):
         return observation, reward + self.shift(), *rest
 
 
-def of_a_closure() -> gym.Env:
+def closure() -> Callable[[], float]:
     rng = np.random.default_rng(1)
-    return ShiftedEnv(lambda: rng.normal())
+    return lambda: rng.normal()
 
 
-def of_a_counter() -> gym.Env:
+def counter() -> Callable[[], float]:
     calls = 0
 
     def shift() -> float:
@@ -43,59 +43,42 @@ def of_a_counter() -> gym.Env:
         calls += 1
         return 0.01 * calls
 
-    return ShiftedEnv(shift)
+    return shift
 
 
-def of_a_closure_in_a_closure() -> gym.Env:
-    seen: list[float] = []
-
-    def mean() -> float:
-        seen.append(0.1 * len(seen))
-        return float(np.mean(seen))
-
-    return ShiftedEnv(lambda: 2.0 * mean())
+def closure_in_a_closure() -> Callable[[], float]:
+    count = counter()
+    return lambda: 2.0 * count()
 
 
-def of_a_recursive_function() -> gym.Env:
+def recursive_function() -> Callable[[], float]:
     seen = [0]
 
     def shift(depth: int = 2) -> float:
         seen[0] += 1
         return shift(depth - 1) if depth else 0.01 * seen[0]
 
-    return ShiftedEnv(shift)
+    return shift
 
 
-def of_a_default() -> gym.Env:
+def defaults() -> Callable[[], float]:
     def shift(seen: list[int] = [0], *, rng: Any = np.random.default_rng(2)) -> float:  # noqa: B006, B008
         seen[0] += 1
         return rng.normal() + 0.01 * seen[0]
 
-    return ShiftedEnv(shift)
+    return shift
 
 
-def of_its_attribute() -> gym.Env:
+def attribute() -> Callable[[], float]:
     def shift() -> float:
         shift.calls += 1  # type: ignore[attr-defined]
         return 0.01 * shift.calls  # type: ignore[attr-defined]
 
     shift.calls = 0  # type: ignore[attr-defined]
-    return ShiftedEnv(shift)
+    return shift
 
 
-def of_a_partial() -> gym.Env:
-    return ShiftedEnv(functools.partial(lambda rng, scale: scale * rng.random(), np.random.RandomState(3), scale=0.5))
-
-
-def of_a_bound_method() -> gym.Env:
-    return ShiftedEnv(np.random.default_rng(4).random)
-
-
-def of_pythons_bound_method() -> gym.Env:
-    return ShiftedEnv(random.Random(5).random)
-
-
-def of_the_module() -> gym.Env:
+def variables_of_the_module() -> Callable[[], float]:
     global CALLS, RNG
     CALLS, RNG = 0, np.random.default_rng(6)
 
@@ -104,10 +87,10 @@ def of_the_module() -> gym.Env:
         CALLS += 1
         return RNG.normal() + 0.01 * CALLS
 
-    return ShiftedEnv(shift)
+    return shift
 
 
-def of_a_transformed_observation() -> gym.Env:
+def transformed_observation() -> gym.Env:
     last = np.zeros(3)
 
     def smooth(observation: np.ndarray) -> np.ndarray:
@@ -131,12 +114,12 @@ class CountingClass(CountingEnv):
         return observation, reward + 0.01 * self.n_steps + self.rng.normal(), *rest
 
 
-def of_the_class() -> gym.Env:
+def state_of_the_class() -> gym.Env:
     CountingClass.n_steps, CountingClass.rng = 0, np.random.default_rng(7)
     return CountingClass()
 
 
-def of_a_class_in_a_function() -> gym.Env:
+def class_in_a_function() -> gym.Env:
     rng = np.random.default_rng(8)
 
     class Inner(CountingEnv):
@@ -147,21 +130,28 @@ def of_a_class_in_a_function() -> gym.Env:
     return Inner()
 
 
-STORED = [
-    of_a_closure, of_a_counter, of_a_closure_in_a_closure, of_a_recursive_function, of_a_default, of_its_attribute,
-    of_a_partial, of_a_bound_method, of_pythons_bound_method, of_the_module, of_a_transformed_observation, of_the_class,
-    of_a_class_in_a_function,
+def partial() -> Callable[[], float]:
+    return functools.partial(lambda rng, scale: scale * rng.random(), np.random.RandomState(3), scale=0.5)
+
+
+SHIFTS: list[Callable[[], Callable[[], float]]] = [
+    closure, counter, closure_in_a_closure, recursive_function, defaults, attribute, variables_of_the_module, partial,
+    lambda: np.random.default_rng(4).random, lambda: random.Random(5).random,
 ]  # fmt: skip
+STORED = [
+    *(lambda make=make: ShiftedEnv(make()) for make in SHIFTS),
+    transformed_observation, state_of_the_class, class_in_a_function,
+]  # fmt: skip
+IDS = [*(make.__name__ for make in SHIFTS[:8]), "method of NumPy", "method of Python", *(one.__name__ for one in STORED[10:])]
 
 
 @pytest.mark.filterwarnings("error:.*cannot be restored within its episode")
-@pytest.mark.parametrize("stop_at", [34, 41])
-@pytest.mark.parametrize("make_env", STORED)
-def test_what_a_callable_remembers_goes_on(tmp_path: Path, make_env: Callable[[], gym.Env], stop_at: int) -> None:
-    """34 is the end of an episode, 41 is not."""
+@pytest.mark.parametrize("make_env", STORED, ids=IDS)
+def test_what_a_callable_remembers_goes_on(tmp_path: Path, make_env: Callable[[], gym.Env]) -> None:
+    """Stopped in the third episode, after two."""
     make = lambda: make_actpc(make_env)  # noqa: E731
     straight = learn_straight(make, tmp_path / "straight", 70)
-    assert_same(straight, learn_in_two(make, tmp_path / "resumed", 70, stop_at))
+    assert_same(straight, learn_in_two(make, tmp_path / "resumed", 70, 41))
 
 
 class Scale:

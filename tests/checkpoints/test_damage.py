@@ -31,8 +31,8 @@ from sb3_actpc.checkpoints import (
     list_bundles,
     restore,
 )
-from sb3_actpc.checkpoints.bundle import VERSION, _manifest_hash
-from sb3_actpc.checkpoints.state import check_weights
+from sb3_actpc.checkpoints.bundle import VERSION, manifest_hash
+from sb3_actpc.utils.weights import check_weights
 from tests.actpc.envs import CountingEnv
 from tests.checkpoints.runs import assert_same, make_actpc
 
@@ -112,38 +112,33 @@ def limit_files(n_bytes: int) -> None:
     resource.setrlimit(resource.RLIMIT_FSIZE, (n_bytes, n_bytes))
 
 
+SCRIPT = """
+from sb3_actpc.utils.weights import save_weights
+from tests.checkpoints.test_damage import CheckpointCallback, CountingEnv, limit_files, make_actpc
+lines = []
+callback = CheckpointCallback({folder!r}, 20, report=lines.append)
+model = make_actpc(CountingEnv)
+limit_files({n_bytes})
+model.learn(20, callback)
+print(lines[0])
+{action}
+"""
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="limits of Unix")
-@pytest.mark.parametrize("n_bytes", [100, 1000, 4000, 20_000])
-def test_a_file_for_which_there_is_no_room_is_named(tmp_path: Path, n_bytes: int) -> None:
-    """One of the checkpoint's, whichever is the first that is too large."""
-    script = (
-        "from tests.checkpoints.test_damage import CheckpointCallback, CountingEnv, limit_files, make_actpc\n"
-        "lines = []\n"
-        f"callback = CheckpointCallback({str(tmp_path)!r}, 20, report=lines.append)\n"
-        "model = make_actpc(CountingEnv)\n"
-        f"limit_files({n_bytes})\n"
-        "model.learn(20, callback)\n"
-        "print(lines[0])\n"
-        "callback.save()\n"
-    )
+@pytest.mark.parametrize(
+    ("action", "n_bytes"),
+    [*(("callback.save()", n_bytes) for n_bytes in (100, 4000, 20_000)), ("save_weights(model, {folder!r} + '/agent')", 1000)],
+)
+def test_a_file_for_which_there_is_no_room_is_named(tmp_path: Path, action: str, n_bytes: int) -> None:
+    """The first that is too large."""
+    folder = str(tmp_path)
+    script = SCRIPT.format(folder=folder, n_bytes=n_bytes, action=action.format(folder=folder))
     result = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
     told = rf"File too large: '{tmp_path}/\.writing-\w+/\w+\.\w+'"
     assert re.search(f"no checkpoint at step 20: .*{told}", result.stdout), result.stdout + result.stderr
+    told = told if action.startswith("callback") else rf"File too large: '{tmp_path}/agent.safetensors'"
     assert result.returncode == 1 and re.search(told, result.stderr.splitlines()[-1])
-    assert list_bundles(tmp_path) == []
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="limits of Unix")
-def test_weights_for_which_there_is_no_room_are_named(tmp_path: Path) -> None:
-    script = (
-        "from sb3_actpc.checkpoints import save_weights\n"
-        "from tests.checkpoints.test_damage import CountingEnv, limit_files, make_actpc\n"
-        "model = make_actpc(CountingEnv)\n"
-        "limit_files(1000)\n"
-        f"save_weights(model, {str(tmp_path / 'agent')!r})\n"
-    )
-    result = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
-    assert f"File too large: '{tmp_path / 'agent.safetensors'}'" in result.stderr
     assert list(tmp_path.iterdir()) == []
 
 
@@ -172,8 +167,8 @@ def test_a_folder_that_cannot_be_written_is_refused_before_training(tmp_path: Pa
     [
         (lambda: make_actpc("Pendulum-v1"), "env='CountingEnv', the agent has env='Pendulum-v1'"),
         (lambda: make_actpc(CountingEnv, n_envs=2), "n_envs=1"),
-        (lambda: make_actpc(CountingEnv, policy_kwargs={"net_arch": [8, 16]}), "another network: .* has shape"),
-        (lambda: make_actpc(CountingEnv, policy_kwargs={"net_arch": [16, 16], "n_critics": 3}), "another network"),
+        (lambda: make_actpc(CountingEnv, policy_kwargs={"net_arch": [8, 16]}), "with shape of .*, the agent has shape of"),
+        (lambda: make_actpc(CountingEnv, policy_kwargs={"net_arch": [16, 16], "n_critics": 3}), "the agent has shape of"),
         (lambda: make_actpc(CountingEnv, buffer_size=100), "buffer_size=200"),
         (lambda: TD3("MlpPolicy", make_vec_env(CountingEnv), buffer_size=200), "algorithm='ActPC'"),
     ],
@@ -194,7 +189,7 @@ def test_another_version_is_not_read(tmp_path: Path, saved: Path) -> None:
     manifest = json.loads(file.read_text())
     manifest["version"] += 1
     del manifest["sha256"]
-    file.write_text(json.dumps({**manifest, "sha256": _manifest_hash(manifest)}))
+    file.write_text(json.dumps({**manifest, "sha256": manifest_hash(manifest)}))
     with pytest.raises(ValueError, match=f"format version {VERSION + 1}, this sb3_actpc reads {VERSION}"):
         find_bundle(tmp_path / "newer")
 

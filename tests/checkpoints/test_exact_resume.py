@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 from gymnasium.envs.classic_control import PendulumEnv
+from sb3_contrib import TQC
 from stable_baselines3 import DDPG, SAC, TD3
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
@@ -22,7 +23,7 @@ from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 import sb3_actpc.envs  # noqa: F401, registers the sparse tasks
 from sb3_actpc import ActPC
 from sb3_actpc.checkpoints import CheckpointCallback, continue_learning, list_bundles, restore
-from sb3_actpc.checkpoints.simulators import _physics_arrays
+from sb3_actpc.checkpoints.physics import physics_arrays
 from tests.actpc.envs import CountingEnv, demonstrations
 from tests.checkpoints.runs import (
     ACTPC,
@@ -60,21 +61,16 @@ def test_actpc(tmp_path: Path, n_envs: int, normalize: bool, stop_at: int) -> No
 @pytest.mark.parametrize(
     "keywords",
     [
-        {"policy_kwargs": {"net_arch": [16, 16], "memory_history": 3}},
+        {"policy_kwargs": REMEMBERING},
         {"guidance": "none", "guidance_kwargs": None, "policy_kwargs": {"net_arch": [16, 16], "n_critics": 1}},
-        {"buffer_size": 20},
-        {
-            "settling": "iterative",
-            "policy_kwargs": {"net_arch": [16, 16], "circuit_kwargs": {"feedback": "tied"}},
-            "target_policy_noise": 0.0,
-        },
-        {"n_steps": 3, "signal_kwargs": {"normalizer": "quantile"}},
-        {"n_steps": 4, "policy_kwargs": {"net_arch": [16, 16], "memory_history": 3}},
+        {"buffer_size": 20, "action_noise": OrnsteinUhlenbeckActionNoise(np.zeros(2), 0.1 * np.ones(2))},
+        {"settling": "iterative", "policy_kwargs": {"net_arch": [16, 16], "circuit_kwargs": {"feedback": "tied"}}},
+        {"n_steps": 3, "signal_kwargs": {"normalizer": "quantile"}, "target_policy_noise": 0.0},
+        {"n_steps": 4, "policy_kwargs": REMEMBERING},
         {"optimize_memory_usage": True, "replay_buffer_kwargs": {"handle_timeout_termination": False}, "alpha_ep": 0.0},
         {"demonstration_fraction": 0.0, "guidance_kwargs": {"gate": False}, "observation_normalization": "none"},
         {"tau": 1.0, "target_update_interval": 7, "train_freq": (3, "step"), "gradient_steps": -1},
         {"train_freq": (1, "episode"), "gradient_steps": 2},
-        {"action_noise": OrnsteinUhlenbeckActionNoise(np.zeros(2), 0.1 * np.ones(2))},
     ],
     ids=lambda keywords: next(iter(keywords)),
 )
@@ -107,23 +103,21 @@ def test_hindsight_replay(tmp_path: Path, algorithm: Any, n_envs: int) -> None:
     check(make, tmp_path, 80, 41)
 
 
-@pytest.mark.parametrize("algorithm", [TD3, DDPG, SAC])
+NOISE = {"action_noise": NormalActionNoise(np.zeros(2), 0.2 * np.ones(2))}
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "keywords"),
+    [(TD3, NOISE), (DDPG, NOISE), (SAC, {}), (SAC, {"use_sde": True, "sde_sample_freq": 4}), (TQC, {})],
+    ids=["TD3", "DDPG", "SAC", "SAC with state-dependent exploration", "TQC"],
+)
 @pytest.mark.parametrize("n_envs", [1, 2])
-def test_baselines(tmp_path: Path, algorithm: Any, n_envs: int) -> None:
+def test_baselines(tmp_path: Path, algorithm: Any, keywords: dict[str, Any], n_envs: int) -> None:
     def make() -> Any:
-        noise = None if algorithm is SAC else NormalActionNoise(np.zeros(2), 0.2 * np.ones(2))
         env = VecNormalize(make_vec_env(CountingEnv, n_envs=n_envs))
-        return algorithm("MlpPolicy", env, action_noise=noise, buffer_size=200, **deepcopy(SMALL))
+        return algorithm("MlpPolicy", env, buffer_size=200, **deepcopy({**keywords, **SMALL}))
 
     check(make, tmp_path, 80, 41)
-
-
-def test_state_dependent_exploration(tmp_path: Path) -> None:
-    def make() -> SAC:
-        keywords = {"use_sde": True, "sde_sample_freq": 4, "buffer_size": 99}
-        return SAC("MlpPolicy", make_vec_env(CountingEnv), **keywords, **deepcopy(SMALL))
-
-    check(make, tmp_path, 60, 33)
 
 
 @pytest.mark.parametrize(
@@ -142,7 +136,7 @@ def test_only_memory_that_belongs_to_the_simulator_is_stored(env_id: str) -> Non
     env = gym.make(env_id)
     env.reset(seed=0)
     data = env.unwrapped.data
-    arrays = _physics_arrays(data)
+    arrays = physics_arrays(data)
     assert {"qpos", "qvel", "qacc_warmstart", "ctrl", "xpos", "cfrc_ext"} <= arrays.keys()
     of_the_struct = {"energy", "solver_fwdinv"}
     starts = [array.ctypes.data for name, array in arrays.items() if name not in of_the_struct]
@@ -201,16 +195,10 @@ HELD = {
 }
 
 
-@pytest.mark.parametrize("algorithm", [ActPC, TD3])
 @pytest.mark.parametrize("kind", HELD)
-def test_an_environment_that_is_held_goes_on_too(tmp_path: Path, kind: str, algorithm: Any) -> None:
+def test_an_environment_that_is_held_goes_on_too(tmp_path: Path, kind: str) -> None:
     """Stopped in the second episode."""
-
-    def make() -> Any:
-        keywords = ACTPC if algorithm is ActPC else {**SMALL, "buffer_size": 200}
-        return algorithm("MlpPolicy", make_vec_env(HELD[kind]), **deepcopy(keywords))
-
-    check(make, tmp_path, 80, 41)
+    check(lambda: TD3("MlpPolicy", make_vec_env(HELD[kind]), buffer_size=200, **deepcopy(SMALL)), tmp_path, 80, 41)
 
 
 class OpaqueEnv(CountingEnv):
@@ -241,10 +229,7 @@ class LateEnv(CountingEnv):
         (lambda: OpaqueEnv("simulators", [CountingEnv()]), "simulators.0: a .*CountingEnv"),
         (lambda: OpaqueEnv("sim", OpaqueEnv()), "handle: a .*list_iterator"),
         (LateEnv, r"it is made of \['Monitor', 'LateEnv'\], the checkpoint's of .*'LateEnv', 'sim: CountingEnv'\]"),
-        (
-            lambda: LateEnv(sim=ContinuousBitFlipping()),
-            r"it is made of .*'sim: ContinuousBitFlipping'\], .*'sim: CountingEnv'\]",
-        ),
+        (lambda: LateEnv(sim=ContinuousBitFlipping()), r"it is made of .*: ContinuousBitFlipping'\], .*: CountingEnv'\]"),
     ],
     ids=["opaque", "opaque under the name env", "in a list", "opaque in a simulator", "late", "another"],
 )
@@ -263,6 +248,25 @@ def test_an_episode_that_cannot_be_restored_starts_again_and_the_log_says_so(
     assert buffer.observations[33, 0, 1] == 0.0  # the first observation of an episode
 
 
+class Counting(BaseCallback):
+    """Counts its steps."""
+
+    def __init__(self, label: str) -> None:
+        super().__init__()
+        self.label, self.n_seen = label, 0
+
+    def _on_step(self) -> bool:
+        self.n_seen += 1
+        return True
+
+
+def test_callbacks_keep_their_attributes_but_arguments_are_those_of_the_new_one(tmp_path: Path) -> None:
+    callbacks: list[BaseCallback] = [Counting("first"), Counting("second")]
+    made = iter(callbacks)
+    learn_in_two(lambda: make_actpc(CountingEnv), tmp_path, 60, 33, lambda: [next(made)])
+    assert [(one.label, one.n_seen) for one in callbacks] == [("first", 33), ("second", 60)]
+
+
 def test_sb3s_evaluation_callback_remembers_its_best_and_its_rows(tmp_path: Path) -> None:
     make = lambda: make_actpc("Pendulum-v1", learning_starts=20)  # noqa: E731
 
@@ -270,10 +274,8 @@ def test_sb3s_evaluation_callback_remembers_its_best_and_its_rows(tmp_path: Path
         env = make_vec_env("Pendulum-v1", seed=5, env_kwargs={"max_episode_steps": 20})
         return EvalCallback(env, n_eval_episodes=1, eval_freq=40, log_path=str(folder), verbose=0)
 
-    one, two = evaluation(tmp_path / "one"), evaluation(tmp_path / "two")
-    learn_straight(make, tmp_path / "one", 130, one)
+    learn_straight(make, tmp_path / "one", 130, evaluation(tmp_path / "one"))
     learn_in_two(make, tmp_path / "two", 130, 90, more=lambda: [evaluation(tmp_path / "two")])
-    del two
     results = [dict(np.load(tmp_path / name / "evaluations.npz")) for name in ("one", "two")]
     assert_equal(*results, "evaluations")
     assert len(results[0]["timesteps"]) == 3

@@ -9,7 +9,8 @@ from stable_baselines3.common.callbacks import StopTrainingOnMaxEpisodes
 from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_actpc import ActPC
-from sb3_actpc.checkpoints import CheckpointCallback, continue_learning, load_checkpoint, load_weights, save_weights
+from sb3_actpc.checkpoints import CheckpointCallback, continue_learning, load_checkpoint
+from sb3_actpc.utils.weights import load_weights, save_weights
 from tests.actpc.envs import CountingEnv
 
 

@@ -17,7 +17,7 @@ from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_actpc import ActPC
-from sb3_actpc.checkpoints import CheckpointCallback
+from sb3_actpc.checkpoints import CheckpointCallback, load_checkpoint
 from tests.actpc.envs import CountingEnv, demonstrations
 from tests.checkpoints.runs import SHORT_WARM_UP, assert_same, make_actpc
 
@@ -109,7 +109,7 @@ def test_a_checkpoint_is_loaded_without_running_code(tmp_path: Path, request: py
     model = ActPC("MlpPolicy", make_vec_env(CountingEnv), buffer_size=99, seed=1, **keywords)
     model.learn(150, CheckpointCallback(tmp_path))
     request.getfixturevalue("no_code")
-    loaded = ActPC.load_checkpoint(tmp_path, make_vec_env(CountingEnv))
+    loaded = load_checkpoint(ActPC, tmp_path, make_vec_env(CountingEnv))
     assert_same(model, loaded.model)
 
 
@@ -117,11 +117,11 @@ def test_what_cannot_be_named_must_be_given_again(tmp_path: Path) -> None:
     model = make_actpc(CountingEnv, demonstrations=demonstrations(), learning_rate=lambda progress: 1e-3)
     model.learn(30, CheckpointCallback(tmp_path))
     with pytest.raises(ValueError, match=r"learning_rate, demonstrations could not be stored"):
-        ActPC.load_checkpoint(tmp_path, make_vec_env(CountingEnv))
+        load_checkpoint(ActPC, tmp_path, make_vec_env(CountingEnv))
     other = {"learning_rate": lambda progress: 1e-3, "demonstrations": demonstrations(n_episodes=2)}
     with pytest.raises(ValueError, match="60 demonstrated transitions, this one 40"):
-        ActPC.load_checkpoint(tmp_path, make_vec_env(CountingEnv), **other)
-    loaded = ActPC.load_checkpoint(tmp_path, make_vec_env(CountingEnv), **{**other, "demonstrations": demonstrations()})
+        load_checkpoint(ActPC, tmp_path, make_vec_env(CountingEnv), **other)
+    loaded = load_checkpoint(ActPC, tmp_path, make_vec_env(CountingEnv), **{**other, "demonstrations": demonstrations()})
     assert_same(model, loaded.model)
 
 

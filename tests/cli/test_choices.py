@@ -124,6 +124,52 @@ def test_steps_and_settings_as_people_write_them() -> None:
     assert [layer.out_features for layer in model.actor.mu if hasattr(layer, "out_features")] == [5, 6, 1]
 
 
+OWN_ALGORITHMS = """
+import sb3_actpc
+import stable_baselines3
+
+class OwnTD3(stable_baselines3.TD3):
+    pass
+
+class OwnActPC(sb3_actpc.ActPC):
+    pass
+"""
+
+
+def test_an_algorithm_of_the_working_folder_is_trained_replayed_and_compared(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The worker of the comparison, another process, finds it as well."""
+    (tmp_path / "own_algorithms.py").write_text(OWN_ALGORITHMS, encoding="utf-8")
+    (tmp_path / "own_task.py").write_text(OWN_TASK, encoding="utf-8")
+    monkeypatch.setattr(sys, "path", [path for path in sys.path if path not in ("", str(tmp_path))])
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    quick = ["--steps", "20", "--eval-episodes", "1", "--no-progress"]
+    own = ["--algo", "own_algorithms:OwnTD3", "--env", "own_task:Own-v0", "--preset", "small.yml"]
+    assert main(["train", *own, *quick]) == 0
+    assert main(["evaluate", "runs/own_task_Own-v0/OwnTD3_small_seed0", "--episodes", "1", "--no-video"]) == 0
+    algos = {"preset": "small.yml", "algo": "own_algorithms:OwnTD3"}
+    Path("c.yml").write_text(json.dumps({"envs": ["own_task:Own-v0"], "algos": [algos], "seeds": 1}), encoding="utf-8")
+    assert main(["compare", "c.yml", *quick, "--workers", "1"]) == 0
+    assert "1 of 1 runs are finished" in capsys.readouterr().out
+    assert len(list(Path("runs/comparison/own_task_Own-v0/OwnTD3").glob("*/result.json"))) == 1
+    assert main(["compare", "--envs", "SparseReacher-v5", "--algos", "own_algorithms:OwnActPC", "--dry-run"]) == 0
+
+
+@pytest.mark.parametrize(
+    ("algo", "message"),
+    [
+        ("json:loads", "loads of json must be a subclass of SB3's BaseAlgorithm"),
+        ("json:nothing", "found None"),
+        ("no_such_module:Agent", "No module named 'no_such_module'"),
+        ("tdd3", "(did you mean 'td3'?): choose one of"),
+    ],
+)
+def test_what_is_no_algorithm_is_refused(algo: str, message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["train", "--env", ENV_ID, "--algo", algo, "--steps", "5"]) == 2
+    assert message in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("option", ["steps", "eval-freq", "checkpoint-freq"])
 @pytest.mark.parametrize(
     ("text", "message"),
@@ -290,3 +336,31 @@ def test_a_task_that_takes_no_render_mode_is_replayed_without_a_video(
     assert main([*command, "--output", "own"]) == 0
     assert main(["evaluate", "own", "--episodes", "1"]) == 0
     assert "no video: rendering is not available here" in capsys.readouterr().out
+
+
+MISSING = """
+import sys
+from sb3_actpc.cli import main
+
+for module, *command in (line.split() for line in sys.argv[1:]):
+    sys.modules[module] = None
+    assert main(command) == 2
+    del sys.modules[module]
+"""
+
+
+def test_the_extra_is_named_where_one_of_its_packages_is_missing() -> None:
+    """Before anything is trained."""
+    train_one = "train --env Pendulum-v1 --algo td3 --steps 5 --demonstrations none"
+    commands = [f"{module} {train_one}" for module in ("pandas", "matplotlib", "tqdm", "rich")]
+    commands += [f"{module} compare --envs Pendulum-v1 --algos td3" for module in ("pandas", "rich")]
+    commands += [f"{module} report nowhere" for module in ("pandas", "scipy", "matplotlib")]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(
+        [sys.executable, "-c", MISSING, *commands], capture_output=True, text=True, env=environment, timeout=300, check=False
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+    lines = [line for line in done.stderr.splitlines() if line.startswith("sb3-actpc: error")]
+    assert len(lines) == len(commands)
+    assert all('pip install "sb3-actpc[experiments]"' in line for line in lines), lines
+    assert not Path("runs").exists()

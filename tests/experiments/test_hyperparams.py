@@ -11,12 +11,12 @@ import yaml
 
 from sb3_actpc import ActPC
 from sb3_actpc.baselines.offline.served import ServedAlgorithm
-from sb3_actpc.checkpoints.settings import constructor_settings
 from sb3_actpc.envs import ROBOSUITE_IDS, sparse_env_id
 from sb3_actpc.experiments.runs import ALGORITHMS, Run, load_preset, resolve
 from sb3_actpc.experiments.runs.environments import make_train_env, register_tasks
 from sb3_actpc.experiments.runs.run import build_model
 from sb3_actpc.utils.preset_files import HYPERPARAMS_FOLDERS
+from sb3_actpc.utils.settings import constructor_settings
 from tests.recordings import record_file
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*out of date.*", "ignore:.*infinity.*", "ignore:.*mini-batch size.*")

@@ -106,7 +106,8 @@ def plan_runs(comparison: Comparison, folder: Path | None = None) -> list[Run]:
 
 
 def _fill(shared: Run, task: Run, variant: Run) -> Run:
-    env = task.env if variant.task_prefix is None else task.env.replace("Sparse", variant.task_prefix, 1)
+    module, colon, name = task.env.rpartition(":")
+    env = f"{module}{colon}{name.replace('Sparse', variant.task_prefix or 'Sparse', 1)}"
     run = Run(**{**merged(shared, task, variant), "env": env, "task": task.env, "progress": False})
     check_env_id(env, run.gym_packages)
     try:
@@ -117,7 +118,7 @@ def _fill(shared: Run, task: Run, variant: Run) -> Run:
 
 def _check_environment(run: Run) -> None:
     """Keywords and demonstrations that were given for it: wrong ones are to end the command and not each of its runs."""
-    own_demonstrations = run.demonstrations not in ("shipped", "weak", "none")
+    own_demonstrations = run.demonstrations not in ("shipped", "none")
     if not (own_demonstrations or run.env_kwargs):
         return
     try:

@@ -1,15 +1,18 @@
 """From the table to finished runs: which are begun, gone on with, tried again or left alone."""
 
+import queue
+import threading
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from sb3_actpc.checkpoints import StopSignals
 from sb3_actpc.experiments.comparison import execution
 from sb3_actpc.experiments.comparison.display import Display
-from sb3_actpc.experiments.comparison.engines import Engine, Event
-from sb3_actpc.experiments.comparison.execution import FAILED, FINISHED, is_disk_full, run_status
+from sb3_actpc.experiments.comparison.engines import Engine
+from sb3_actpc.experiments.comparison.execution import FAILED, FINISHED, Outcome, is_disk_full, run_status
 from sb3_actpc.experiments.runs import Run
 from sb3_actpc.utils.files import folder_lock
 
@@ -57,61 +60,67 @@ def run_comparison(
 
 
 class _Scheduler:
-    """Keeps an engine busy."""
+    """Keeps an engine busy: a thread waits for each run under way, and puts what it hears of it into a queue."""
 
     def __init__(self, engine: Engine, display: Display, runs: Sequence[Run], summary: Summary) -> None:
         self.engine, self.display, self.summary = engine, display, summary
         self.waiting = deque(runs)
-        self.under_way: dict[str, Run] = {}
+        self.under_way: dict[str, threading.Thread] = {}
         self.losses: Counter[str] = Counter()
+        self.stop = threading.Event()
+        self.news: queue.Queue[tuple[Run, int | Outcome | Exception]] = queue.Queue()
 
     def run(self) -> None:
         """Until all have ended, or a signal or a full disk says stop."""
         try:
             with StopSignals() as signals:
-                while self.under_way or (self.waiting and self.summary.stopped_by is None):
-                    if signals.received and self.summary.stopped_by is None:
+                while self.under_way or (self.waiting and not self.stop.is_set()):
+                    if signals.received and not self.stop.is_set():
                         self.display.line(f"{signals.received}: the runs under way save their state and end")
                         self._stop(signals.received)
                     self._start_some()
-                    for event in self.engine.poll(POLL):
-                        self._take(event)
+                    with suppress(queue.Empty):
+                        self._take(*self.news.get(timeout=POLL))
         finally:
+            self.stop.set()
+            for thread in self.under_way.values():
+                thread.join()
             self.engine.close()
 
     def _start_some(self) -> None:
-        while self.summary.stopped_by is None and self.waiting and len(self.under_way) < self.engine.capacity():
+        while not self.stop.is_set() and self.waiting and len(self.under_way) < self.engine.capacity():
             run = self.waiting.popleft()
             (run.folder / execution.ERROR).unlink(missing_ok=True)
-            try:
-                self.engine.start(run)
-            except OSError as error:
-                if not is_disk_full(error):
-                    raise
-                self._stop(execution.DISK_FULL, str(error))
-                return
-            self.under_way[run.id] = run
             self.display.started(run)
+            self.under_way[run.id] = threading.Thread(target=self._execute, args=(run,), daemon=True)
+            self.under_way[run.id].start()
 
-    def _take(self, event: Event) -> None:
-        run = self.under_way.get(event.run_id)
-        if run is None:
-            return
-        if event.outcome is None:
-            self.display.stepped(run, event.steps or 0)
+    def _execute(self, run: Run) -> None:
+        try:
+            self.news.put((run, self.engine.execute(run, self.stop, lambda steps: self.news.put((run, steps)))))
+        except Exception as error:  # of the engine, not of the run
+            self.news.put((run, error))
+
+    def _take(self, run: Run, news: int | Outcome | Exception) -> None:
+        if isinstance(news, int):
+            self.display.stepped(run, news)
             return
         del self.under_way[run.id]
-        self.display.ended(run, event.outcome)
-        if event.outcome.status == execution.DISK_FULL:
-            self._stop(execution.DISK_FULL, event.outcome.message)
-        elif event.outcome.status in (execution.LOST, execution.STOPPED) and self.summary.stopped_by is None:
+        if isinstance(news, Exception):
+            if not is_disk_full(news):
+                raise news
+            news = Outcome(execution.DISK_FULL, str(news))
+        self.display.ended(run, news)
+        if news.status == execution.DISK_FULL:
+            self._stop(execution.DISK_FULL, news.message)
+        elif news.status in (execution.LOST, execution.STOPPED) and not self.stop.is_set():
             self.losses[run.id] += 1  # somebody ended the run's process, not the run
             if self.losses[run.id] < MAX_LOSSES:
                 self.waiting.appendleft(run)
             else:
-                execution.write_error(run.folder, f"given up after {MAX_LOSSES} times: {event.outcome.message}")
+                execution.write_error(run.folder, f"given up after {MAX_LOSSES} times: {news.message}")
 
     def _stop(self, reason: str, message: str = "") -> None:
-        if self.summary.stopped_by is None:
+        if not self.stop.is_set():
             self.summary.stopped_by, self.summary.message = reason, message
-            self.engine.stop()
+            self.stop.set()

@@ -22,6 +22,8 @@ def find_variant(name: str, also: Iterable[str] = ()) -> Run:
     known = _variants()
     if name in known:
         return known[name]
+    if ":" in name:  # MODULE:CLASS
+        return Run(name=name.rpartition(":")[2], algo=name)
     names = [*also, *variant_names()]
     raise ValueError(f"unknown algorithm or variant {name!r}{nearest(name, names)}: expected one of {', '.join(names)}")
 
@@ -42,7 +44,7 @@ def parse_variant(entry: Any) -> Run:
         return Run(**merged(find_variant(base), own))
     if "algo" not in given:
         raise ValueError(f"{dict(entry)} has neither algo nor base: say which algorithm it is")
-    return Run(**merged(Run(name=own.algo), own))
+    return Run(**merged(Run(name=own.algo.rpartition(":")[2]), own))
 
 
 def part_of_run(entry: Mapping[str, Any], also: Sequence[str] = (), elsewhere: Sequence[str] = ()) -> Run:

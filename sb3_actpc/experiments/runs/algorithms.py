@@ -1,6 +1,9 @@
 """The algorithms by name, and what their constructors take."""
 
 import importlib
+import os
+import re
+import sys
 from collections.abc import Mapping
 from typing import Any
 
@@ -36,17 +39,40 @@ _OPTION_OF = {
 
 
 def known_algorithm(name: str) -> str:
-    """The name; ValueError, with the nearest known one, when it is no key of ``ALGORITHMS``."""
-    if name not in ALGORITHMS:
-        hint = f"{nearest(name, ALGORITHMS)}: choose one of {', '.join(sorted(ALGORITHMS))}"
+    """The name; ValueError, with the nearest known one, when it is no key of ``ALGORITHMS`` and not ``MODULE:CLASS``."""
+    if name not in ALGORITHMS and not re.fullmatch(r"\w+(\.\w+)*:\w+", name):
+        hint = f"{nearest(name, ALGORITHMS)}: choose one of {', '.join(sorted(ALGORITHMS))}, or give MODULE:CLASS"
         raise ValueError(f"algo={name!r} is no algorithm{hint}")
     return name
 
 
 def load_algorithm(name: str) -> type[BaseAlgorithm]:
-    """Import an algorithm, a key of ``ALGORITHMS``; ValueError when it is none."""
-    module, _, class_name = ALGORITHMS[known_algorithm(name)].partition(":")
-    return getattr(importlib.import_module(module), class_name)
+    """Import an algorithm, a key of ``ALGORITHMS`` or ``MODULE:CLASS``; a module is looked for in the working folder, too.
+    ValueError when it is no algorithm of SB3, ImportError when the module is missing."""
+    module, _, class_name = ALGORITHMS.get(known_algorithm(name), name).partition(":")
+    find_in_working_folder()
+    found = getattr(importlib.import_module(module), class_name, None)
+    if not (isinstance(found, type) and issubclass(found, BaseAlgorithm)):
+        raise ValueError(f"algo={name!r}: {class_name} of {module} must be a subclass of SB3's BaseAlgorithm, found {found!r}")
+    return found
+
+
+def find_in_working_folder() -> None:
+    """Let modules be imported from the working folder, as with ``python -m``."""
+    if os.getcwd() not in sys.path:
+        sys.path.append(os.getcwd())
+
+
+def default_preset(name: str) -> str | None:
+    """The algorithm's own preset; of ``MODULE:CLASS`` that of the class it extends, None where that has none."""
+    if name in ALGORITHMS:
+        return name
+    bases = [(base.__module__, base.__name__) for base in load_algorithm(name).__mro__]
+    for known, target in ALGORITHMS.items():
+        module, _, class_name = target.partition(":")
+        if any(own.startswith(module) and base == class_name for own, base in bases):
+            return known
+    return None
 
 
 def check_keywords(algorithm: type[BaseAlgorithm], settings: Mapping[str, Any]) -> None:

@@ -4,9 +4,7 @@ import contextlib
 import importlib
 import inspect
 import io
-import os
 import re
-import sys
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -16,6 +14,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecNormalize
 
 from sb3_actpc.envs import ROBOSUITE_IDS, register_envs, sparse_env_id
+from sb3_actpc.experiments.runs.algorithms import find_in_working_folder
 from sb3_actpc.utils.checks import nearest
 from sb3_actpc.utils.constructors import constructor_keywords
 
@@ -79,8 +78,7 @@ def check_env_id(env_id: str, gym_packages: Sequence[str] = ()) -> None:
     """Check that an environment is registered; ids with a module (``module:Name-v0``) are left to ``gymnasium.make``.
     Modules that register environments are imported first; the working folder is looked in, too. gymnasium.error.Error where
     it is not, ModuleNotFoundError where a module is missing."""
-    if os.getcwd() not in sys.path:  # as with `python -m`
-        sys.path.append(os.getcwd())
+    find_in_working_folder()
     for module in [*gym_packages, *env_id.split(":")[:-1]]:
         try:
             importlib.import_module(module)

@@ -19,7 +19,7 @@ from sb3_actpc.checkpoints import why_no_checkpoints
 from sb3_actpc.demonstrations import is_minari_id, shipped_demonstrations
 from sb3_actpc.demonstrations.minari import minari_files
 from sb3_actpc.envs import sparse_env_id
-from sb3_actpc.experiments.runs.algorithms import check_keywords, load_algorithm
+from sb3_actpc.experiments.runs.algorithms import check_keywords, default_preset, load_algorithm
 from sb3_actpc.experiments.runs.environments import make_env
 from sb3_actpc.experiments.runs.schema import Run, merged
 from sb3_actpc.utils.arguments import check_settings
@@ -85,7 +85,8 @@ def resolve(run: Run) -> Run:
         raise ValueError("env is missing: give a Gymnasium id, such as SparseHopper-v5")
     algorithm = load_algorithm(run.algo)
     is_noise_chosen = "noise_type" in {*run.settings, *run.model_fields_set}
-    settings = with_changes(load_preset(run.preset or run.algo, run.env), run.settings)
+    preset_name = run.preset or default_preset(run.algo)
+    settings = with_changes({} if preset_name is None else load_preset(preset_name, run.env), run.settings)
     entries = {name: settings.pop(name, None) for name in RUN_KEYS}
     preset = Run(**{name: value for name, value in entries.items() if value is not None})
     said = {name: getattr(run, name) for name in run.model_fields_set - {"settings"}}
@@ -155,8 +156,7 @@ def agent_keywords(run: Run, observation_space: gym.Space[Any], action_space: gy
         if activation not in _ACTIVATIONS:
             raise ValueError(f"activation_fn={activation!r} is unknown: choose one of {', '.join(_ACTIVATIONS)}")
         keywords["policy_kwargs"]["activation_fn"] = _ACTIVATIONS[activation]
-    demonstrations = find_demonstrations(run.env, run.demonstrations)
-    if demonstrations is not None and "demonstrations" in constructor_keywords(load_algorithm(run.algo)):
+    if (demonstrations := demonstrations_of(run)) is not None:
         keywords["demonstrations"] = demonstrations
     if run.noise_type is not None:
         size = int(np.prod(action_space.shape or (1,)))
@@ -223,12 +223,10 @@ def with_changes(settings: Mapping[str, Any], changes: Mapping[str, Any]) -> dic
 
 def find_demonstrations(env_id: str, choice: str) -> Path | str | None:
     """The demonstrations of a run, a file or the id of a Minari dataset, None for none: ``"shipped"`` (for a task whose name
-    begins with ``Sparse``, or its goal version), ``"weak"`` (a weaker demonstrator's), ``"none"``, a path, or such an id.
+    begins with ``Sparse``, or its goal version), ``"none"``, a path, or such an id.
     FileNotFoundError when the path does not exist, or a sparse task has no shipped file."""
     if choice == "none":
         return None
-    if choice == "weak":
-        return shipped_demonstrations(sparse_env_id(env_id), weak=True)
     if is_minari_id(choice):
         return choice
     if choice != "shipped":
@@ -239,10 +237,16 @@ def find_demonstrations(env_id: str, choice: str) -> Path | str | None:
     return shipped_demonstrations(env_id) if env_id.rpartition(":")[2].startswith("Sparse") else None
 
 
+def demonstrations_of(run: Run) -> Path | str | None:
+    """What :func:`find_demonstrations` finds for a run; None for an algorithm without a keyword for demonstrations."""
+    takes_some = "demonstrations" in constructor_keywords(load_algorithm(run.algo))
+    return find_demonstrations(run.env, run.demonstrations) if takes_some else None
+
+
 def missing_demonstrations(run: Run) -> str:
     """A sentence where the algorithm would take shipped demonstrations and the task has none, else an empty string."""
     takes_some = "demonstrations" in constructor_keywords(load_algorithm(run.algo))
-    if run.demonstrations != "shipped" or not takes_some or find_demonstrations(run.env, run.demonstrations) is not None:
+    if run.demonstrations != "shipped" or not takes_some or demonstrations_of(run) is not None:
         return ""
     return f"{run.env}: no demonstrations are shipped for it, so there are none (--demonstrations FILE gives some)"
 

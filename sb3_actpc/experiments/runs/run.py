@@ -42,6 +42,7 @@ from sb3_actpc.experiments.runs.record import (
 )
 from sb3_actpc.experiments.runs.schema import Run, content_id
 from sb3_actpc.experiments.runs.summary import plot_learning_curve
+from sb3_actpc.utils.extras import import_extra
 from sb3_actpc.utils.files import LOCK, folder_lock, folder_name
 
 # the evaluation's episodes start from other states than the training's
@@ -170,6 +171,8 @@ def _content(run: Run) -> str:
 
 
 def _run(run: Run, report: Report, callbacks: Sequence[BaseCallback], resumes: bool, is_held: bool) -> dict[str, Any]:
+    for module in ("pandas", "matplotlib", *(("tqdm", "rich") if run.progress else ())):  # which the end of the run needs
+        import_extra(module, "experiments")
     th.set_num_threads(run.threads)
     with ExitStack() as stack:
         eval_envs = [stack.enter_context(env) for env in make_eval_envs(run.env, run.env_kwargs, run.eval_episodes)]
@@ -308,7 +311,7 @@ def _taken(folder: Path) -> str:
 def default_folder(run: Run) -> Iterator[Path]:
     """``runs/<env>/<algo>_<preset>_seed<seed>``, made when it does not exist, or with ``_2``, ``_3``, … where that holds a
     result or checkpoints, or another process trains in it. Until the block ends no other process is given it."""
-    base = Path("runs") / folder_name(run.env) / f"{run.algo}_{run.preset_name}_seed{run.seed}"
+    base = Path("runs") / folder_name(run.env) / f"{run.algo.rpartition(':')[2]}_{run.preset_name}_seed{run.seed}"
     for number in count(1):
         folder = base if number == 1 else base.with_name(f"{base.name}_{number}")
         if _taken(folder):

@@ -96,12 +96,12 @@ class Run(Schema):
     :func:`~sb3_actpc.experiments.runs.presets.resolve`; None that is said for ``noise_type`` or ``normalize`` is none."""
 
     env: str = ""  # Gymnasium id of the task
-    algo: Annotated[str, AfterValidator(known_algorithm)] = "actpc"  # key of ``ALGORITHMS``
+    algo: Annotated[str, AfterValidator(known_algorithm)] = "actpc"  # key of ``ALGORITHMS``, or ``MODULE:CLASS``
     preset: str | None = None  # a file's name in ``hyperparams/``, or a path ending in ``.yml``; by default ``algo``
     # environment steps to train for
     n_timesteps: Count | None = Field(default=None, validation_alias=AliasChoices("n_timesteps", "steps"))
     seed: Seed = 0  # of the agent and of the training environment
-    # ``"shipped"`` or ``"weak"`` (the package's files for a sparse task), ``"none"``, a path, or the id of a Minari dataset
+    # ``"shipped"`` (the package's file for a sparse task), ``"none"``, a path, or the id of a Minari dataset
     demonstrations: str = "shipped"
     # the algorithm's keywords that replace the preset's; ``"policy_kwargs.net_arch"`` replaces one value in a mapping. Once
     # filled in: all of them
@@ -143,7 +143,7 @@ class Run(Schema):
     @property
     def preset_name(self) -> str:
         """Name of the preset without folder and suffix."""
-        return Path(self.preset or self.algo).stem
+        return Path(self.preset).stem if self.preset else self.algo.rpartition(":")[2]
 
     @property
     def folder(self) -> Path:

@@ -4,8 +4,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import pandas as pd
-
 from sb3_actpc.experiments.runs.evaluation import says_one_return
 from sb3_actpc.utils.files import atomic_write
 
@@ -36,6 +34,7 @@ def result_table(result: Mapping[str, Any]) -> str:
 def plot_learning_curve(progress: Path, output: Path, title: str, demonstrators_return: float | None) -> None:
     """Draw the dense and the sparse return of a ``progress.csv`` against the environment steps, and the demonstrators' as a
     dashed line."""
+    import pandas as pd
     from matplotlib.figure import Figure
 
     rows = pd.read_csv(progress)

@@ -12,6 +12,7 @@ import numpy as np
 
 from sb3_actpc.demonstrations.dataset import Demonstrations
 from sb3_actpc.experiments.runs.evaluation import play_episodes
+from sb3_actpc.utils.extras import import_extra
 
 GL_BACKENDS = ("egl", "osmesa")
 VIDEO_SUFFIXES = (".mp4", ".gif", ".png")
@@ -66,14 +67,15 @@ def record_video(
     rendering does not work here, ValueError when the path has another suffix, or the environment cannot draw demonstrations.
     """
     check_video_path(path)
+    imageio = import_extra("imageio.v2", "experiments")
+    if path.suffix.lower() == ".mp4":
+        import_extra("imageio_ffmpeg", "experiments")
     with _rendering(env_id, env_kwargs) as env:
         frames: list[Any] = _play(model, env, seed, n_frames)
         if demonstrations is not None:
             right = _replay(demonstrations, env, n_frames)
             frames = [np.hstack(pair) for pair in zip(frames, right, strict=False)]
         frames_per_second = float(env.metadata.get("render_fps", 30))
-    import imageio.v2 as imageio
-
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}{path.suffix}")  # the suffix tells imageio the format
     if path.suffix.lower() == ".png":

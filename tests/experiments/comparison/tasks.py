@@ -2,8 +2,9 @@
 
 import os
 import signal
+import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,6 @@ import yaml
 from sb3_actpc.demonstrations.dataset import Demonstrations
 from sb3_actpc.experiments.comparison import plan_runs, read_comparison
 from sb3_actpc.experiments.comparison.display import Display
-from sb3_actpc.experiments.comparison.engines import Event
 from sb3_actpc.experiments.comparison.execution import Outcome, execute_run
 from sb3_actpc.experiments.comparison.schedule import Summary, run_comparison
 from sb3_actpc.experiments.runs import Run
@@ -128,24 +128,16 @@ class InlineEngine:
     def __init__(self) -> None:
         self.begun: list[Run] = []
         self.lines: list[str] = []
-        self._events: list[Event] = []
 
     def capacity(self) -> int:
         return 1
 
-    def start(self, run: Run) -> None:
+    def execute(self, run: Run, stop: threading.Event, on_steps: Callable[[int], None]) -> Outcome:
         self.begun.append(run)
-        outcome = self.execute(run)
-        self._events += [Event(run.id, steps=run.n_timesteps), Event(run.id, outcome=outcome)]
+        return self.outcome_of(run)
 
-    def execute(self, run: Run) -> Outcome:
+    def outcome_of(self, run: Run) -> Outcome:
         return execute_run(run, self.lines.append, lambda steps: None)
-
-    def poll(self, timeout: float) -> list[Event]:
-        events, self._events = self._events, []
-        return events
-
-    def stop(self) -> None: ...
 
     def close(self) -> None: ...
 

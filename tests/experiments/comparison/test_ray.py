@@ -1,17 +1,17 @@
 """The Ray engine on a cluster of two nodes on this machine, one of them killed while a run is on it."""
 
+import threading
 import time
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
+from sb3_actpc.checkpoints import list_bundles
 from sb3_actpc.cli import main
 from sb3_actpc.experiments.comparison import make_engine
-from sb3_actpc.experiments.comparison.cluster import RayEngine
-from sb3_actpc.experiments.comparison.engines import Event
 from sb3_actpc.experiments.comparison.execution import run_status
 from sb3_actpc.experiments.comparison.schedule import run_comparison
+from sb3_actpc.experiments.runs.run import CHECKPOINTS
 from tests.checkpoints.runs import log_rows
 from tests.experiments.comparison.tasks import ROOT, Lines, bring_to_end, small_runs, write_preset
 
@@ -37,15 +37,14 @@ def test_the_runs_of_a_node_that_dies_are_done_elsewhere(tmp_path: Path) -> None
     runs = small_runs(tmp_path / "out", ["first", "second", "third"], pause=0.2)
     deaths = []
 
-    class KillingDisplay(Lines):
-        """Kills the second node once both nodes work."""
+    def kill_once_both_work() -> None:
+        while sum(bool(list_bundles(run.folder / CHECKPOINTS)) for run in runs) < 2:
+            time.sleep(0.1)
+        cluster.remove_node(second, allow_graceful=False)
+        deaths.append(second)
 
-        def stepped(self, run: object, steps: int) -> None:
-            if not deaths and steps >= 15 and sum(line.startswith("started") for line in self.lines) >= 2:
-                cluster.remove_node(second, allow_graceful=False)
-                deaths.append(steps)
-
-    display = KillingDisplay()
+    display = Lines()
+    threading.Thread(target=kill_once_both_work, daemon=True).start()
     try:
         summary = run_comparison(runs, tmp_path / "out", lambda: make_engine("ray", None, 1, address=cluster.address), display)
     finally:
@@ -63,40 +62,23 @@ def test_the_runs_of_a_node_that_dies_are_done_elsewhere(tmp_path: Path) -> None
 def test_a_cluster_of_its_own_is_started_and_stops_when_told(tmp_path: Path) -> None:
     """A run that is stopped has saved where it was, and goes on there."""
     [run] = small_runs(tmp_path / "out", pause=0.1)
-    engine = make_engine("ray", 1, 1)
-    outcomes: list[Event] = []
+    engine, stop = make_engine("ray", 1, 1), threading.Event()
+
+    def stop_after_a_checkpoint() -> None:
+        while not list_bundles(run.folder / CHECKPOINTS):
+            time.sleep(0.1)
+        stop.set()
+
+    threading.Thread(target=stop_after_a_checkpoint, daemon=True).start()
     try:
         assert engine.capacity() == 1
-        engine.start(run)
-        deadline = time.monotonic() + 600
-        is_told = False
-        while not outcomes and time.monotonic() < deadline:
-            for event in engine.poll(0.5):
-                if event.outcome is not None:
-                    outcomes.append(event)
-                elif not is_told and (event.steps or 0) >= 12:
-                    engine.stop()
-                    is_told = True
+        outcome = engine.execute(run, stop, lambda steps: None)
     finally:
         engine.close()
-    assert outcomes and outcomes[0].outcome is not None and outcomes[0].outcome.status == "stopped"
+    assert outcome.status == "stopped"
     assert run_status(run.folder) == "unfinished"
     _, inline, _ = bring_to_end([run], tmp_path / "out")
     assert "from step" in inline.lines[0]
-
-
-def test_a_head_that_dies_ends_the_command_and_no_run(tmp_path: Path) -> None:
-    """Ray itself would end the process, a minute later, and not say that the comparison can go on."""
-    [run] = small_runs(tmp_path / "out")
-    engine = RayEngine.__new__(RayEngine)
-    engine.ray, engine._head = SimpleNamespace(wait=lambda *_, **__: ([], [])), "127.0.0.1:1"
-    engine._tasks, engine._is_mine = {object(): run}, True
-    with pytest.raises(
-        ConnectionError, match=r"the head of the Ray cluster at 127\.0\.0\.1:1 has died: .* same command goes on"
-    ):
-        engine.poll(0.1)
-    engine.close()  # asks nobody who is dead
-    assert run_status(run.folder) == "new"
 
 
 def test_no_cluster_at_the_address_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:

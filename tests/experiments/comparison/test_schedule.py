@@ -15,7 +15,6 @@ from rich.console import Console
 
 from sb3_actpc.checkpoints import list_bundles
 from sb3_actpc.cli import main
-from sb3_actpc.experiments.comparison.cluster import _execute, pack_folder, unpack_folder
 from sb3_actpc.experiments.comparison.display import Display, describe_runs
 from sb3_actpc.experiments.comparison.execution import (
     FAILED,
@@ -165,11 +164,11 @@ class FaultyEngine(tasks.InlineEngine):
 
     n_losses = 0
 
-    def execute(self, run: Run) -> Outcome:
+    def outcome_of(self, run: Run) -> Outcome:
         if self.n_losses:
             self.n_losses -= 1
             return Outcome(LOST, "the process of the run ended with signal 9")
-        return super().execute(run)
+        return super().outcome_of(run)
 
 
 @pytest.mark.parametrize("n_losses", [MAX_LOSSES - 1, MAX_LOSSES])
@@ -266,22 +265,6 @@ def test_every_state_of_a_run_has_its_name() -> None:
     bring_to_end([run], OUT)
     assert run_status(run.folder) == FINISHED
     assert read_result(run.folder)["timesteps"] == 60
-
-
-def test_a_node_without_the_folders_works_on_a_copy_that_comes_back() -> None:
-    """What the Ray engine's task does where the probe cannot be seen, after an interruption elsewhere."""
-    [straight] = small_runs(Path("straight"))
-    bring_to_end([straight], Path("straight"))
-    [run] = small_runs(OUT)
-    interrupt_after(run, 33)
-    packed = pack_folder(run.folder)
-    status, message, returned = _execute(run.model_dump_json(), "/there/is/no/such/probe", packed, None)
-    assert (status, message) == (FINISHED, "") and returned is not None
-    assert run_status(run.folder) == UNFINISHED  # the copy was worked on
-    unpack_folder(returned, run.folder)
-    assert run_status(run.folder) == FINISHED
-    assert measured(run) == measured(straight)
-    assert not list((run.folder / CHECKPOINTS).rglob("*.json"))  # gone from the copy, gone from here
 
 
 def test_the_table_gives_the_seconds_of_finished_runs_to_those_of_their_kind_and_guesses_none() -> None:

@@ -1,53 +1,38 @@
-"""Agents made from files alone: from a checkpoint, or from a file of weights that cannot run code."""
+"""Files of weights and settings, which cannot run code, and agents made from them."""
 
 import json
 import os
 from pathlib import Path
 from typing import Any, TypeVar
 
-import numpy as np
 import safetensors
 import safetensors.torch
 import torch as th
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.type_aliases import GymEnv
 
-from sb3_actpc.checkpoints.bundle import Report, find_bundle, warn
-from sb3_actpc.checkpoints.encoding import Decoder, Encoder
-from sb3_actpc.checkpoints.settings import constructor_settings, read_settings
-from sb3_actpc.checkpoints.state import Restored, check_weights, restore_model
 from sb3_actpc.utils.files import atomic_write
+from sb3_actpc.utils.settings import constructor_settings, read_settings
 
 SelfAlgorithm = TypeVar("SelfAlgorithm", bound=OffPolicyAlgorithm)
 
 FORMAT = "sb3_actpc weights"
-VERSION = 5
+VERSION = 6
 _SUFFIX = ".safetensors"
+_STATISTICS = ("mean", "var", "count")
+_NORMALIZERS = "normalizers."
 
 
-def load_checkpoint(
-    algorithm: type[OffPolicyAlgorithm],
-    path: str | os.PathLike[str],
-    env: GymEnv | str,
-    device: th.device | str = "auto",
-    report: Report = warn,
-    **overrides: Any,
-) -> Restored:
-    """Make an agent with the settings of a checkpoint and put everything back into it; no code is run from the file.
-
-    :param path: a checkpoint, or the folder of several: the newest whole one is taken
-    :param env: an environment made as the stopped run's
-    :param report: given a line for each damaged checkpoint, and when episodes must start again
-    :param overrides: constructor keywords: those that could not be stored by name, and what may differ (``verbose``, ...)
-    :return: the agent (``model``), for :func:`~sb3_actpc.checkpoints.continue_learning`
-    :raises FileNotFoundError: when there is no checkpoint
-    :raises ValueError: when it is damaged, does not fit or was written in another version of the format
-    """
-    bundle = find_bundle(path, report)
-    if bundle.manifest["agent"]["algorithm"] != algorithm.__name__:
-        raise ValueError(f"{bundle.path} is a checkpoint of {bundle.manifest['agent']['algorithm']}, not {algorithm.__name__}")
-    keywords = read_settings(bundle.manifest["settings"], overrides)
-    return restore_model(algorithm(env=env, device=device, **keywords), bundle, report)
+def check_weights(model: BaseAlgorithm) -> None:
+    """:raises ValueError: naming the first weight that is NaN or infinite"""
+    for name, parameter in model.policy.named_parameters():
+        if not bool(th.isfinite(parameter).all()):
+            raise ValueError(
+                f"{name}: weights are not finite at step {model.num_timesteps}; lower the learning rate, bound the weights or "
+                "normalise the observations, and go on from the last good checkpoint"
+            )
 
 
 def save_weights(model: OffPolicyAlgorithm, path: str | os.PathLike[str]) -> Path:
@@ -71,7 +56,6 @@ def save_weights(model: OffPolicyAlgorithm, path: str | os.PathLike[str]) -> Pat
         raise ValueError(f"{what} cannot be written by name: only classes of torch, SB3 and sb3_actpc can; use save() instead")
     settings["unnamed"] = []
     settings["keywords"].pop("demonstrations", None)
-    encoder = Encoder()
     header = {
         "format": FORMAT,
         "version": VERSION,
@@ -79,10 +63,10 @@ def save_weights(model: OffPolicyAlgorithm, path: str | os.PathLike[str]) -> Pat
         "observation_space": str(model.observation_space),
         "action_space": str(model.action_space),
         "settings": settings,
-        "normalizers": encoder.encode(_normalizers(model), "normalizers"),
     }
     tensors = {name: tensor.detach().cpu().contiguous().clone() for name, tensor in model.policy.state_dict().items()}
-    tensors |= {name: th.as_tensor(np.array(array)) for name, array in encoder.arrays.items()}
+    for name, statistics in _normalizers(model).items():
+        tensors |= {f"{name}.{part}": th.tensor(getattr(statistics, part), dtype=th.float64) for part in _STATISTICS}
     path = Path(path)
     path = path if path.suffix == _SUFFIX else path.with_name(path.name + _SUFFIX)
     with atomic_write(path) as file:
@@ -119,12 +103,7 @@ def load_weights(
     for name in ("observation_space", "action_space"):
         if str(getattr(model, name)) != header[name]:
             raise ValueError(f"{path} was trained with {name}={header[name]}, the environment has {getattr(model, name)}")
-    stored, present = header["normalizers"], _normalizers(model)
-    if [one is None for one in stored] != [one is None for one in present]:
-        saved = f"with VecNormalize(norm_obs={stored[0] is not None})" if stored else "without VecNormalize"
-        raise ValueError(f"{path} was saved {saved}: wrap the environment as it was in training")
-    arrays = {name: tensors.pop(name).numpy() for name in list(tensors) if name.startswith("normalizers.")}
-    Decoder(arrays, {}).decode(stored, present)
+    _load_normalizers(model, {name: tensors.pop(name) for name in list(tensors) if name.startswith(_NORMALIZERS)}, path)
     try:
         model.policy.load_state_dict(tensors)
     except RuntimeError as error:
@@ -152,7 +131,22 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, th.Tensor]]:
     return header, tensors
 
 
-def _normalizers(model: OffPolicyAlgorithm) -> list[Any]:
-    """VecNormalize's running statistics of observations (None where it leaves them alone) and returns; empty without one."""
+def _normalizers(model: OffPolicyAlgorithm) -> dict[str, RunningMeanStd]:
+    """VecNormalize's running statistics of returns and, where it normalises them, of observations; empty without one."""
     env = model.get_vec_normalize_env()
-    return [] if env is None else [env.obs_rms if env.norm_obs else None, env.ret_rms]
+    if env is None:
+        return {}
+    observed = env.obs_rms if env.norm_obs else {}
+    parts = observed if isinstance(observed, dict) else {"": observed}
+    return {f"{_NORMALIZERS}returns": env.ret_rms, **{f"{_NORMALIZERS}observations{key}": one for key, one in parts.items()}}
+
+
+def _load_normalizers(model: OffPolicyAlgorithm, stored: dict[str, th.Tensor], path: Path) -> None:
+    present = _normalizers(model)
+    if {name.rpartition(".")[0] for name in stored} != present.keys():
+        norm_obs = any("observations" in name for name in stored)
+        saved = f"with VecNormalize(norm_obs={norm_obs})" if stored else "without VecNormalize"
+        raise ValueError(f"{path} was saved {saved}: wrap the environment as it was in training")
+    for name, statistics in present.items():
+        mean, var, count = (stored[f"{name}.{part}"].numpy() for part in _STATISTICS)
+        statistics.mean, statistics.var, statistics.count = mean, var, float(count)

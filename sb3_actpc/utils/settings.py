@@ -19,15 +19,14 @@ from sb3_actpc.utils.constructors import constructor_keywords
 # a class can be named when it is of one of these packages and of one of these kinds
 _PACKAGES = ("torch", "stable_baselines3", "sb3_contrib", "sb3_actpc")
 _KINDS: tuple[type, ...] = (th.nn.Module, th.optim.Optimizer, ReplayBuffer)
-_SCHEDULES: dict[str, tuple[Any, tuple[str, ...]]] = {
-    "linear": (LinearSchedule, ("start", "end", "end_fraction")),
-    "constant": (ConstantSchedule, ("val",)),
-}
-_NOISES: dict[str, tuple[Any, dict[str, str]]] = {
+# schedules and noises: the attribute that holds each argument of the constructor
+_OBJECTS: dict[str, tuple[Any, dict[str, str]]] = {
+    "linear": (LinearSchedule, {"start": "start", "end": "end", "end_fraction": "end_fraction"}),
+    "constant": (ConstantSchedule, {"val": "val"}),
     "normal": (NormalActionNoise, {"mean": "_mu", "sigma": "_sigma"}),
     "ornstein-uhlenbeck": (OrnsteinUhlenbeckActionNoise, {"mean": "_mu", "sigma": "_sigma", "theta": "_theta", "dt": "_dt"}),
 }
-# chosen anew by whoever loads, or stored otherwise
+# chosen by the program that loads, or stored otherwise
 _NOT_STORED = {"env", "policy", "device", "verbose"}
 _ATTRIBUTE_OF = {"stats_window_size": "_stats_window_size"}
 
@@ -54,7 +53,7 @@ def read_settings(record: Mapping[str, Any], overrides: Mapping[str, Any]) -> di
     missing = [name for name in record["unnamed"] if name not in overrides]
     if missing:
         raise ValueError(f"{', '.join(missing)} could not be stored as plain values: pass the same again, {missing[0]}=...")
-    keywords = {name: read_value(value) for name, value in record["keywords"].items() if name not in overrides}
+    keywords = {name: _read_value(value) for name, value in record["keywords"].items() if name not in overrides}
     policy = overrides.get("policy", record["policy"])
     if policy is None:
         raise ValueError("the policy's class could not be stored by name: pass the same again, policy=...")
@@ -86,39 +85,40 @@ def _name_value(value: Any) -> Any:
 def _name_object(value: Any) -> dict[str, Any]:
     if isinstance(value, type):
         name = f"{value.__module__}.{value.__qualname__}"
-        if find_class(name) is value:
+        if _find_class(name) is value:
             return {"class": name}
     if isinstance(value, FloatSchedule):
         return _name_object(value.value_schedule)
     if isinstance(value, VectorizedActionNoise):
         return _name_object(value.base_noise)
-    for name, (kind, attributes) in _SCHEDULES.items():
+    for name, (kind, attributes) in _OBJECTS.items():
         if type(value) is kind:
-            return {"schedule": [name, *(float(getattr(value, attribute)) for attribute in attributes)]}
-    for name, (kind, parameters) in _NOISES.items():
-        if type(value) is kind:
-            return {"noise": [name, {key: np.asarray(vars(value)[part]).tolist() for key, part in parameters.items()}]}
+            return {"object": [name, {key: np.asarray(vars(value)[part]).tolist() for key, part in attributes.items()}]}
     raise ValueError(f"{value!r} has no name here")
 
 
-def read_value(node: Any) -> Any:
-    """The value of one keyword as :func:`constructor_settings` stored it; ValueError for a class, schedule or noise not
-    allowed."""
+def _read_value(node: Any) -> Any:
+    """The value of one keyword as :func:`constructor_settings` stored it; ValueError for a class or an object not allowed."""
     if isinstance(node, list):
-        return [read_value(part) for part in node]
+        return [_read_value(part) for part in node]
     if not isinstance(node, dict):
         return node
     (kind, content), *others = node.items()
-    if others or kind not in ("tuple", "dict", "class", "schedule", "noise"):
+    if others or kind not in ("tuple", "dict", "class", "object"):
         raise ValueError(f"a setting is stored as {sorted(node)}, which this version does not know")
     if kind == "tuple":
-        return tuple(read_value(part) for part in content)
+        return tuple(_read_value(part) for part in content)
     if kind == "dict":
-        return {key: read_value(part) for key, part in content.items()}
-    return _read_object(kind, content)
+        return {key: _read_value(part) for key, part in content.items()}
+    if kind == "object":
+        return _make_object(*content)
+    found = _find_class(str(content))
+    if found is None:
+        raise ValueError(f"the class {content!r} is not one of those of {', '.join(_PACKAGES)}: it is not loaded")
+    return found
 
 
-def find_class(name: str) -> type | None:
+def _find_class(name: str) -> type | None:
     """The class of a module and name, if it is among the allowed ones and its module has been imported before; otherwise
     None."""
     module, _, attribute = name.rpartition(".")
@@ -126,18 +126,9 @@ def find_class(name: str) -> type | None:
     return found if isinstance(found, type) and issubclass(found, _KINDS) else None
 
 
-def _read_object(kind: str, content: Any) -> Any:
-    if kind == "class":
-        found = find_class(str(content))
-        if found is None:
-            raise ValueError(f"the class {content!r} is not one of those of {', '.join(_PACKAGES)}: it is not loaded")
-        return found
-    name, *values = content
-    table: Mapping[str, Any] = _SCHEDULES if kind == "schedule" else _NOISES
-    if name not in table:
-        raise ValueError(f"the {kind} {name!r} is not one of {sorted(table)}: it is not loaded")
-    make, parameters = table[name]
-    if kind == "schedule":
-        return make(*map(float, values))
-    arrays = {key: np.asarray(values[0][key], dtype=np.float64) for key in parameters}
+def _make_object(name: str, values: Mapping[str, Any]) -> Any:
+    if name not in _OBJECTS:
+        raise ValueError(f"the schedule or noise {name!r} is not one of {sorted(_OBJECTS)}: it is not loaded")
+    make, parameters = _OBJECTS[name]
+    arrays = {key: np.asarray(values[key], dtype=np.float64) for key in parameters}
     return make(**{key: array if array.ndim else float(array) for key, array in arrays.items()})
