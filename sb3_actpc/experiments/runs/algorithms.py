@@ -21,6 +21,7 @@ ALGORITHMS = {
     "cql": "sb3_actpc.baselines:CQL",
     "ddpg": "sb3_actpc.baselines:DDPGDemo",
     "her": "sb3_actpc.baselines:HER",
+    "ibrl": "sb3_actpc.baselines:IBRL",
     "logo": "sb3_actpc.baselines:LOGO",
     "ppo": "stable_baselines3:PPO",
     "rlpd": "sb3_actpc.baselines:RLPD",

@@ -1,0 +1,172 @@
+"""IBRL: a frozen BC policy proposes actions to a TD3 agent, when it acts and when it bootstraps."""
+
+from typing import Any, ClassVar
+
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.policies import BasePolicy, ContinuousCritic
+from stable_baselines3.common.torch_layers import create_mlp
+from stable_baselines3.common.type_aliases import PyTorchObs
+from stable_baselines3.common.utils import polyak_update
+from stable_baselines3.td3.policies import TD3Policy
+from torch import nn
+
+from sb3_actpc.baselines.bc import BC
+from sb3_actpc.baselines.bc_policies import BCPolicy
+from sb3_actpc.baselines.td3 import TD3Demo
+from sb3_actpc.utils.arguments import Count, Positive, Weight, checked
+
+N_TARGET_CRITICS = 2  # drawn to bootstrap (REDQ, arXiv 2101.05982)
+
+
+class IBRLPolicy(TD3Policy):
+    """SB3's TD3 policy with layer-normalized critics and the frozen BC policy, ``bc``.
+
+    :param args: as SB3's
+    :param n_critics: number of critics
+    :param exploration_noise: standard deviation of Gaussian noise on the actor's proposal, in units of [-1, 1], while learning
+    :param options: further keywords, as SB3's
+    :raises ValueError: for fewer than two critics, and for observations that are no Box
+    """
+
+    def __init__(self, *args: Any, n_critics: int = 5, exploration_noise: float = 0.1, **options: Any) -> None:
+        if n_critics < N_TARGET_CRITICS:
+            raise ValueError(f"n_critics={n_critics!r} must be at least {N_TARGET_CRITICS}: two of them bootstrap")
+        self.exploration_noise = exploration_noise
+        self.follows_bc = False  # the actor proposes nothing yet
+        super().__init__(*args, n_critics=n_critics, **options)
+        assert isinstance(self.action_space, spaces.Box)
+        self.bc = BCPolicy(self.observation_space, self.action_space, lambda progress: 0.0).requires_grad_(False)
+
+    def make_critic(self, features_extractor: Any = None) -> ContinuousCritic:
+        """SB3's critics with a layer normalization after each hidden layer."""
+        critic = super().make_critic(features_extractor)
+        n_inputs = critic.q_networks[0][0].in_features  # type: ignore[index]
+        hidden = self.critic_kwargs["net_arch"]
+        for index in range(len(critic.q_networks)):
+            modules = create_mlp(n_inputs, 1, hidden, self.activation_fn, post_linear_modules=[nn.LayerNorm])
+            critic.q_networks[index] = nn.Sequential(*modules)
+            critic.add_module(f"qf{index}", critic.q_networks[index])
+        return critic.to(self.device)
+
+    def bc_actions(self, observations: th.Tensor) -> th.Tensor:
+        """Proposals of the BC policy in [-1, 1], (B, A)."""
+        return self.bc._predict(observations, deterministic=True)
+
+    def target_values(self, observations: PyTorchObs, actions: th.Tensor) -> th.Tensor:
+        """The smaller value of two target critics, drawn anew at each call, (B, 1)."""
+        values = th.stack(self.critic_target(observations, actions))
+        drawn = th.randperm(len(values), device=values.device)[:N_TARGET_CRITICS]
+        return values[drawn].amin(dim=0)
+
+    def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        assert isinstance(observation, th.Tensor)
+        proposed = self.bc_actions(observation)
+        if self.follows_bc:
+            return proposed
+        actions = self.actor(observation)
+        if not deterministic:
+            actions = (actions + self.exploration_noise * th.randn_like(actions)).clamp(-1, 1)
+        both = th.stack([actions, proposed])
+        # both actions are valued by the same critics: all of them, so that the choice is no matter of chance
+        values = th.stack([th.cat(self.critic_target(observation, one), dim=1).amin(dim=1) for one in both])
+        return th.where((values[1] > values[0])[:, None], proposed, actions)
+
+
+class IBRL(TD3Demo):
+    """Imitation-bootstrapped reinforcement learning (Hu et al., arXiv 2311.02198) on TD3.
+
+    The first ``learn`` trains a BC policy on the demonstrations, which then stays as it is. At each step the agent takes the
+    actor's action or that of the BC policy, whichever the target critics value more. Targets bootstrap from the better of
+    the two in the next state. Until ``learning_starts`` the BC policy acts.
+
+    Differences from the paper:
+
+    1. Half of every batch is demonstrated; there the replay buffer starts with the demonstrations.
+    2. The actor has no dropout.
+    3. The choice between two actions when acting uses the smallest value of all target critics, not of two drawn ones.
+    4. The actor climbs the first critic, as TD3's does.
+
+    :param args: policy, "MlpPolicy", and env; ``policy_kwargs`` are those of :class:`IBRLPolicy`
+    :param bc_steps: steps of :class:`~sb3_actpc.baselines.BC`
+    :param gradient_steps: critic updates per environment step
+    :param policy_delay: critic updates per actor update; None for ``gradient_steps``
+    :param target_policy_noise: as SB3's; the paper smooths the actor's proposal for the next state
+    :param options: keywords of :class:`~sb3_actpc.baselines.TD3Demo`; exploration noise is ``policy_kwargs``' own
+    :raises ValueError: without demonstrations, with ``action_noise``, and as there
+    """
+
+    policy: IBRLPolicy
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": IBRLPolicy}
+
+    @checked
+    def __init__(
+        self,
+        *args: Any,
+        bc_steps: Count = 2500,
+        gradient_steps: Positive = 5,
+        policy_delay: int | None = None,
+        target_policy_noise: Weight = 0.1,
+        **options: Any,
+    ) -> None:
+        if options.get("action_noise") is not None:
+            raise ValueError(f"action_noise={options['action_noise']!r}: use policy_kwargs={{'exploration_noise': 0.1}}")
+        super().__init__(
+            *args,
+            bc_steps=bc_steps,
+            gradient_steps=gradient_steps,
+            policy_delay=gradient_steps if policy_delay is None else policy_delay,
+            target_policy_noise=target_policy_noise,
+            **options,
+        )
+
+    def _setup_model(self) -> None:
+        if self.env is not None and self.demonstrations is None:
+            raise ValueError("demonstrations=None: IBRL needs demonstrations for its BC policy, pass a file")
+        super()._setup_model()
+
+    def _clone_actor(self) -> None:
+        """Train the BC policy, not the actor."""
+        model = BC(
+            "MlpPolicy",
+            self.env,
+            demonstrations=self.demonstrations,
+            n_demonstrations=self.n_demonstrations,
+            n_demonstration_transitions=self.n_demonstration_transitions,
+            learning_rate=lambda left: 1e-3 * left,
+            batch_size=64,
+            seed=self.seed,
+            device=self.device,
+        )
+        model.learn(self.bc_steps, log_interval=None)
+        self.policy.bc.load_state_dict(model.policy.state_dict())
+
+    def _sample_action(self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1) -> Any:
+        self.policy.follows_bc = self.num_timesteps < learning_starts
+        try:
+            return super()._sample_action(0, action_noise, n_envs)
+        finally:
+            self.policy.follows_bc = False
+
+    def _critic_targets(self, batch: Any) -> th.Tensor:
+        """The better of the actor's and the BC policy's actions bootstraps, (B, 1)."""
+        discounts = self.gamma if batch.discounts is None else batch.discounts
+        with th.no_grad():
+            noise = batch.actions.clone().normal_(0, self.target_policy_noise)
+            noise = noise.clamp(-self.target_noise_clip, self.target_noise_clip)
+            actions = (self.actor_target(batch.next_observations) + noise).clamp(-1, 1)
+            proposed = self.policy.bc_actions(batch.next_observations)
+            # one call: the same two critics value both
+            observations = batch.next_observations.repeat(2, 1)
+            values = self.policy.target_values(observations, th.cat([actions, proposed]))
+            bootstrap = values.view(2, -1, 1).amax(dim=0)
+            return batch.rewards + (1 - batch.dones) * discounts * bootstrap
+
+    def _update_critic(self, batch: Any) -> None:
+        """The target critics follow every update."""
+        super()._update_critic(batch)
+        polyak_update(self.critic.parameters(), self.critic_target.parameters(), self._tau_of(self.critic_kwargs))
+
+    def _update_targets(self) -> None:
+        polyak_update(self.actor.parameters(), self.actor_target.parameters(), self._tau_of(self.actor_kwargs))
