@@ -174,7 +174,11 @@ def test_a_generator_is_shared_by_layers_as_it_was(is_shared: bool) -> None:
     assert env.unwrapped.np_random.random() != first
 
 
-@pytest.mark.parametrize("rng", [random.Random(3), np.random.RandomState(3), np.random.Generator(np.random.SFC64(3))], ids=lambda rng: type(rng).__name__)
+@pytest.mark.parametrize(
+    "rng",
+    [random.Random(3), np.random.RandomState(3), np.random.Generator(np.random.SFC64(3))],
+    ids=["Random", "RandomState", "Generator"],
+)
 def test_every_generator_goes_on_and_is_shared(rng: Any) -> None:
     env, reason = go_on(CountingEnv, holding(one=rng, other=rng))
     assert not reason and env.one is env.other
