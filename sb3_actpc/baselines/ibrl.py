@@ -35,7 +35,7 @@ class IBRLPolicy(TD3Policy):
             raise ValueError(f"n_critics={n_critics!r} must be at least {N_TARGET_CRITICS}: two of them bootstrap")
         self.exploration_noise = exploration_noise
         self.follows_bc = False  # the actor proposes nothing yet
-        super().__init__(*args, n_critics=n_critics, **options)
+        super().__init__(*args, **{**options, "n_critics": n_critics})
         assert isinstance(self.action_space, spaces.Box)
         self.bc = BCPolicy(self.observation_space, self.action_space, lambda progress: 0.0).requires_grad_(False)
 
@@ -43,7 +43,7 @@ class IBRLPolicy(TD3Policy):
         """SB3's critics with a layer normalization after each hidden layer."""
         critic = super().make_critic(features_extractor)
         n_inputs = critic.q_networks[0][0].in_features  # type: ignore[index]
-        hidden = self.critic_kwargs["net_arch"]
+        hidden: Any = self.critic_kwargs["net_arch"]
         for index in range(len(critic.q_networks)):
             modules = create_mlp(n_inputs, 1, hidden, self.activation_fn, post_linear_modules=[nn.LayerNorm])
             critic.q_networks[index] = nn.Sequential(*modules)
