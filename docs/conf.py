@@ -32,6 +32,7 @@ nb_execution_raise_on_error = True
 nb_execution_timeout = 1800  # seconds, of one cell
 nb_execution_in_temp = True
 nb_merge_streams = True
+nb_render_markdown_format = "myst"  # with tables
 
 autodoc_member_order = "bysource"
 autodoc_typehints = "description"
