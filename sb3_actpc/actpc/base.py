@@ -76,14 +76,14 @@ class ActPCBase(LearnsFromDemonstrations, Persistent):
     _is_stepping: bool
 
     @property
-    def pretrained(self) -> bool:
+    def is_pretrained(self) -> bool:
         """Whether the actor has imitated the demonstrations (:meth:`pretrain`), or was given synapses that have."""
         return bool(self.policy.has_imitated)
 
     @property
     def imitates_first(self) -> bool:
         """Whether ``learn`` begins with BC, so that an evaluation before it says nothing."""
-        return self.demonstrations is not None and self.guidance != "none" and not self.pretrained
+        return self.demonstrations is not None and self.guidance != "none" and not self.is_pretrained
 
     @property
     def inputs(self) -> CircuitInputs:
@@ -181,7 +181,7 @@ class ActPCBase(LearnsFromDemonstrations, Persistent):
         """
         self.expert = None
         self._used_demonstrations = self.demonstrations, self.n_demonstrations, self.n_demonstration_transitions
-        is_trained = self.pretrained or self.num_timesteps > 0
+        is_trained = self.is_pretrained or self.num_timesteps > 0
         if self.demonstrations is None:
             self._drop_demonstrations(is_trained)
         elif self.env is not None or not isinstance(self.observation_space, spaces.Dict):  # a goal task: in ``set_env``
@@ -218,7 +218,7 @@ class ActPCBase(LearnsFromDemonstrations, Persistent):
             bounds = finite_bounds(self.observation_space, inputs.are_normalised)
             normalizer.begin()
             normalizer.fit(inputs.features(inputs.observations(bounds)))
-        elif self.observation_normalization == "demonstrations" and self.expert is not None and not self.pretrained:
+        elif self.observation_normalization == "demonstrations" and self.expert is not None and not self.is_pretrained:
             normalizer.begin()
             if not inputs.are_normalised:
                 normalizer.fit(self.expert.features(inputs))
@@ -244,7 +244,7 @@ class ActPCBase(LearnsFromDemonstrations, Persistent):
         memory = self.replay_buffer.self_imitation
         if memory is not None:
             memory.takes_all = self.actor_guidance.stores == "positive" and self.expert is not None
-        imitates = self.pretrained and self.refresh_weight > 0
+        imitates = self.is_pretrained and self.refresh_weight > 0
         warn_of_idle_settings(self.demonstrations is not None, imitates, (self.alpha_ext, self.alpha_ep, self.alpha_in))
 
     def pretrain(self, before_update: Callable[[], None] = lambda: None, progress_bar: bool = False) -> None:
@@ -256,7 +256,7 @@ class ActPCBase(LearnsFromDemonstrations, Persistent):
         """
         expert = self.expert
         if expert is not None:
-            if not self.pretrained:
+            if not self.is_pretrained:
                 self._fit_normalizer()
                 self._show_to_vec_normalize(expert)
             # without a weight the prior has no role
@@ -269,7 +269,7 @@ class ActPCBase(LearnsFromDemonstrations, Persistent):
                 batch = expert.sample(batch_size, self.inputs, self.reward_weights, self.gamma)
                 self.instrumental.update(batch.features, batch.actions, batch.next_features, batch.memory)
                 self.policy.n_prior_updates.add_(1)
-        self.actor_guidance.on_training_start(self._context(), self.pretrained)
+        self.actor_guidance.on_training_start(self._context(), self.is_pretrained)
         if expert is not None:
             self.policy.has_imitated.fill_(1.0)
 

@@ -99,6 +99,20 @@ class Persistent(StoresLastTransition):
         """
         return load_checkpoint(cls, path, env, **keywords)
 
+    @classmethod
+    def pretrained(cls, env_id: str, env: GymEnv | None = None, **keywords: Any) -> "Persistent":
+        """
+        A trained agent that comes with the package, to act: see :func:`sb3_actpc.pretrained.load_pretrained`.
+
+        :param env_id: the environment that it was trained on, such as ``SparseReacher-v5``
+        :param env: an environment with the same spaces; by default one is made from the id
+        :param keywords: constructor keywords that replace the stored ones
+        :raises ValueError: when no agent comes with the package for this environment
+        """
+        from sb3_actpc.pretrained import load_pretrained  # it imports the agent
+
+        return load_pretrained(env_id, env, **keywords)
+
     def load_replay_buffer(self, path: Any, truncate_last_traj: bool = True) -> None:
         """
         As in SB3, which unpickles: load files that you trust.

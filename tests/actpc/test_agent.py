@@ -942,7 +942,7 @@ def test_images_are_imitated_as_the_circuits_see_them():
     expert = model.expert.episodes.observations
     assert first.shape == (1, 3, 36, 40) and np.array_equal(expert[0], first[0]) and np.array_equal(expert[1], second[0])
     model.learn(5)
-    assert model.pretrained
+    assert model.is_pretrained
 
 
 def test_a_loaded_agents_signals_are_those_asked_for(tmp_path):
@@ -1016,7 +1016,7 @@ def test_save_and_load_predict_the_same_and_training_goes_on(keywords, tmp_path)
     obs = np.random.default_rng(0).normal(size=(5, 3)).astype(np.float32)
     state = model.predict(obs, episode_start=np.ones(5))[1]
     assert np.array_equal(model.predict(obs, state)[0], loaded.predict(obs, state)[0])
-    assert loaded.reward_weights == model.reward_weights and loaded.pretrained
+    assert loaded.reward_weights == model.reward_weights and loaded.is_pretrained
     loaded.load_replay_buffer(tmp_path / "replay")
     loaded.learn(20, reset_num_timesteps=False)
     assert loaded.num_timesteps == 60 and loaded._n_updates > model._n_updates

@@ -78,12 +78,12 @@ def test_weights_that_have_not_imitated_yet_are_taught(tmp_path: Path) -> None:
     untaught = make_actpc(CountingEnv, demonstrations=demonstrations())
     path = untaught.save_weights(tmp_path / "untaught")
     loaded = ActPC.from_weights(path, make_vec_env(CountingEnv), demonstrations=demonstrations())
-    assert not loaded.pretrained
+    assert not loaded.is_pretrained
     loaded.pretrain()
     again = ActPC.from_weights(
         loaded.save_weights(tmp_path / "taught"), make_vec_env(CountingEnv), demonstrations=demonstrations()
     )
-    assert again.pretrained
+    assert again.is_pretrained
 
 
 def test_weights_with_demonstrations_go_on_learning_from_new_ones(tmp_path: Path) -> None:

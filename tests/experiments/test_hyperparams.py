@@ -42,6 +42,7 @@ FEWER: dict[str, dict[str, Any]] = {
     **dict.fromkeys(("sac", "td3"), OFF_POLICY),
     "ddpg": OFF_POLICY,
     "rlpd": OFF_POLICY,
+    "ibrl": {**OFF_POLICY, "bc_steps": 20},
     "logo": {"n_steps": 16, "batch_size": 8, "n_critic_updates": 1},
     "ppo": {"n_steps": 16, "batch_size": 8, "n_epochs": 1},
     "trpo": {"n_steps": 16, "batch_size": 8, "n_critic_updates": 1},
