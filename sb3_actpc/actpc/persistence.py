@@ -131,7 +131,7 @@ class Persistent(StoresLastTransition):
 
     def save_weights(self, path: str | PathLike[str]) -> Path:
         """
-        Write weights and settings into a file that cannot run code: see :func:`sb3_actpc.checkpoints.save_weights`.
+        Write weights and settings into a file that cannot run code: see :func:`sb3_actpc.utils.weights.save_weights`.
 
         :param path: file to write; ``.safetensors`` is added where it is missing
         :return: the file
@@ -143,7 +143,7 @@ class Persistent(StoresLastTransition):
         cls: type[SelfPersistent], path: str | PathLike[str], env: GymEnv | str, **keywords: Any
     ) -> SelfPersistent:
         """
-        An agent from a file of :meth:`save_weights`: see :func:`sb3_actpc.checkpoints.load_weights`.
+        An agent from a file of :meth:`save_weights`: see :func:`sb3_actpc.utils.weights.load_weights`.
 
         :param path: the file
         :param env: the environment, or its id
