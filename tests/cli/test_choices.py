@@ -114,7 +114,7 @@ def test_the_zoos_help_lists_its_commands(capsys: pytest.CaptureFixture[str]) ->
         main(["zoo", "--help"])
     assert ended.value.code == 0
     shown = capsys.readouterr().out
-    assert all(command in shown for command in ("train", "optimize", "enjoy", "plot", "all_plots"))
+    assert all(command in shown for command in ("train", "optimize", "enjoy", "plot"))
 
 
 def test_steps_and_settings_as_people_write_them() -> None:
