@@ -109,7 +109,7 @@ def load_agent(path: Path, env: GymEnv | str, **keywords: Any) -> ActPC:
     :param path: the file
     :param env: an environment with the spaces of the training, or its id
     :param keywords: constructor keywords that replace the stored ones
-    :raises ValueError: when it is no such file, or the spaces differ
+    :raises ValueError: when it is no such file, the spaces differ, or keywords are for learning
     """
     try:
         with safetensors.safe_open(path, framework="pt") as file:
@@ -119,6 +119,9 @@ def load_agent(path: Path, env: GymEnv | str, **keywords: Any) -> ActPC:
         raise ValueError(f"{path}: not a file of save_agent ({' '.join(str(error).split())})") from error
     if header.get("format") != FORMAT:
         raise ValueError(f"{path} has the format {header.get('format')!r}, this version reads {FORMAT!r}")
+    refused = sorted({"demonstrations", "guidance", "guidance_kwargs"} & keywords.keys())
+    if refused:
+        raise ValueError(f"{refused[0]}= does not go with a bundled agent, which has no critic: train a new agent instead")
     settings = read_settings(header["settings"], {"buffer_size": BUFFER_SIZE, "guidance": "none", **keywords})
     model = ActPC(env=env, **settings)
     for name in ("observation_space", "action_space"):

@@ -112,3 +112,8 @@ def test_what_cannot_be_played_is_said_in_one_line(
 ) -> None:
     assert main(["enjoy", *options]) == 2
     assert message in capsys.readouterr().err
+
+
+def test_keywords_for_learning_are_refused():
+    with pytest.raises(ValueError, match="train a new agent"):
+        load_pretrained("SparseReacher-v5", guidance="default")

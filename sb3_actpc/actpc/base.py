@@ -3,7 +3,7 @@
 import sys
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -14,7 +14,6 @@ from stable_baselines3.common.callbacks import BaseCallback, ProgressBarCallback
 from stable_baselines3.common.noise import VectorizedActionNoise
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
-from tqdm import tqdm
 
 from sb3_actpc.actpc.buffers import SignalReplay, combined_buffer_class
 from sb3_actpc.actpc.demonstration_replay import DemonstrationReplay
@@ -41,6 +40,7 @@ from sb3_actpc.guidance.base import ImitationBatch
 from sb3_actpc.utils.arguments import Between
 from sb3_actpc.utils.callbacks import between_updates
 from sb3_actpc.utils.checks import Settings, check_finite, check_kind, named_in_errors, nearest
+from sb3_actpc.utils.extras import import_extra
 
 SelfBase = TypeVar("SelfBase", bound="ActPCBase")
 RESCORING_INTERVAL = 1000  # updates between two evaluations of the demonstrations' signals
@@ -264,7 +264,10 @@ class ActPCBase(LearnsFromDemonstrations, Persistent):
             batch_size = self.policy.batch_sizes(self.batch_size)["prior"]
             self.policy.set_learning_rate(self.lr_schedule(1.0))
             seconds = 0.1 if sys.stderr.isatty() else 5.0  # between two drawings: a file or a notebook keeps them all
-            for _ in tqdm(range(n_updates), "prior", disable=not progress_bar, mininterval=seconds):
+            updates: Iterable[int] = range(n_updates)
+            if progress_bar:
+                updates = import_extra("tqdm", "experiments").tqdm(updates, "prior", mininterval=seconds)
+            for _ in updates:
                 before_update()
                 batch = expert.sample(batch_size, self.inputs, self.reward_weights, self.gamma)
                 self.instrumental.update(batch.features, batch.actions, batch.next_features, batch.memory)

@@ -128,6 +128,7 @@ class Persistent(StoresLastTransition):
         assert isinstance(loaded, SignalReplay)
         loaded.history = self.policy.memory_history
         self.replay_buffer = loaded
+        self._last_obs = None  # its running episodes are not the agent's: the next ``learn`` resets the environments
 
     def save_weights(self, path: str | PathLike[str]) -> Path:
         """

@@ -173,7 +173,7 @@ class BehaviorGuidance(ActorGuidance):
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """As stored."""
         stored = state["selection"]
-        self.selection = None if stored is None else PolicySelection(**stored)
+        self.selection = None if stored is None else PolicySelection(**{**stored, "share": self.config.evaluation_share})
         self.copied_at = state["copied_at"]
 
 

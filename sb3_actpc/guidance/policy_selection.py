@@ -123,6 +123,7 @@ class PolicySelection:
                 self.incumbent_returns = self.previous_returns
                 self.previous_returns = []
                 self.has_challenger = False
+                self.roles = ["actor"] * self.n_envs  # running evaluation episodes count for nobody
                 self.n_rolled_back += 1
                 return "rolled back"
         return None

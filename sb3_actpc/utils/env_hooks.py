@@ -1,5 +1,6 @@
 """Hooks in a training environment: calls are counted, and what an environment returns is a copy."""
 
+import copy
 import copyreg
 import multiprocessing
 import signal
@@ -33,10 +34,14 @@ def copied(values: Any) -> Any:
         return values.copy()
     if isinstance(values, th.Tensor):
         return values.clone()
+    if isinstance(values, tuple) and hasattr(values, "_fields"):
+        return type(values)(*map(copied, values))
     if type(values) in (tuple, list):
         return type(values)(map(copied, values))
-    if type(values) is dict:
-        return {name: copied(value) for name, value in values.items()}
+    if isinstance(values, dict):
+        container = copy.copy(values)
+        container.update({name: copied(value) for name, value in values.items()})
+        return container
     return values
 
 

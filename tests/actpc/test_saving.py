@@ -107,3 +107,17 @@ def test_a_file_of_another_algorithm_is_refused(tmp_path):
     TD3("MlpPolicy", "Pendulum-v1", policy_kwargs={"net_arch": [4]}, buffer_size=10).save(tmp_path / "td3")
     with pytest.raises(ValueError, match=r"td3 holds no ActPC: load it with the class that saved it .policy=<class"):
         ActPC.load(tmp_path / "td3")
+
+
+def test_a_loaded_replay_buffer_joins_no_two_episodes(tmp_path):
+    """The buffer ends in mid-episode, and the agent has gone on since: its last transition is cut, as by a time limit."""
+    model = ActPC("MlpPolicy", "Pendulum-v1", seed=0, learning_starts=1000)
+    model.learn(50)
+    model.save_replay_buffer(tmp_path / "buffer.pkl")
+    model.learn(30, reset_num_timesteps=False)
+    model.load_replay_buffer(tmp_path / "buffer.pkl")
+    model.learn(5, reset_num_timesteps=False)
+    buffer = model.replay_buffer
+    assert buffer.size() == 55
+    assert buffer.dones[49, 0] and buffer.timeouts[49, 0]
+    np.testing.assert_array_equal(buffer.observations[51, 0], buffer.next_observations[50, 0])

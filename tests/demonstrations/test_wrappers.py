@@ -92,12 +92,12 @@ SAME: dict[str, Wrap] = {
     "nothing": lambda env: env,
     "monitor": Monitor,
     "statistics": lambda env: wrappers.RecordEpisodeStatistics(env),
-    "time limit": lambda env: wrappers.TimeLimit(env, 9),
+    "time limit": lambda env: wrappers.TimeLimit(env, 999),
     "logger": Logger,
     "clipped actions": lambda env: wrappers.ClipAction(env),
     "another type": lambda env: wrappers.DtypeObservation(env, np.float32),
     "the same bounds": with_the_same_bounds,
-    "all of them": lambda env: Monitor(Logger(wrappers.RecordEpisodeStatistics(wrappers.TimeLimit(env, 9)))),
+    "all of them": lambda env: Monitor(Logger(wrappers.RecordEpisodeStatistics(wrappers.TimeLimit(env, 999)))),
 }
 
 

@@ -113,3 +113,11 @@ def test_a_gate_that_is_stored_in_the_middle_goes_on_as_one_that_is_not():
     stored.play(3000)
     assert straight.decisions == stored.decisions
     assert straight.selection == stored.selection
+
+
+def test_a_rollback_ends_the_other_evaluation_episodes():
+    selection = PolicySelection(2, previous_returns=[10.0, 10.0, 10.0], incumbent_returns=[0.0])
+    selection.roles = ["incumbent", "incumbent"]
+    assert selection.end_episode(0) == "rolled back"
+    assert selection.end_episode(1) is None
+    assert selection.incumbent_returns == [10.0, 10.0, 10.0]

@@ -28,6 +28,7 @@ class PressesCtrlC(BaseCallback):
 
 def learn_twice(kind: str, is_wrapped: bool, folder: str) -> None:
     """The script of the process."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell in the background ignores it
     env = {"dummy": DummyVecEnv, "processes": SubprocVecEnv}[kind](
         [lambda: Monitor(OneArray()) if is_wrapped else OneArray()] * 2
     )
@@ -63,6 +64,7 @@ def test_environments_without_wrappers_survive_ctrl_c_too():
 
 def ends_alone() -> None:
     """The script of the process."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     env = SubprocVecEnv([OneArray] * 2)
     model = agent(TD3Demo, env)
     try:
