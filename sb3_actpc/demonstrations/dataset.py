@@ -405,18 +405,17 @@ class Demonstrations:
             raise ValueError(f"{prefix}{name} must be a whole number from 1 to {available}, found {count!r}")
 
 
-def shipped_demonstrations(env_id: str, weak: bool = False) -> Path:
-    """The demonstrations file of a sparse task, such as ``SparseHalfCheetah-v5``, that comes with the package; ``weak`` is
-    that of a weaker demonstrator, with about half the return, which only the HalfCheetah has. FileNotFoundError, which says
-    how to collect them, when none is shipped."""
-    path = DATA_FOLDER / f"sparse_{base_name(env_id).removeprefix('Sparse').lower()}{'_weak' if weak else ''}.npz"
+def shipped_demonstrations(env_id: str) -> Path:
+    """The demonstrations file of a sparse task, such as ``SparseHalfCheetah-v5``, that comes with the package.
+    FileNotFoundError, which says how to collect them, when none is shipped."""
+    path = DATA_FOLDER / f"sparse_{base_name(env_id).removeprefix('Sparse').lower()}.npz"
     observes_more = env_id.rpartition(":")[2] == "SparseReacher-v4"  # one value more than v5, of which the file is
     if observes_more or not path.is_file():
         from sb3_actpc.utils.checks import nearest  # heavy: demonstrations do without
 
         near = "" if env_id in gym.registry else nearest(env_id, SPARSE_IDS)
         raise FileNotFoundError(
-            f"no {'weak ' if weak else ''}demonstrations of {env_id} are shipped{near}: collect them (sb3-actpc demos collect "
+            f"no demonstrations of {env_id} are shipped{near}: collect them (sb3-actpc demos collect "
             f"--env {env_id}) and pass --demonstrations FILE, or train without (--demonstrations none); what is shipped: "
             "sb3-actpc list demos"
         )

@@ -128,7 +128,7 @@ def download_robomimic(
 
 
 def _fetch(url: str, path: Path, env_id: str, report: Report) -> None:
-    import pooch
+    pooch = import_extra("pooch", "experiments")
 
     report(f"fetching {url}")
     pooch.get_logger().setLevel("WARNING")
