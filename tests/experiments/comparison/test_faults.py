@@ -67,10 +67,15 @@ def wait_until(condition: Callable[[], bool]) -> None:
 
 
 def worker_of(command: subprocess.Popen[str]) -> int:
-    """The process that the command has started."""
-    children = Path(f"/proc/{command.pid}/task/{command.pid}/children")
-    wait_until(lambda: bool(children.read_text().split()))
-    return int(children.read_text().split()[0])
+    """The worker that one of the command's threads has started."""
+
+    def workers() -> list[int]:
+        lists = [path.read_text().split() for path in Path(f"/proc/{command.pid}/task").glob("*/children")]
+        children = [int(pid) for pids in lists for pid in pids]
+        return [pid for pid in children if b"comparison.worker" in Path(f"/proc/{pid}/cmdline").read_bytes()]
+
+    wait_until(lambda: bool(workers()))
+    return workers()[0]
 
 
 needs_proc = pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="processes are found in /proc")
