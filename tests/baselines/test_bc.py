@@ -240,7 +240,7 @@ def test_an_offline_method_is_evaluated_at_every_interval_and_others_before_thei
     played: list[tuple[int, bool]] = []
 
     def counted(model: Any, envs: Any, n_episodes: int, seed: int) -> Any:
-        played.append((n_episodes, getattr(model, "pretrained", False)))
+        played.append((n_episodes, getattr(model, "is_pretrained", False)))
         return play_episodes(model, envs, n_episodes, seed)
 
     short = {"bc_updates": 2}
