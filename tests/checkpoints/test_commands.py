@@ -17,6 +17,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_actpc import ActPC
+from sb3_actpc.actpc.reward_signals import PriorError
 from sb3_actpc.checkpoints import EXIT_STOPPED, CheckpointCallback, TrainingStopped, continue_learning, list_bundles, restore
 from sb3_actpc.cli import main
 from sb3_actpc.demonstrations.dataset import Demonstrations
@@ -71,10 +72,10 @@ def assert_same_run(straight: Path, stopped: Path) -> None:
     assert_equal(one.policy.state_dict(), two.policy.state_dict(), "policy")
 
 
-def signal_at(step: int, number: int, monkeypatch: pytest.MonkeyPatch, name: str = "_store_transition") -> None:
-    """Send this process a real signal once, in the first call of a method from an environment step on."""
+def signal_at(step: int, number: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Send this process a real signal once, as a transition is stored, from an environment step on."""
     sent = []
-    original = getattr(ActPC, name)
+    original = ActPC._store_transition
 
     def send(self: ActPC, *arguments: Any) -> Any:
         if self.num_timesteps >= step and not sent:
@@ -82,7 +83,7 @@ def signal_at(step: int, number: int, monkeypatch: pytest.MonkeyPatch, name: str
             os.kill(os.getpid(), number)
         return original(self, *arguments)
 
-    monkeypatch.setattr(ActPC, name, send)
+    monkeypatch.setattr(ActPC, "_store_transition", send)
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
@@ -118,7 +119,15 @@ def test_a_run_stopped_in_its_pretraining_goes_on_as_if_it_never_was(
     train = ["demonstrations.npz" if word == "none" else word for word in TRAIN]
     assert main([*train, "--output", "straight"]) == 0
     with monkeypatch.context() as patch:
-        signal_at(0, signal.SIGINT, patch, "_update_prior")
+        original, sent = PriorError.update, []
+
+        def send(self: PriorError, *arguments: Any) -> None:
+            if not sent:
+                sent.append(True)
+                os.kill(os.getpid(), signal.SIGINT)
+            original(self, *arguments)
+
+        patch.setattr(PriorError, "update", send)
         assert main([*train, "--output", "stopped"]) == EXIT_STOPPED
     assert "stopped by SIGINT at step 0" in capsys.readouterr().err
     assert main(["train", "--resume", "stopped", "--no-progress"]) == 0

@@ -22,6 +22,7 @@ from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 import sb3_actpc.envs  # noqa: F401, registers the sparse tasks
 from sb3_actpc import ActPC
+from sb3_actpc.actpc.reward_signals import PriorError
 from sb3_actpc.checkpoints import CheckpointCallback, continue_learning, list_bundles, restore
 from sb3_actpc.checkpoints.physics import physics_arrays
 from tests.actpc.envs import CountingEnv, demonstrations
@@ -290,7 +291,7 @@ def test_a_stop_in_the_pretraining_loses_no_update(tmp_path: Path, monkeypatch: 
         return make_actpc(CountingEnv, 2, demonstrations=demonstrations(), action_noise=noise)
 
     straight = learn_straight(make, tmp_path / "straight", 60)
-    original, calls = ActPC._update_prior, []
+    original, calls = PriorError.update, []
 
     def send_signal(self: Any, *arguments: Any) -> Any:
         calls.append("prior")
@@ -298,7 +299,7 @@ def test_a_stop_in_the_pretraining_loses_no_update(tmp_path: Path, monkeypatch: 
             os.kill(os.getpid(), signal.SIGTERM)
         return original(self, *arguments)
 
-    monkeypatch.setattr(ActPC, "_update_prior", send_signal)
+    monkeypatch.setattr(PriorError, "update", send_signal)
     resumed = learn_in_two(make, tmp_path / "resumed", 60, stop_at=0)
     stopped = make()
     restore(stopped, list_bundles(tmp_path / "resumed" / "checkpoints")[0])
