@@ -5,9 +5,7 @@ import json
 import os
 import random
 import re
-import resource
 import shutil
-import signal
 import subprocess
 import sys
 from collections.abc import Callable
@@ -106,19 +104,17 @@ def test_a_full_disk_leaves_the_old_checkpoints_and_the_training_alone(
     find_bundle(tmp_path)
 
 
-def limit_files(n_bytes: int) -> None:
-    """Files may not grow beyond this, as on a full disk; for a process that has just been made."""
-    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (n_bytes, n_bytes))
-
-
 SCRIPT = """
+import resource, signal
+from sb3_actpc.checkpoints import CheckpointCallback
 from sb3_actpc.utils.weights import save_weights
-from tests.checkpoints.test_damage import CheckpointCallback, CountingEnv, limit_files, make_actpc
+from tests.actpc.envs import CountingEnv
+from tests.checkpoints.runs import make_actpc
 lines = []
 callback = CheckpointCallback({folder!r}, 20, report=lines.append)
 model = make_actpc(CountingEnv)
-limit_files({n_bytes})
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)  # files may not grow beyond this, as on a full disk
+resource.setrlimit(resource.RLIMIT_FSIZE, ({n_bytes}, {n_bytes}))
 model.learn(20, callback)
 print(lines[0])
 {action}

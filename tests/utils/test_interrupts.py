@@ -14,7 +14,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 from sb3_actpc import ActPC
 from sb3_actpc.baselines.td3 import TD3Demo
 from sb3_actpc.checkpoints import CheckpointCallback
-from tests.utils.test_rollouts import OneArray, agent, assert_no_transition_is_wrong
+from tests.utils.one_array import OneArray, agent, assert_no_transition_is_wrong
 
 
 class PressesCtrlC(BaseCallback):
