@@ -153,9 +153,7 @@ class IBRL(TD3Demo):
         """The better of the actor's and the BC policy's actions bootstraps, (B, 1)."""
         discounts = self.gamma if batch.discounts is None else batch.discounts
         with th.no_grad():
-            noise = batch.actions.clone().normal_(0, self.target_policy_noise)
-            noise = noise.clamp(-self.target_noise_clip, self.target_noise_clip)
-            actions = (self.actor_target(batch.next_observations) + noise).clamp(-1, 1)
+            actions = self._smoothed_next_actions(batch)
             proposed = self.policy.bc_actions(batch.next_observations)
             # one call: the same two critics value both
             observations = batch.next_observations.repeat(2, 1)

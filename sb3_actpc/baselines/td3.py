@@ -127,13 +127,17 @@ class TD3Demo(DemonstratedAlgorithm, TD3):
         loss.backward()
         self.critic.optimizer.step()
 
+    def _smoothed_next_actions(self, batch: Any) -> th.Tensor:
+        """The target actor's actions with clipped noise, (B, A)."""
+        noise = batch.actions.clone().normal_(0, self.target_policy_noise)
+        noise = noise.clamp(-self.target_noise_clip, self.target_noise_clip)
+        return (self.actor_target(batch.next_observations) + noise).clamp(-1, 1)
+
     def _critic_targets(self, batch: Any) -> th.Tensor:
         """Clipped double Q-learning with target policy smoothing, (B, 1)."""
         discounts = self.gamma if batch.discounts is None else batch.discounts
         with th.no_grad():
-            noise = batch.actions.clone().normal_(0, self.target_policy_noise)
-            noise = noise.clamp(-self.target_noise_clip, self.target_noise_clip)
-            next_actions = (self.actor_target(batch.next_observations) + noise).clamp(-1, 1)
+            next_actions = self._smoothed_next_actions(batch)
             next_values = th.cat(self.critic_target(batch.next_observations, next_actions), dim=1).amin(dim=1, keepdim=True)
             return batch.rewards + (1 - batch.dones) * discounts * next_values
 

@@ -103,14 +103,19 @@ def fit_demonstrations(
     recorded_behind = demonstrations.metadata.get("wrappers", [] if is_collected else None)
     if env_id is not None or recorded_behind is not None:
         check_wrapping(wrapping_of_vectorised(env, demonstrations.actions), recorded_behind, env_id or demonstrations.env_id)
+    return _transposed(demonstrations, env).rewarded_by(env)
+
+
+def _transposed(demonstrations: Demonstrations, env: "VecEnv") -> Demonstrations:
+    """Images with their channels first, where SB3 has wrapped the environment so; they were recorded without."""
     from stable_baselines3.common.vec_env import VecTransposeImage, unwrap_vec_wrapper  # heavy: demonstrations do without
 
-    transposes = unwrap_vec_wrapper(env, VecTransposeImage)  # SB3 wraps environments of images; they were recorded without
-    if transposes is not None:
-        columns = demonstrations.observations, demonstrations.next_observations
-        observations, following = (_channels_first(rows, transposes) for rows in columns)
-        demonstrations = dataclasses.replace(demonstrations, observations=observations, next_observations=following)
-    return demonstrations.rewarded_by(env)
+    transposes = unwrap_vec_wrapper(env, VecTransposeImage)
+    if transposes is None:
+        return demonstrations
+    columns = demonstrations.observations, demonstrations.next_observations
+    observations, following = (_channels_first(rows, transposes) for rows in columns)
+    return dataclasses.replace(demonstrations, observations=observations, next_observations=following)
 
 
 def _compare_lengths(demonstrations: Demonstrations, env: "VecEnv") -> None:
