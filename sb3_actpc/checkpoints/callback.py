@@ -70,6 +70,7 @@ class CheckpointCallback(BaseCallback):
         self.signals = StopSignals()
         self._others: list[BaseCallback] = []
         self._last_saved = 0
+        self._newest: Path | None = None  # checkpoint of this run
 
     def close(self) -> None:
         """Put the old signal handlers back; ``learn`` does so when it ends."""
@@ -79,14 +80,25 @@ class CheckpointCallback(BaseCallback):
         """Write a checkpoint now, and return its folder; ValueError when a weight is not finite, OSError when it cannot be
         written: those there before stay."""
         model = self.model
+        self._report_others()
         manifest = {**describe_model(model), "settings": constructor_settings(model)}
         with write_bundle(self.folder, model.num_timesteps, self.keep, manifest) as write:
             capture_model(model, self._others, write)
         self._last_saved = model.num_timesteps
         path = list_bundles(self.folder)[-1]
+        self._newest = path
         if self.verbose:
             self.report(f"step {model.num_timesteps:>8}  saved in {path}")
         return path
+
+    def _report_others(self) -> None:
+        """A line where another run's checkpoints are about to be replaced."""
+        present = list_bundles(self.folder)
+        if present and present[-1] != self._newest:
+            self.report(
+                f"{present[-1]} is of another run, and this one's checkpoints replace it: give each run a folder of its own, or "
+                "go on from it with load_checkpoint"
+            )
 
     def on_pretraining_update(self, callback: BaseCallback) -> None:
         """Go on from a checkpoint taken in a pre-training, and save and stop on a signal.
@@ -114,6 +126,12 @@ class CheckpointCallback(BaseCallback):
     def _on_training_start(self) -> None:
         self._others = self._beside(self.locals.get("callback"))
         self._last_saved = self.num_timesteps
+        if self.num_timesteps:
+            self._know_present()
+
+    def _know_present(self) -> None:
+        """The checkpoints that are there are of this run, which goes on."""
+        self._newest = next(reversed(list_bundles(self.folder)), None)
 
     def _on_rollout_start(self) -> None:
         self._resume_or_stop()
@@ -140,6 +158,7 @@ class CheckpointCallback(BaseCallback):
     def _resume(self) -> None:
         restored, self.restored = self.restored, None
         if restored is not None:
+            self._know_present()
             restore_learning(restored, self._others)
 
     def _resume_or_stop(self) -> None:

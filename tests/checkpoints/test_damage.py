@@ -307,3 +307,14 @@ def test_restoring_in_place_replaces_what_was_learned_since(saved: Path) -> None
     restore(one, saved)
     restore(two, saved)
     assert_same(one, two)
+
+
+def test_two_runs_with_one_folder_are_told_of_each_other(tmp_path: Path) -> None:
+    """The second run replaces the first one's checkpoints; neither a run that goes on nor a resumed one says so."""
+    lines: list[str] = []
+    callback = CheckpointCallback(tmp_path, 20, report=lines.append)
+    first = make_actpc(CountingEnv).learn(40, callback)
+    first.learn(20, CheckpointCallback(tmp_path, 20, report=lines.append), reset_num_timesteps=False)
+    assert not lines
+    make_actpc(CountingEnv).learn(40, CheckpointCallback(tmp_path, 20, report=lines.append))
+    assert len(lines) == 1 and "is of another run" in lines[0] and str(tmp_path) in lines[0]
