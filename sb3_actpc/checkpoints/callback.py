@@ -96,8 +96,8 @@ class CheckpointCallback(BaseCallback):
         present = list_bundles(self.folder)
         if present and present[-1] != self._newest:
             self.report(
-                f"{present[-1]} is of another run, and this one's checkpoints replace it: give each run a folder of its own, or "
-                "go on from it with load_checkpoint"
+                f"{present[-1]} is of another run, and this one's checkpoints replace it: give each run a folder of its own, "
+                "or go on from it with load_checkpoint"
             )
 
     def on_pretraining_update(self, callback: BaseCallback) -> None:
