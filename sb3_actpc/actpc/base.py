@@ -86,6 +86,11 @@ class ActPCBase(LearnsFromDemonstrations, Persistent):
         return self.demonstrations is not None and self.guidance != "none" and not self.is_pretrained
 
     @property
+    def actor_policy(self) -> ActPCActor:
+        """The policy that learns, for ``evaluate_policy(agent.actor_policy, env)``; ``predict`` uses the deployed one."""
+        return self.actor.ungated()
+
+    @property
     def inputs(self) -> CircuitInputs:
         """Turns observations into what the circuits see."""
         return CircuitInputs(self.actor, self._vec_normalize_env)
@@ -360,7 +365,6 @@ class ActPCBase(LearnsFromDemonstrations, Persistent):
             targets=[self.policy.actor_target],
             n_envs=self.n_envs,
             sample=self.sample_imitated if self.imitated_episodes() else None,
-            residual_std=self.policy.residual_std,
             selection_circuits=self.policy.selection_circuits(),
         )
 

@@ -98,7 +98,9 @@ def test_a_comparison_says_so_too_of_algorithms_that_would_imitate(capsys: pytes
 def test_evaluations_are_of_the_dense_task_from_step_zero_to_the_last() -> None:
     assert train("--demonstrations", "none", "--eval-freq", "25") == 0
     rows = rows_of(RUN)
-    assert list(rows[0]) == ["timesteps", "updates", "seconds", "evaluation_seconds", *RESULTS]
+    of_actor = ["actor_return", "actor_dense_return", "actor_success"]
+    assert list(rows[0]) == ["timesteps", "updates", "seconds", "evaluation_seconds", *RESULTS, *of_actor]
+    assert {row[name] for row in rows for name in of_actor} == {""}  # TD3 deploys the policy that learns
     assert [int(row["timesteps"]) for row in rows] == [0, 25, 50, 60]
     # an update after every step beyond the 20 random ones; an evaluation comes before the update of its step, the last after
     assert [int(row["updates"]) for row in rows] == [0, 4, 29, 40]

@@ -68,6 +68,18 @@ def test_predict_uses_the_deployed_policy_and_evaluation_episodes_have_no_noise(
     assert np.allclose(model.policy.scale_action(model.predict(observations)[0]), deployed, atol=1e-6)
 
 
+def test_the_actor_policy_is_the_one_that_learns():
+    model = imitating()
+    model.learn(60)
+    observations = np.random.default_rng(0).normal(size=(8, 3)).astype(np.float32)
+    with th.no_grad():
+        features = model.actor.features(model.actor.obs_to_tensor(observations)[0])
+        learned = model.policy.unscale_action(model.actor.circuit.project(features).numpy())
+    assert np.allclose(model.actor_policy.predict(observations)[0], learned, atol=1e-6)
+    assert not np.allclose(model.predict(observations)[0], learned, atol=1e-6)  # nothing was promoted
+    assert model.actor.deployed is not None  # the view took nothing away
+
+
 def test_guidance_none_has_no_deployed_policy_and_no_bc():
     keywords = {**QUICK, "guidance_kwargs": None}
     model = ActPC("MlpPolicy", CountingEnv(), demonstrations=demonstrations(), guidance="none", **keywords)

@@ -34,7 +34,8 @@ class Comparison(Schema):
 
 
 def read_comparison(given: Mapping[str, Any]) -> Comparison:
-    """:param given: ``envs`` (ids, or mappings with ``env`` and other keys of a :class:`~sb3_actpc.experiments.runs.Run`),
+    """:param given: ``envs`` (ids, or mappings with ``env`` and other keys of a :class:`~sb3_actpc.experiments.runs.Run`;
+        ``task`` names an entry, for an environment with several sets of demonstrations),
         ``algos`` (names, or mappings: see :func:`~sb3_actpc.experiments.comparison.variants.parse_variant`), ``seeds``,
         ``first_seed``, ``output``, and keys of a run that hold for all. Values of None count
         as not given, but for ``noise_type`` and ``normalize``, where they leave the preset's out
@@ -50,7 +51,7 @@ def read_comparison(given: Mapping[str, Any]) -> Comparison:
         raise ValueError("no task to compare on: give at least one, such as --envs SparseHopper-v5")
     if not variants:
         raise ValueError("no algorithm to compare: give at least one, such as --algos actpc")
-    _check_names([task.env for task in tasks])
+    _check_names([task.task or task.env for task in tasks])
     _check_names([str(variant.name) for variant in variants])
     rest = {key: own[key] for key in ("seeds", "first_seed", "output") if key in own}
     comparison = Comparison(tasks=tuple(tasks), variants=tuple(variants), shared=shared, **rest)
@@ -108,7 +109,7 @@ def plan_runs(comparison: Comparison, folder: Path | None = None) -> list[Run]:
 def _fill(shared: Run, task: Run, variant: Run) -> Run:
     module, colon, name = task.env.rpartition(":")
     env = f"{module}{colon}{name.replace('Sparse', variant.task_prefix or 'Sparse', 1)}"
-    run = Run(**{**merged(shared, task, variant), "env": env, "task": task.env, "progress": False})
+    run = Run(**{**merged(shared, task, variant), "env": env, "task": task.task or task.env, "progress": False})
     check_env_id(env, run.gym_packages)
     try:
         return resolve(run)
@@ -137,7 +138,9 @@ def _parse_task(entry: Any) -> Run:
     entry = {"env": entry} if isinstance(entry, str) else entry
     if not isinstance(entry, Mapping) or "env" not in entry:
         raise ValueError(f"expected a Gymnasium id or a mapping with env, found {entry!r}")
-    return part_of_run({str(key): value for key, value in entry.items()}, elsewhere=OF_VARIANTS)
+    given = {str(key): value for key, value in entry.items()}
+    label = given.pop("task", None)
+    return Run(**merged(part_of_run(given, ("task",), elsewhere=OF_VARIANTS), Run(task=label) if label else Run()))
 
 
 def _list(given: Mapping[str, Any], name: str) -> list[Any]:

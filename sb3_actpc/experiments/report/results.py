@@ -15,14 +15,14 @@ import pandas as pd
 from sb3_actpc.experiments.comparison.execution import ERROR, FINISHED, read_error, run_status
 from sb3_actpc.experiments.report.references import reference_score
 from sb3_actpc.experiments.runs.episode_log import EPISODES
-from sb3_actpc.experiments.runs.evaluation import PROGRESS
+from sb3_actpc.experiments.runs.evaluation import OF_ACTOR, PROGRESS
 from sb3_actpc.experiments.runs.record import CONFIG, read_config
 from sb3_actpc.experiments.runs.schema import content_id
 from sb3_actpc.utils.files import atomic_write
 
 RESULTS, CURVES = "results.csv", "curves.csv.gz"
 RUN_FOLDER = re.compile(r"seed\d+_[0-9a-f]+")
-MEASURES = ("return", "dense_return", "success")  # columns of progress.csv
+MEASURES = ("return", "dense_return", "success", *OF_ACTOR.values())  # columns of progress.csv
 SETTLED = 5000  # the worst evaluation is taken from this step on
 CHOSEN_STEPS = (10_000, 25_000, 50_000)
 _TEXTS = ["task", "env", "variant", "algorithm", "settings", "demonstrations", "status", "version", "commit", "error"]
@@ -100,13 +100,13 @@ def read_rows(path: Path) -> pd.DataFrame:
 def run_measures(env_id: str, curve: pd.DataFrame, chosen_steps: Sequence[int] = CHOSEN_STEPS) -> dict[str, float]:
     """What one run reached; NaN where it is undefined.
 
-    For each of return, dense return and success: the last evaluation, the evaluation at each chosen step, the worst
+    For each of ``MEASURES``: the last evaluation, the evaluation at each chosen step, the worst
     evaluation from 5,000 steps on, and the area under the curve divided by its length (the mean over steps).
     """
     values: dict[str, float] = {}
     steps = curve["timesteps"] if len(curve) else pd.Series(dtype=float)
     for name in MEASURES:
-        column = curve[name] if name in curve else pd.Series(dtype=float)
+        column = curve[name] if name in curve else pd.Series(math.nan, index=curve.index)
         values[name] = float(column.iloc[-1]) if len(column) else math.nan
         for step in chosen_steps:
             at_step = column[steps == step]
@@ -153,7 +153,7 @@ def _run_row(folder: Path, curve: pd.DataFrame, chosen_steps: Sequence[int]) -> 
         "steps": int(curve["timesteps"].iloc[-1]) if len(curve) else 0,
         "planned_steps": config.get("n_timesteps", 0),
         "eval_episodes": config.get("eval_episodes", 0),
-        **run_measures(task, curve, chosen_steps),
+        **run_measures(env_id if reference_score(task) is None else task, curve, chosen_steps),
         "episodes": len(read_rows(folder / EPISODES)),
         "demonstrators_return": math.nan if reference is None else reference,
         "version": dict(config.get("versions", {})).get("sb3-actpc", ""),

@@ -13,7 +13,6 @@ from sb3_actpc.experiments.report.results import CHOSEN_STEPS, MEASURES, Results
 from sb3_actpc.utils.files import atomic_write, folder_name
 
 UNDEFINED = "n/a"
-_NAMES = {"return": "return", "dense_return": "dense return", "success": "success"}
 
 
 def write_report(
@@ -42,8 +41,9 @@ def write_report(
         figures.draw_summary(scores, target / "summary.png")
         files.append(target / "summary.png")
         text.append(f"## Across tasks\n\n{markdown(aggregate_table(scores))}\n\n![Across tasks](summary.png)")
-    if len(scores) > 1:
-        text.append(f"## Probability of improvement\n\n{markdown(improvement_table(scores))}")
+    improvement = improvement_table(results, steps)
+    if len(improvement):
+        text.append(f"## Probability of improvement\n\nOf the return on a task drawn at random.\n\n{markdown(improvement)}")
     missing = results.runs.loc[results.runs["status"] != "finished", ["task", "variant", "seed", "status", "steps", "error"]]
     if len(missing):
         text.append(f"## Runs that are not in the tables\n\n{markdown(missing)}")
@@ -59,11 +59,12 @@ def task_table(results: Results, task: str, steps: Sequence[int]) -> pd.DataFram
         n_episodes = ", ".join(str(n) for n in sorted(runs["eval_episodes"].unique()))
         row = {"variant": f"{label} †" if runs["dirty"].any() else label, "seeds": str(len(runs)), "episodes": n_episodes}
         for measure in MEASURES:
-            form = ".2f" if measure == "success" else ".1f"
-            columns = {f"{_NAMES[measure]} at {step:,}": f"{measure}_at_{step}" for step in steps}
-            columns |= {f"{_NAMES[measure]}, last": measure, f"{_NAMES[measure]}, area": f"{measure}_area"}
-            columns |= {f"{_NAMES[measure]}, worst after 5,000": f"{measure}_worst"}
-            row |= {name: mean_and_deviation(runs[column].to_numpy(), form) for name, column in columns.items()}
+            form = ".2f" if measure.endswith("success") else ".1f"
+            name = measure.replace("_", " ")
+            columns = {f"{name} at {step:,}": f"{measure}_at_{step}" for step in steps}
+            columns |= {f"{name}, last": measure, f"{name}, area": f"{measure}_area"}
+            columns |= {f"{name}, worst after 5,000": f"{measure}_worst"}
+            row |= {title: mean_and_deviation(runs[column].to_numpy(), form) for title, column in columns.items()}
         rows.append({**row, "seconds": mean_and_deviation(runs["seconds"].to_numpy(), ".0f")})
     table = pd.DataFrame(rows)
     return table.loc[:, (table != UNDEFINED).any()]
@@ -71,11 +72,22 @@ def task_table(results: Results, task: str, steps: Sequence[int]) -> pd.DataFram
 
 def normalized_scores(results: Results) -> dict[str, list[np.ndarray]]:
     """Variant -> its normalized scores, (n_runs,) for each task; only variants that have runs on every scored task."""
-    scored = results.finished.dropna(subset=["normalized"])
+    return _on_every_task(results.finished, "normalized")
+
+
+def returns_at(results: Results, step: int) -> dict[str, list[np.ndarray]]:
+    """Variant -> its returns at a step, (n_runs,) for each task; a run that ended before counts with its last evaluation."""
+    runs = results.finished
+    ended = runs["return"].where(runs["steps"] < step)
+    return _on_every_task(runs.assign(at_step=runs[f"return_at_{step}"].fillna(ended)), "at_step")
+
+
+def _on_every_task(runs: pd.DataFrame, column: str) -> dict[str, list[np.ndarray]]:
+    scored = runs.dropna(subset=[column])
     tasks = sorted(scored["task"].unique())
     whole = {}
-    for label, runs in scored.groupby("label"):
-        parts = [runs.loc[runs["task"] == task, "normalized"].to_numpy() for task in tasks]
+    for label, own in scored.groupby("label"):
+        parts = [own.loc[own["task"] == task, column].to_numpy() for task in tasks]
         if all(len(part) for part in parts):
             whole[str(label)] = parts
     return whole
@@ -90,13 +102,16 @@ def aggregate_table(scores: dict[str, list[np.ndarray]]) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=["variant", "runs", "interquartile mean", "95 % interval"])
 
 
-def improvement_table(scores: dict[str, list[np.ndarray]]) -> pd.DataFrame:
-    """Probability that a run of the first variant beats a run of the second, for every pair."""
+def improvement_table(results: Results, steps: Sequence[int]) -> pd.DataFrame:
+    """Probability that a run of the first variant has a higher return than one of the second, for every pair and step."""
     rows = []
-    for name, other in combinations(scores, 2):
-        value, low, high = statistics.probability_of_improvement(scores[name], scores[other])
-        rows.append([f"{name} over {other}", f"{value:.2f}", interval(low, high, ".2f")])
-    return pd.DataFrame(rows, columns=["pair", "probability", "95 % interval"])
+    longest = results.finished["steps"].max()
+    for step in sorted({step for step in steps if step <= longest}):
+        scores = returns_at(results, step)
+        for name, other in combinations(scores, 2):
+            value, low, high = statistics.probability_of_improvement(scores[name], scores[other])
+            rows.append([f"{name} over {other}", f"{step:,}", f"{value:.2f}", interval(low, high, ".2f")])
+    return pd.DataFrame(rows, columns=["pair", "steps", "probability", "95 % interval"])
 
 
 def _overview(runs: pd.DataFrame) -> str:

@@ -17,6 +17,7 @@ from sb3_actpc.utils.files import atomic_write
 
 UNTRAINED_EPISODES = 5
 PROGRESS = "progress.csv"
+OF_ACTOR = {"return": "actor_return", "dense_return": "actor_dense_return", "success": "actor_success"}  # columns
 
 
 class Predictor(Protocol):
@@ -42,10 +43,11 @@ class NormalizedPredictor:
         return self.model.predict(self.normalize(observation), *further, **options)
 
     @classmethod
-    def wrap(cls, model: BaseAlgorithm) -> Predictor:
-        """The agent itself, or with the present statistics of its environment where that normalises observations."""
+    def wrap(cls, model: BaseAlgorithm, policy: Predictor | None = None) -> Predictor:
+        """The agent (or a policy of its), or with the present statistics of its environment where that normalizes."""
         wrapper = model.get_vec_normalize_env()
-        return cls(model, wrapper.normalize_obs) if wrapper is not None and wrapper.norm_obs else model
+        acting = model if policy is None else policy
+        return cls(acting, wrapper.normalize_obs) if wrapper is not None and wrapper.norm_obs else acting
 
     @classmethod
     def save(cls, model: BaseAlgorithm, folder: Path) -> None:
@@ -160,7 +162,8 @@ class EvaluationCallback(CsvCallback):
     Each evaluation starts its episodes from the same seeds, appends a row to ``progress.csv`` and saves
     ``model.zip`` (written under another name and renamed, so that a stopped run leaves a whole one), where the agent of the
     best evaluation is to be kept only when no dense return before was higher. ``seconds`` are those
-    since :meth:`begin`, the evaluations' own (``evaluation_seconds``) among them; ``updates`` are the agent's.
+    since :meth:`begin`, the evaluations' own (``evaluation_seconds``) among them; ``updates`` are the agent's. Where the
+    deployed policy is not the one that learns (ActPC with its gate), the columns ``OF_ACTOR`` are of the latter.
 
     :param envs: environments that only this callback uses, closed by whoever made them
     :param eval_freq: environment steps between two evaluations, of ``eval_episodes`` each; their first episode is of ``seed``
@@ -180,6 +183,7 @@ class EvaluationCallback(CsvCallback):
         "return_std",
         "success",
         "episode_length",
+        *OF_ACTOR.values(),
     )
     kept = ("evaluation_seconds", "best_return", "last_summary", "last_timesteps")
 
@@ -251,6 +255,7 @@ class EvaluationCallback(CsvCallback):
         n_episodes = self.eval_episodes if n_episodes is None else n_episodes
         statistics = play_episodes(NormalizedPredictor.wrap(self.model), self.envs, n_episodes, self.seed)
         self.last_summary = statistics.summary()
+        of_actor = self._evaluate_actor(n_episodes)
         dense_return = float(statistics.dense_returns.mean())
         if not self.keeps_best or dense_return >= self.best_return:
             NormalizedPredictor.save(self.model, self.folder)
@@ -262,6 +267,7 @@ class EvaluationCallback(CsvCallback):
         self.last_timesteps = self.num_timesteps
         row: dict[str, Any] = {
             **self.last_summary,
+            **of_actor,
             "timesteps": self.num_timesteps,
             "updates": getattr(self.model, "_n_updates", 0),
             "seconds": round(self.wall_seconds, 2),
@@ -279,3 +285,12 @@ class EvaluationCallback(CsvCallback):
             shown = [f"dense {shown[0]}", f"sparse return {summary['return']:7.1f} "]
         shown += [] if success is None else [f"success {success:.2f}"]
         self.report(f"step {self.num_timesteps:>8}  {' '.join(shown)}")
+
+    def _evaluate_actor(self, n_episodes: int) -> dict[str, float | None]:
+        """The columns ``OF_ACTOR``; none where the policy that learns is the one deployed."""
+        agent: Any = self.model
+        if getattr(getattr(agent, "actor", None), "deployed", None) is None:
+            return {}
+        learning = NormalizedPredictor.wrap(agent, agent.actor_policy)
+        summary = play_episodes(learning, self.envs, n_episodes, self.seed).summary()
+        return {column: summary[name] for name, column in OF_ACTOR.items()}

@@ -5,7 +5,7 @@ import math
 from pathlib import Path
 from typing import Any
 
-from sb3_actpc.experiments.runs.evaluation import PROGRESS
+from sb3_actpc.experiments.runs.evaluation import OF_ACTOR, PROGRESS
 from sb3_actpc.experiments.runs.schema import VERSION, Run
 from sb3_actpc.utils.files import atomic_write
 
@@ -116,7 +116,7 @@ def _read_evaluations(path: Path) -> Any:
 
     try:
         rows = pd.read_csv(path, dtype=float, float_precision="round_trip").astype({"timesteps": int, "updates": int})
-        if rows.empty or rows.drop(columns="success").isna().any(axis=None):
+        if rows.empty or rows.drop(columns=["success", *OF_ACTOR.values()], errors="ignore").isna().any(axis=None):
             raise ValueError("values are missing")
     except (ValueError, KeyError) as error:  # a row that was not written to its end
         raise ValueError(f"{path}: holds no evaluation, or a row is damaged") from error

@@ -50,6 +50,17 @@ def test_runs_of_a_task_with_a_namespace_lie_as_deep_as_others() -> None:
     del gym.registry["mylab/Pend-v0"]
 
 
+def test_a_task_with_two_names_has_two_sets_of_demonstrations() -> None:
+    few = {"env": "SparseReacher-v5", "task": "few", "settings": {"n_demonstrations": 2}}
+    runs = plan(envs=["SparseReacher-v5", few], algos=["actpc"], seeds=1)
+    assert [(run.env, run.task, run.settings.get("n_demonstrations")) for run in runs] == [
+        ("SparseReacher-v5", "SparseReacher-v5", None),
+        ("SparseReacher-v5", "few", 2),
+    ]
+    with pytest.raises(ValueError, match="'few' is given twice"):
+        plan(envs=[few, few], algos=["actpc"], seeds=1)
+
+
 def test_seeds_that_nothing_was_chosen_on_can_be_asked_for() -> None:
     assert [run.seed for run in plan(seeds=3, first_seed=4)] == [4, 5, 6]
     assert plan(seeds=1, first_seed=2)[0].id == plan(seeds=3)[2].id

@@ -26,6 +26,7 @@ def write_run(
     seed: int = 0,
     dense: Sequence[float] = (0.0, 50.0, 100.0),
     finished: bool = True,
+    returns: Sequence[float] = (0.0, 1.0, 2.0),
     **settings: Any,
 ) -> Path:
     """A run of 10,000 steps with the given dense returns at ``STEPS``; 12 seconds, 2 of them evaluations."""
@@ -51,7 +52,7 @@ def write_run(
         "evaluation_seconds": [0.0, 1.0, 2.0],
         "dense_return": dense,
         "dense_return_std": [0.0] * 3,
-        "return": [0.0, 1.0, 2.0],
+        "return": returns,
         "return_std": [0.0] * 3,
         "success": [0.0, 0.5, 1.0],
         "episode_length": [5.0] * 3,

@@ -11,7 +11,7 @@ from matplotlib.colors import to_rgb
 from sb3_actpc.cli import main
 from sb3_actpc.experiments.report.figures import COLORS, draw_curves, drawn_labels
 from sb3_actpc.experiments.report.results import area, load_results
-from sb3_actpc.experiments.report.tables import mean_and_deviation, write_report
+from sb3_actpc.experiments.report.tables import improvement_table, mean_and_deviation, write_report
 from tests.experiments.report.folders import HOPPER, REACHER, write_run
 
 
@@ -46,6 +46,17 @@ def test_the_two_files_make_the_same_report_again(tmp_path: Path) -> None:
     assert "50.5 ± 0.7" in first and "Runs that are not in the tables" in first and "| 20 |" in first
     curves = pd.read_csv(tmp_path / "kept" / "curves.csv.gz")
     assert len(curves) == 5 * 3 and curves["run"].nunique() == 5
+
+
+def test_the_probability_of_improvement_is_of_returns_at_each_step(tmp_path: Path) -> None:
+    for seed in range(2):
+        write_run(tmp_path, variant="actpc", seed=seed, returns=(0.0, 3.0, 5.0))
+        write_run(tmp_path, variant="bc", seed=seed, returns=(0.0, 4.0, 4.0))
+    table = improvement_table(load_results(tmp_path, (5_000, 10_000, 50_000)), (5_000, 10_000, 50_000))
+    assert table[["pair", "steps", "probability"]].to_numpy().tolist() == [
+        ["actpc over bc", "5,000", "0.00"],
+        ["actpc over bc", "10,000", "1.00"],
+    ]
 
 
 def test_settings_of_one_name_are_told_apart(tmp_path: Path) -> None:
