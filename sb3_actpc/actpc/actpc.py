@@ -95,7 +95,7 @@ class ActPC(ActPCBase):
     :param prior_updates: updates of the prior before learning starts, with ``alpha_in``; then it is frozen
     :param refresh_weight: λ, weight of the actor's refresh from the demonstrations and its own good episodes
     :param demonstration_fraction: share of every batch that comes from the demonstrations
-    :param exploration_noise: standard deviation of the Gaussian noise on actions in [-1, 1]; guidance may lower it
+    :param exploration_noise: standard deviation of the Gaussian noise on actions in [-1, 1]
     :param alpha_ep: weight of the epistemic signal
     :param alpha_in: weight of the instrumental signal
     :param alpha_ext: weight of the task's reward (the paper's is 0 with demonstrations)
@@ -265,8 +265,7 @@ class ActPC(ActPCBase):
         if action_noise is not None:
             noise = action_noise()
         elif self.exploration_noise:
-            scale = self.actor_guidance.exploration_scale(context, float(self.exploration_noise))
-            noise = np.random.normal(size=actions.shape).astype(np.float32) * scale.reshape(actions.shape[1:])
+            noise = np.random.normal(size=actions.shape).astype(np.float32) * np.float32(self.exploration_noise)
         if noise is not None:
             explores = np.array([self.actor_guidance.explores(env) for env in range(n_envs)])
             explores = explores.reshape(-1, *[1] * (actions.ndim - 1))

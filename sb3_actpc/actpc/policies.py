@@ -153,6 +153,13 @@ class ActPCActor(BasePolicy):
         """The circuit that acts: the deployed one where there is a deployment gate."""
         return self.circuit if self.deployed is None else self.deployed
 
+    def ungated(self) -> "ActPCActor":
+        """The policy that learns, which acts in training: another view of the same circuits, without the deployment gate."""
+        view = copy.copy(self)
+        view._modules = self._modules.copy()
+        view.deployed = None
+        return view
+
     def train(self, mode: bool = True) -> "ActPCActor":
         """Nothing can tell training from acting: circuits have no such mode, and the extractor, which nobody trains, acts."""
         self.training = mode
@@ -288,7 +295,6 @@ class ActPCPolicy(BasePolicy):
 
     actor: ActPCActor
     action_space: spaces.Box
-    residual_std: th.Tensor
     has_imitated: th.Tensor
     n_prior_updates: th.Tensor
 
@@ -375,8 +381,6 @@ class ActPCPolicy(BasePolicy):
         check_agreement(self.actor.circuit, self.critic)
         self.actor_target = copy.deepcopy(self.actor.circuit)
         self.critic_target = copy.deepcopy(self.critic)
-        # of the demonstrated actions around the BC policy; infinite before there is one
-        self.register_buffer("residual_std", th.full((n_actions,), th.inf))
         # what the demonstrations have taught, which goes where the synapses go; floats, as SB3 expects of parameters
         self.register_buffer("has_imitated", th.tensor(0.0))
         self.register_buffer("n_prior_updates", th.tensor(0.0))

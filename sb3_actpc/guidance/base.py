@@ -22,7 +22,6 @@ class GuidanceContext:
     :param targets: circuits that start as copies of the actor (its target circuit)
     :param n_envs: environments
     :param sample: draws a batch of so many imitated steps; None where there is nothing to imitate
-    :param residual_std: (A,), a buffer of the policy: standard deviation of the demonstrated actions around the BC policy
     :param selection_circuits: "deployed", "average", "challenger" and "previous"; None without a deployment gate
     """
 
@@ -30,7 +29,6 @@ class GuidanceContext:
     targets: list[NGCCircuit]
     n_envs: int
     sample: Callable[[int], ImitationBatch] | None
-    residual_std: th.Tensor
     selection_circuits: dict[str, NGCCircuit] | None
 
 
@@ -51,10 +49,6 @@ class ActorGuidance:
     def explores(self, env: int) -> bool:
         """Whether the running episode of environment ``env`` has exploration noise."""
         return True
-
-    def exploration_scale(self, context: GuidanceContext, scale: float) -> np.ndarray:
-        """Standard deviation of the exploration noise, (A,), where the agent's is ``scale``."""
-        return np.full(len(context.residual_std), scale, dtype=np.float32)
 
     def on_step(self, context: GuidanceContext, rewards: np.ndarray, dones: np.ndarray, n_updates: int) -> None:
         """After an environment step with the task's ``rewards`` and ``dones``, (n_envs,) each."""

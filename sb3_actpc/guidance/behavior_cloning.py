@@ -2,14 +2,11 @@
 
 from collections.abc import Callable
 
-import torch as th
-
 from sb3_actpc.guidance.base import ImitationBatch
 from sb3_actpc.ngc import NGCCircuit
 
 BATCH_SIZE = 256
 LEARNING_RATES = (1e-3, 5e-5)  # first and last; the rate falls geometrically
-SMALLEST_RESIDUAL_STD = 0.02  # of actions in [-1, 1]: nearly deterministic demonstrators still leave room to explore
 
 
 def clone_behavior(actor: NGCCircuit, sample: Callable[[int], ImitationBatch], n_updates: int) -> None:
@@ -31,10 +28,3 @@ def clone_behavior(actor: NGCCircuit, sample: Callable[[int], ImitationBatch], n
     for group, rate in zip(actor.optimizer.param_groups, rates, strict=True):
         group["lr"] = rate
     actor.optimizer.state.clear()
-
-
-def residual_std(actor: NGCCircuit, sample: Callable[[int], ImitationBatch]) -> th.Tensor:
-    """Standard deviation of 4,096 imitated actions around the actor's, (A,), at least ``SMALLEST_RESIDUAL_STD``."""
-    features, actions, memory = sample(4096)
-    residuals = actions - actor.project(features, memory)
-    return residuals.square().mean(0).sqrt().clamp_min(SMALLEST_RESIDUAL_STD)

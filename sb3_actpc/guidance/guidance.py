@@ -6,7 +6,7 @@ from typing import Any, Literal
 import numpy as np
 
 from sb3_actpc.guidance.base import ActorGuidance, GuidanceContext
-from sb3_actpc.guidance.behavior_cloning import clone_behavior, residual_std
+from sb3_actpc.guidance.behavior_cloning import clone_behavior
 from sb3_actpc.guidance.policy_selection import PolicySelection
 from sb3_actpc.ngc import NGCCircuit
 
@@ -79,7 +79,6 @@ class BehaviorGuidance(ActorGuidance):
         if is_pretrained or context.sample is None or not self.config.bc_updates:
             return
         clone_behavior(context.actor, context.sample, self.config.bc_updates)
-        context.residual_std.copy_(residual_std(context.actor, context.sample))
         copies = [*context.targets, *(context.selection_circuits or {}).values()]
         for circuit in copies:
             copy_circuit(context.actor, circuit)
@@ -95,10 +94,6 @@ class BehaviorGuidance(ActorGuidance):
     def explores(self, env: int) -> bool:
         """Only the actor's episodes have noise."""
         return self.selection is None or self.selection.roles[env] == "actor"
-
-    def exploration_scale(self, context: GuidanceContext, scale: float) -> np.ndarray:
-        """No wider than the demonstrated actions spread around the BC policy."""
-        return context.residual_std.clamp_max(scale).cpu().numpy()
 
     def on_step(self, context: GuidanceContext, rewards: np.ndarray, dones: np.ndarray, n_updates: int) -> None:
         """Evaluation episodes end, policies are promoted, rejected or rolled back, the next episodes begin."""
