@@ -17,7 +17,7 @@ from torch import nn
 
 from sb3_actpc.demonstrations.mixin import LearnsFromDemonstrations
 from sb3_actpc.utils.arguments import Count, Positive, Share, Weight, checked
-from sb3_actpc.utils.env_hooks import hook_vec_env
+from sb3_actpc.utils.rollouts import KeepsEpisodesApart
 
 ZERO_DELTA = 6e-7  # at or below this the guidance step is left out (the authors' code)
 _NETS = ("discriminator", "guidance_value", "discriminator_optimizer", "guidance_value_optimizer")
@@ -33,7 +33,7 @@ class Guidance(NamedTuple):
     returns: th.Tensor  # (N,), targets of the guidance value net
 
 
-class LOGO(LearnsFromDemonstrations, TRPO):
+class LOGO(LearnsFromDemonstrations, KeepsEpisodesApart, TRPO):
     """Learning online with guidance offline (Rengarajan et al., arXiv 2202.04628), on sb3-contrib's TRPO.
 
     Each iteration is TRPO's on the task's reward (policy improvement), then a trust-region step of size δ on the reward
@@ -116,11 +116,6 @@ class LOGO(LearnsFromDemonstrations, TRPO):
         super().set_env(env, force_reset)
         if self.demonstrations is not None:
             self._load_demonstrations()
-
-    def _setup_learn(self, *args: Any, **options: Any) -> Any:
-        assert self.env is not None
-        hook_vec_env(self.env)  # observations are copied on arrival
-        return super()._setup_learn(*args, **options)
 
     def _update_info_buffer(self, infos: list[dict[str, Any]], dones: np.ndarray | None = None) -> None:
         super()._update_info_buffer(infos, dones)

@@ -3,10 +3,11 @@
 from typing import Any, cast
 
 import numpy as np
-from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.buffers import ReplayBuffer, RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.type_aliases import MaybeCallback, RolloutReturn, TrainFreq
 from stable_baselines3.common.vec_env import VecEnv
 
@@ -140,3 +141,65 @@ class StoresLastTransition(OffPolicyAlgorithm):
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_watched", "_is_reset"]
+
+
+class _CutsEpisodes:
+    """A callback after which the running episodes end, as by a time limit, where it has moved the training environment."""
+
+    def __init__(self, callback: BaseCallback, algorithm: OnPolicyAlgorithm, env: WatchedVecEnv) -> None:
+        self.callback = callback
+        self.algorithm = algorithm
+        self.env = env
+
+    def on_rollout_start(self) -> None:
+        self.callback.on_rollout_start()
+        if self.env.is_disturbed:
+            self.algorithm._last_obs = self.env.reset()
+            self.algorithm._last_episode_starts = np.ones(self.env.num_envs, dtype=bool)
+
+    def on_step(self) -> bool:
+        goes_on = self.callback.on_step()
+        if self.env.is_disturbed:
+            step = self.callback.locals
+            for env in np.flatnonzero(~step["dones"]):
+                step["infos"][env] |= {"terminal_observation": step["new_obs"][env].copy(), "TimeLimit.truncated": True}
+            step["dones"][:] = True
+            step["new_obs"][:] = self.env.reset()
+        return goes_on
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.callback, name)
+
+
+class KeepsEpisodesApart(OnPolicyAlgorithm):
+    """
+    On-policy rollouts with array observations in which no transition joins two episodes.
+
+    Someone else can step or reset the training environment, as ``evaluate_policy`` does. Then the running episodes end as by a
+    time limit, and the environment is reset before the next action. See SB3 issue 1684. Observations are copied.
+    """
+
+    _watched: WatchedVecEnv | None = None
+
+    def _setup_learn(self, *args: Any, **options: Any) -> tuple[int, BaseCallback]:
+        assert self.env is not None
+        if self._watched is None or self._watched.venv is not self.env:
+            self._watched = WatchedVecEnv(self.env)
+        self._watched.finish_step()
+        before = self._last_obs
+        result = super()._setup_learn(*args, **options)
+        if self._last_obs is not before:  # SB3 has reset the environment
+            self._watched.mark()
+        self._last_obs = copied(self._last_obs)
+        return result
+
+    def collect_rollouts(
+        self, env: VecEnv, callback: BaseCallback, rollout_buffer: RolloutBuffer, n_rollout_steps: int
+    ) -> bool:
+        """As SB3's."""
+        assert self._watched is not None
+        apart = cast(BaseCallback, _CutsEpisodes(callback, self, self._watched))
+        return super().collect_rollouts(self._watched, apart, rollout_buffer, n_rollout_steps)
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_watched"]

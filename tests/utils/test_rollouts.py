@@ -147,6 +147,51 @@ def resets_by_name(model) -> None:
 MOVES = [evaluates, resets, steps_one_directly, resets_by_name]
 
 
+class KeepsRollouts(Plays):
+    """Also keeps what the rollout buffer holds before it is used."""
+
+    def __init__(self, move, when: str) -> None:
+        super().__init__(move, when)
+        self.rollouts = []
+
+    def _on_rollout_end(self) -> None:
+        buffer = self.model.rollout_buffer
+        self.rollouts.append((buffer.observations.copy(), buffer.episode_starts.copy(), buffer.rewards.copy()))
+        super()._on_rollout_end()
+
+
+def assert_steps_follow(observations, starts) -> None:
+    """``observations`` (n, n_envs, 2) of OneArray: within an episode the step rises by one."""
+    first = starts[1:].astype(bool)
+    assert np.allclose(observations[1:, :, 1][first], 0.0, atol=1e-3)
+    assert np.allclose((observations[1:] - observations[:-1])[~first], (0.0, 1.0), atol=1e-3)
+
+
+@pytest.mark.parametrize("move", MOVES)
+@pytest.mark.parametrize("when", ["step", "rollout start", "rollout end", "between"])
+@pytest.mark.parametrize("monitor", [False, True])
+def test_no_transition_of_logo_joins_two_episodes(move, when, monitor):
+    model = LOGO("MlpPolicy", vec_env(n_envs=2, monitor=monitor), n_steps=20, batch_size=20, n_critic_updates=1)
+    for _ in range(3):
+        callback = KeepsRollouts(move, when)
+        model.learn(40, callback=callback, reset_num_timesteps=False)
+        if when == "between":
+            move(model)
+        for observations, starts, _ in callback.rollouts:
+            assert_steps_follow(observations, starts)
+
+
+def test_an_episode_of_logo_that_was_cut_is_bootstrapped():
+    """As SB3 does at a time limit: the last reward has γ V(s') added, where all rewards are 0."""
+    model = LOGO("MlpPolicy", vec_env(), n_steps=20, batch_size=20, n_critic_updates=1)
+    callback = KeepsRollouts(resets, "step")
+    model.learn(20, callback=callback)
+    [(_, starts, rewards)] = callback.rollouts
+    ends = np.append(starts[1:, 0], 0.0).astype(bool)
+    assert ends.sum() >= 4
+    assert (rewards[ends, 0] != 0.0).all() and (rewards[~ends, 0] == 0.0).all()
+
+
 @pytest.mark.parametrize("algorithm", [ActPC, TD3Demo])
 @pytest.mark.parametrize("move", MOVES)
 @pytest.mark.parametrize(("monitor", "wrapper"), [(False, None), (True, None), (False, "monitor"), (False, "normalize")])
