@@ -19,9 +19,7 @@ def test_the_command_of_the_contributors_page_builds_every_page(tmp_path: Path) 
     text = (ROOT / "docs" / "contributing.md").read_text(encoding="utf-8")
     [options] = re.findall(r"python -m sphinx (.*) docs docs/_build", text)
     command = [sys.executable, "-m", "sphinx", *options.split(), "docs", str(tmp_path / "site")]
-    built = subprocess.run(
-        command, cwd=ROOT, env={**os.environ, **NO_NETWORK}, capture_output=True, text=True, check=False
-    )
+    built = subprocess.run(command, cwd=ROOT, env={**os.environ, **NO_NETWORK}, capture_output=True, text=True, check=False)
     assert built.returncode == 0, built.stdout[-3000:] + built.stderr[-3000:]
     sources = {path.relative_to(ROOT / "docs").with_suffix("") for path in (ROOT / "docs").rglob("*.md")}
     pages = {path.relative_to(tmp_path / "site").with_suffix("") for path in (tmp_path / "site").rglob("*.html")}

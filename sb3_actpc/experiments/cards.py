@@ -4,6 +4,7 @@
 """
 
 import json
+import shlex
 import shutil
 import statistics
 import sys
@@ -17,6 +18,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_actpc.actpc import ActPC
 from sb3_actpc.experiments.runs.evaluation import NormalizedPredictor, Predictor
+from sb3_actpc.experiments.runs.presets import RUN_KEYS
 from sb3_actpc.experiments.runs.record import CONFIG, read_result
 from sb3_actpc.experiments.runs.run import evaluate_run, load_run
 from sb3_actpc.experiments.runs.schema import Run
@@ -25,6 +27,7 @@ from sb3_actpc.pretrained import AGENTS, INDEX, read_index, save_agent
 from sb3_actpc.utils.files import atomic_write, file_hash, folder_name
 from sb3_actpc.utils.weights import save_weights
 
+PRESET = "preset.yml"
 RESULT_KEYS = ("return", "return_std", "dense_return", "dense_return_std", "success", "eval_episodes", "timesteps", "seed")
 
 
@@ -70,6 +73,8 @@ def write_card(folder: Path, target: Path, n_episodes: int = 10, seed: int = 0, 
     _write_json(target / "results.json", _results(result))
     if video:
         notes += _write_video(run, model, target / "replay.mp4", seed)
+    with atomic_write(target / PRESET, "w") as file:
+        yaml.safe_dump(_preset(run), file, sort_keys=True)
     with atomic_write(target / "README.md", "w") as file:
         file.write(card_text(run, result, name, (target / "replay.mp4").is_file()))
     return Card(target, sorted(path.name for path in target.iterdir()), notes)
@@ -109,8 +114,8 @@ def card_text(run: Run, result: dict[str, Any], name: str, has_video: bool) -> s
         "| | |\n| --- | --- |\n" + "\n".join(rows),
         *(["The first evaluation episode is in `replay.mp4`."] if has_video else []),
         f"## Use\n\n{_usage(run, name)}",
-        f"## Training\n\n```bash\n{_command(run)}\n```\n\n`{CONFIG}` has every setting, the versions and the commit.",
-        f"```yaml\n{yaml.safe_dump(run.settings, sort_keys=True)}```",
+        f"## Training\n\n```bash\n{_command(run)}\n```\n\n`{PRESET}` has every setting, `{CONFIG}` also the versions "
+        "and the commit.",
     ]
     return "\n\n".join(parts) + "\n"
 
@@ -126,7 +131,14 @@ def _usage(run: Run, name: str) -> str:
 
 def _command(run: Run) -> str:
     words = ["sb3-actpc train", f"--algo {run.algo}", f"--env {run.env}", f"--steps {run.n_timesteps}", f"--seed {run.seed}"]
-    return " ".join([*words, *([f"--preset {run.preset}"] if run.preset else [])])
+    demonstrations = [] if run.demonstrations == "shipped" else [f"--demonstrations {shlex.quote(run.demonstrations)}"]
+    return " ".join([*words, f"--preset {PRESET}", *demonstrations])
+
+
+def _preset(run: Run) -> dict[str, Any]:
+    """The settings of a run as a preset file has them."""
+    own = {name: getattr(run, name) for name in RUN_KEYS if getattr(run, name)}
+    return {run.env: json.loads(json.dumps({**own, **run.settings}))}  # tuples become lists
 
 
 def _results(result: dict[str, Any]) -> dict[str, Any]:

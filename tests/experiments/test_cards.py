@@ -11,7 +11,8 @@ import yaml
 from sb3_actpc import ActPC
 from sb3_actpc.cli import main
 from sb3_actpc.experiments.cards import bundle_agents
-from sb3_actpc.experiments.runs import Run, train_run, video
+from sb3_actpc.experiments.runs import Run, resolve, train_run, video
+from sb3_actpc.experiments.runs.record import read_run
 from sb3_actpc.pretrained import load_pretrained, read_index
 
 ENV_ID = "SparseReacher-v5"
@@ -37,7 +38,7 @@ def test_a_card_holds_what_the_hub_asks_for(run_folder: Path, tmp_path: Path) ->
     assert main(["card", str(run_folder), "--output", str(tmp_path / "card"), "--episodes", "2", "--no-video"]) == 0
     written = {path.name for path in (tmp_path / "card").iterdir()}
     model = f"actpc-{ENV_ID}"
-    assert written == {"README.md", "config.json", "results.json", f"{model}.zip", f"{model}.safetensors"}
+    assert written == {"README.md", "config.json", "preset.yml", "results.json", f"{model}.zip", f"{model}.safetensors"}
     metadata = yaml.safe_load((tmp_path / "card" / "README.md").read_text(encoding="utf-8").split("---\n")[1])
     [entry] = metadata["model-index"]
     [result] = entry["results"]
@@ -46,6 +47,17 @@ def test_a_card_holds_what_the_hub_asks_for(run_folder: Path, tmp_path: Path) ->
     [metric] = result["metrics"]
     assert metric["value"] == f"{results['mean_reward']:.2f} +/- {results['std_reward']:.2f}"
     assert results["n_eval_episodes"] == 2
+
+
+def test_the_command_of_a_card_trains_with_the_settings_of_the_run(run_folder: Path, tmp_path: Path) -> None:
+    assert main(["card", str(run_folder), "--output", str(tmp_path / "card"), "--episodes", "1", "--no-video"]) == 0
+    text = (tmp_path / "card" / "README.md").read_text(encoding="utf-8")
+    assert f"sb3-actpc train --algo actpc --env {ENV_ID} --steps 20 --seed 0 --preset preset.yml" in text
+    again = resolve(Run(env=ENV_ID, preset=str(tmp_path / "card" / "preset.yml")))
+    before = read_run(run_folder)
+    for name in ("settings", "n_timesteps", "policy", "n_envs", "env_kwargs", "normalize", "noise_type"):
+        assert getattr(again, name) == getattr(before, name)
+    assert again.settings["policy_kwargs"] == {"net_arch": [16, 16]}
 
 
 def test_the_code_of_a_card_loads_its_files(run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -65,9 +77,7 @@ def test_a_card_has_a_video_where_the_machine_can_render(run_folder: Path, tmp_p
     assert "replay.mp4" in (tmp_path / "card" / "README.md").read_text(encoding="utf-8")
 
 
-def test_a_folder_with_files_is_not_written_over(
-    run_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_folder_with_files_is_not_written_over(run_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "note.txt").write_text("mine", encoding="utf-8")
     assert main(["card", str(run_folder), "--output", str(tmp_path), "--no-video"]) == 2
     assert "choose an empty folder" in capsys.readouterr().err
