@@ -166,7 +166,7 @@ class ActPCBase(LearnsFromDemonstrations, Persistent):
             )
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
-        """As in SB3. Returns of another environment are forgotten; ValueError where demonstrations do not fit."""
+        """As in SB3. Returns of another environment are dropped; ValueError where demonstrations do not fit."""
         super().set_env(env, force_reset)
         self.actor_guidance.forget_returns()
         if self.replay_buffer is not None:

@@ -361,7 +361,7 @@ class CombinedHerReplayBuffer(SignalReplay, HerReplayBuffer):  # type: ignore[mi
     """Hindsight experience replay with ActPC's signals: relabelling touches the task's reward and the goals alone.
 
     The newest transitions are real ones; of the rest SB3's ``her_ratio`` is relabelled. Goals of their own episode alone
-    would teach the critic that whoever moves slowly is at its goal: what is reached later is then near. So some goals were
+    would teach the critic that a slow robot is at its goal: what is reached later is then near. So some goals were
     reached elsewhere, by which what was done leads nowhere: three tenths of all, as in HIQL (Park et al., arXiv 2307.11949).
 
     :param random_goals: share of the relabelled transitions whose goal was reached at any stored step; 0 for SB3's class. By

@@ -116,7 +116,7 @@ class DemonstrationReplay:
         if inputs.vec_normalize is not None:
             task = inputs.vec_normalize.normalize_reward(task)
         epistemic, instrumental = (
-            pays(kind[rows]) for pays, kind in zip(signals, (self.epistemic, self.instrumental), strict=True)
+            signal(kind[rows]) for signal, kind in zip(signals, (self.epistemic, self.instrumental), strict=True)
         )
         return weights[0] * task + weights[1] * epistemic + weights[2] * instrumental
 
@@ -151,9 +151,9 @@ class DemonstrationReplay:
             return
         ratios: list[float] = []
         for sign in (1.0, -1.0):
-            shown, seen = (sign * part[sign * part > 0.0] for part in (self.demonstrations.rewards, rewards))
-            if len(shown) and len(seen):
-                ratios += [shown.mean() / seen.mean(), shown.max() / seen.max()]
+            demonstrated, own = (sign * part[sign * part > 0.0] for part in (self.demonstrations.rewards, rewards))
+            if len(demonstrated) and len(own):
+                ratios += [demonstrated.mean() / own.mean(), demonstrated.max() / own.max()]
         self.has_scale = bool(ratios)
         if ratios and (min(ratios) > OTHER_SCALE or max(ratios) < 1 / OTHER_SCALE):
             warnings.warn(

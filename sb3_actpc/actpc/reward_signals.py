@@ -99,7 +99,7 @@ def instrumental_reward(normalized: np.ndarray, form: str = "penalty") -> np.nda
 
     :param normalized: any shape, in [0, 1], 0 where the step was as demonstrated
     :param form: "penalty", -r in [-1, 0] (the paper's equation; never positive, so that the shortest episode is the best where
-        the task can end by falling), or "unit", 1 - r in [0, 1] (the paper's sentence below it; a step as demonstrated pays 1)
+        the task can end by falling), or "unit", 1 - r in [0, 1] (the paper's sentence below it; 1 for a step as demonstrated)
     :return: of the same shape
     """
     return 1.0 - normalized if form == "unit" else -normalized

@@ -111,7 +111,7 @@ class SelfImitationMemory:
     """The actor's memory of its own goal-reaching episodes (paper: M^actor, Algorithm 1, line 29), laid end to end.
 
     An episode enters when its sparse return is positive and at least the best return now stored; the oldest leave when the
-    capacity is passed. A task that pays negative rewards alone never gets one in: the memory warns of it, once.
+    capacity is passed. A task with negative rewards alone never gets one in: the memory warns of it, once.
 
     With ``takes_all`` every episode with a positive return enters; its return then says how often it is imitated.
 
@@ -140,9 +140,9 @@ class SelfImitationMemory:
         self._n_ended, self._best_ended = self._n_ended + 1, max(self._best_ended, episode_return)
         if self._n_ended == PATIENCE and self._best_ended < 0.0:
             warnings.warn(
-                f"all of the first {PATIENCE} episodes had a negative return: self-imitation takes episodes with a positive "
-                "one alone, and none will come in if the task never pays; shift the reward above 0, or leave the memory out "
-                "with replay_buffer_kwargs=dict(self_imitation_size=0)",
+                f"all of the first {PATIENCE} episodes had a negative return: self-imitation only takes episodes with a "
+                "positive return; shift the reward above 0, or turn it off with "
+                "replay_buffer_kwargs=dict(self_imitation_size=0)",
                 stacklevel=2,
             )
         is_good = self.takes_all or episode_return >= self.best_return

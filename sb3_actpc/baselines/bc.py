@@ -54,13 +54,13 @@ class BC(OfflineAlgorithm):
     def _network_kwargs(self) -> dict[str, Any]:
         return {"optimizer_kwargs": {"weight_decay": self.weight_decay}}
 
-    def _take(self, shown: Demonstrations) -> None:
+    def _take(self, demonstrations: Demonstrations) -> None:
         assert isinstance(self.action_space, spaces.Box)
-        actions = scaled_actions(shown, self.action_space)
-        rows = th.as_tensor(shown.observations, device=self.device)
+        actions = scaled_actions(demonstrations, self.action_space)
+        rows = th.as_tensor(demonstrations.observations, device=self.device)
         self.policy.fit_normalization(rows)
         self._observations, self._actions = self.policy.normalized(rows), th.as_tensor(actions, device=self.device)
-        bounds = shown.episode_bounds
+        bounds = demonstrations.episode_bounds
         lengths = bounds[:, 1] - bounds[:, 0]
         self._episode_ends = th.as_tensor(np.repeat(bounds[:, 1], lengths), device=self.device)
         held_out = np.zeros(len(bounds), dtype=bool)

@@ -80,10 +80,10 @@ class WithDemonstrations(ReplayBuffer):
         if self.demonstrated is None or not n_demonstrated:
             return super().sample(batch_size, env)
         self.demonstrated.device = self.device
-        shown = self.demonstrated.sample(n_demonstrated, env)
+        demonstrated = self.demonstrated.sample(n_demonstrated, env)
         if n_demonstrated == batch_size:
-            return shown
-        return join_batches(super().sample(batch_size - n_demonstrated, env), shown)
+            return demonstrated
+        return join_batches(super().sample(batch_size - n_demonstrated, env), demonstrated)
 
 
 class DemonstrationReplayBuffer(WithDemonstrations):
@@ -134,7 +134,7 @@ def demonstration_buffer_class(
     return same[kind]
 
 
-def join_batches(own: Any, shown: Any) -> Any:
+def join_batches(own: Any, demonstrated: Any) -> Any:
     """Two batches of SB3's, named tuples of tensors (B, ...) and (C, ...), as one, (B + C, ...); fields that SB3 leaves at
     None stay None."""
 
@@ -143,4 +143,4 @@ def join_batches(own: Any, shown: Any) -> Any:
             return {key: th.cat([part, theirs[key]]) for key, part in mine.items()}
         return None if mine is None else th.cat([mine, theirs])
 
-    return own._replace(**{name: join(mine, getattr(shown, name)) for name, mine in own._asdict().items()})
+    return own._replace(**{name: join(mine, getattr(demonstrated, name)) for name, mine in own._asdict().items()})

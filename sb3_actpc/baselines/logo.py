@@ -93,7 +93,7 @@ class LOGO(LearnsFromDemonstrations, KeepsEpisodesApart, TRPO):
     def _setup_model(self) -> None:
         self._check_actions()
         super()._setup_model()
-        self._shown: th.Tensor | None = None
+        self._demonstrated: th.Tensor | None = None
         if self.demonstrations is None:
             return
         if not (isinstance(self.observation_space, spaces.Box) and isinstance(self.action_space, spaces.Box)):
@@ -108,8 +108,10 @@ class LOGO(LearnsFromDemonstrations, KeepsEpisodesApart, TRPO):
             self._load_demonstrations()
 
     def _load_demonstrations(self) -> None:
-        shown = self._fitted_demonstrations()
-        self._shown = th.as_tensor(np.concatenate([shown.observations, shown.actions], axis=1), device=self.device)
+        demonstrated = self._fitted_demonstrations()
+        self._demonstrated = th.as_tensor(
+            np.concatenate([demonstrated.observations, demonstrated.actions], axis=1), device=self.device
+        )
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         """As SB3's; an agent that was loaded without an environment gets its demonstrations now."""
@@ -123,7 +125,7 @@ class LOGO(LearnsFromDemonstrations, KeepsEpisodesApart, TRPO):
 
     def train(self) -> None:
         """One iteration: policy improvement (TRPO), then policy guidance, then the adaptation of δ."""
-        guidance = None if self._shown is None else self._prepare_guidance(self._shown)
+        guidance = None if self._demonstrated is None else self._prepare_guidance(self._demonstrated)
         super().train()
         if guidance is not None:
             if self.delta > ZERO_DELTA:
@@ -131,7 +133,7 @@ class LOGO(LearnsFromDemonstrations, KeepsEpisodesApart, TRPO):
             self._adapt_delta()
             self.logger.record("train/guidance_delta", self.delta)
 
-    def _prepare_guidance(self, shown: th.Tensor) -> Guidance:
+    def _prepare_guidance(self, demonstrated: th.Tensor) -> Guidance:
         """Train the discriminator on the iteration's transitions and value them by it, before TRPO reorders its buffer."""
         buffer = self.rollout_buffer
         shape = (buffer.buffer_size * buffer.n_envs, -1)
@@ -143,10 +145,12 @@ class LOGO(LearnsFromDemonstrations, KeepsEpisodesApart, TRPO):
         seen = th.cat([flat[0].reshape(shape), flat[1].reshape(shape).clamp(low, high)], dim=1)
         if self._vec_normalize_env is not None:  # the buffer's observations are normalised, as they were seen
             n = flat[0][0].numel()
-            rows = shown[:, :n].cpu().numpy().reshape(-1, *(self.observation_space.shape or ()))
-            normalised = np.asarray(self._vec_normalize_env.normalize_obs(rows), dtype=np.float32).reshape(len(shown), n)
-            shown = th.cat([th.as_tensor(normalised, device=self.device), shown[:, n:]], dim=1)
-        self._train_discriminator(seen, shown)
+            rows = demonstrated[:, :n].cpu().numpy().reshape(-1, *(self.observation_space.shape or ()))
+            normalised = np.asarray(self._vec_normalize_env.normalize_obs(rows), dtype=np.float32).reshape(
+                len(demonstrated), n
+            )
+            demonstrated = th.cat([th.as_tensor(normalised, device=self.device), demonstrated[:, n:]], dim=1)
+        self._train_discriminator(seen, demonstrated)
         with th.no_grad():
             # -log D, with D the sigmoid of the output
             rewards = nn.functional.softplus(-self.discriminator(seen)).reshape(buffer.n_envs, -1).T
@@ -167,10 +171,10 @@ class LOGO(LearnsFromDemonstrations, KeepsEpisodesApart, TRPO):
             returns=returns,
         )
 
-    def _train_discriminator(self, seen: th.Tensor, shown: th.Tensor) -> None:
+    def _train_discriminator(self, seen: th.Tensor, demonstrated: th.Tensor) -> None:
         """Binary cross-entropy: 1 for the agent's transitions, 0 for the demonstrations."""
         for _ in range(self.discriminator_updates):
-            mine, theirs = self.discriminator(seen), self.discriminator(shown)
+            mine, theirs = self.discriminator(seen), self.discriminator(demonstrated)
             loss = nn.functional.softplus(-mine).mean() + nn.functional.softplus(theirs).mean()
             self.discriminator_optimizer.zero_grad()
             loss.backward()
@@ -236,7 +240,7 @@ class LOGO(LearnsFromDemonstrations, KeepsEpisodesApart, TRPO):
         self._iteration_returns = []
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_shown", *_NETS]
+        return [*super()._excluded_save_params(), "_demonstrated", *_NETS]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         names, variables = super()._get_torch_save_params()

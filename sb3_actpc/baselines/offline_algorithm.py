@@ -107,7 +107,7 @@ class OfflineAlgorithm(LearnsFromDemonstrations):
         """Choose what acts from now on; nothing to choose here."""
 
     @abstractmethod
-    def _take(self, shown: Demonstrations) -> None:
+    def _take(self, demonstrations: Demonstrations) -> None:
         """Learn from these demonstrations, which fit the environment."""
 
     def _load_demonstrations(self) -> None:

@@ -158,23 +158,23 @@ class TD3Demo(DemonstratedAlgorithm, TD3):
         n_demonstrated = self.replay_buffer.n_demonstrated(len(actions))  # type: ignore[union-attr]
         if not (n_demonstrated and self.cloning_weight):
             return -values.mean()
-        shown = slice(len(actions) - n_demonstrated, None)
-        distances = (actions[shown] - batch.actions[shown]).square().sum(dim=1, keepdim=True)
-        is_cloned = self._worth_cloning(batch, actions, shown)
+        demonstrated = slice(len(actions) - n_demonstrated, None)
+        distances = (actions[demonstrated] - batch.actions[demonstrated]).square().sum(dim=1, keepdim=True)
+        is_cloned = self._worth_cloning(batch, actions, demonstrated)
         self._losses["cloned_share"].append(is_cloned.mean().item())
         value_weight = self.policy_gradient_weight
         if self.normalize_values:
             value_weight = value_weight / values.detach().abs().mean().clamp(min=SMALLEST_VALUE).item()
         return self.cloning_weight * (distances * is_cloned).mean() - value_weight * values.mean()
 
-    def _worth_cloning(self, batch: Any, actions: th.Tensor, shown: slice) -> th.Tensor:
+    def _worth_cloning(self, batch: Any, actions: th.Tensor, demonstrated: slice) -> th.Tensor:
         """The Q-filter: 1 where the critic values the demonstrated action above the actor's, (n_demonstrated, 1)."""
         if not self.q_filter:
-            return th.ones_like(batch.rewards[shown])
-        rows = map_observations(lambda part: part[shown], batch.observations)
+            return th.ones_like(batch.rewards[demonstrated])
+        rows = map_observations(lambda part: part[demonstrated], batch.observations)
         with th.no_grad():
-            demonstrated_values = self.critic.q1_forward(rows, batch.actions[shown])
-            return (demonstrated_values > self.critic.q1_forward(rows, actions[shown])).float()
+            demonstrated_values = self.critic.q1_forward(rows, batch.actions[demonstrated])
+            return (demonstrated_values > self.critic.q1_forward(rows, actions[demonstrated])).float()
 
     def learn(self, total_timesteps: int, *args: Any, **options: Any) -> Self:
         """As SB3's; the first call begins with ``bc_steps`` steps of behavior cloning."""

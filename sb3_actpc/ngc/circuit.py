@@ -40,7 +40,7 @@ class NGCCircuit(nn.Module):
     :param settling: "iterative" (settle as ``dynamics`` says, then one change) or "scheduled" (each layer's change is
         taken when the error first reaches it, one ordered sweep; the zero-divergence schedule, Z-IL, of the predictive-coding
         literature; about K times cheaper). Scheduled with tied feedback is, numerically, the gradient of the output's loss;
-        with learned error synapses it is where the error neurons rest under an infinitesimal error that is held (no W^T)
+        with learned error synapses it is where the error neurons rest under a fixed infinitesimal error (no W^T)
     :param n_settling_steps: K (paper: 10 to 25); with ``dynamics="krylov"`` the most steps
     :param settling_tolerance: "krylov" stops when this share of the output's equation is left (the others take all K steps)
     :param dynamics: how iterative settling comes to rest: "krylov" (minimal residuals, two to four steps:
@@ -72,7 +72,7 @@ class NGCCircuit(nn.Module):
 
     chain_class: type[SettlingChain] = SettlingChain  # how errors come back; a subclass of the circuit may have another
     rates: th.Tensor
-    optimizer: th.optim.Optimizer  # of :meth:`parameter_groups`; set by whoever wants the circuit to learn
+    optimizer: th.optim.Optimizer  # of :meth:`parameter_groups`; the owner sets it so that the circuit learns
 
     def __init__(
         self,

@@ -13,7 +13,7 @@ from sb3_actpc.ngc.plasticity import HebbianChanges
 class CoupledState:
     """
     :param actor: the actor's settled state; its output error is the perturbation d_a the critic asked for
-    :param actions: the actor's projected actions, (B, A), that were held while settling
+    :param actions: the actor's projected actions, (B, A), fixed while settling
     :param action_values: the critic's projected values of them, (B, n_outputs), of an ensemble (M, B, n_outputs)
     """
 
@@ -116,7 +116,7 @@ def _settle_both(actor: NGCCircuit, critic: NGCCircuit, motor: SettlingChain, va
 
 
 def _sweep_repeatedly(actor: NGCCircuit, critic: NGCCircuit, motor: SettlingChain, value: SettlingChain) -> None:
-    """Under a held error nothing answers at the output: only the slopes change as the states move, sweep by sweep."""
+    """Under a fixed error nothing answers at the output: only the slopes change as the states move, sweep by sweep."""
     to_action = critic.input_feedback()
     for _ in range(critic.n_settling_steps):
         before = motor.drive

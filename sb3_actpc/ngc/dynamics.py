@@ -235,7 +235,7 @@ class SettlingChain:
         """
         One ordered pass, e_l = φ'(z_l) ⊙ (E_l e_{l+1}) from the output to the first layer, with the states at projection.
 
-        This is where the error neurons rest under an infinitesimal output error that is held, whatever E is: eq. 1 is
+        This is where the error neurons rest under a fixed infinitesimal output error, whatever E is: eq. 1 is
         triangular there. It is also the zero-divergence schedule of the predictive-coding literature (Z-IL: Song et al.,
         2020), and how ago109/active-neural-generative-coding, ``src/model/ngc.py``, updates: every layer's change is taken at
         the step when the error first reaches it. With tied feedback it is, numerically, the gradient of the output's loss;

@@ -10,7 +10,7 @@ class WorkingMemory(nn.Module):
     Gaussian projection Q, concatenated (paper, section on the NGC circuit; H = 7 after Miller's span of memory).
 
     :param n_inputs: size of one observation
-    :param history: H, how many observations are held
+    :param history: H, number of observations in the memory
     :raises ValueError: when a size is not positive
     """
 

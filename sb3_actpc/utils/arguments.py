@@ -75,7 +75,7 @@ def checked(init: Callable[Parameters, None]) -> Callable[Parameters, None]:
 
 
 def _plain(value: Any) -> Any:
-    """Python's own numbers in the place of NumPy's, which SB3 does not take everywhere."""
+    """Python's own numbers instead of NumPy's, which SB3 does not take everywhere."""
     if type(value) is tuple:
         return tuple(map(_plain, value))
     return value.item() if isinstance(value, np.generic) else value

@@ -103,7 +103,7 @@ def test_algorithms_are_given_the_same_demonstrations(tmp_path: Path) -> None:
         assert np.array_equal(shown.rewards[:, 0], reference.expert.demonstrations.rewards)
         env.close()
     model, env = prepare_logo(tmp_path)
-    assert np.array_equal(model._shown[:, :11].numpy(), expected.observations)
+    assert np.array_equal(model._demonstrated[:, :11].numpy(), expected.observations)
     env.close()
 
 

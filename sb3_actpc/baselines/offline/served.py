@@ -93,17 +93,17 @@ class ServedAlgorithm(OfflineAlgorithm):
         super()._setup_model()
         self.policy.owner = self
 
-    def _take(self, shown: Demonstrations) -> None:
+    def _take(self, demonstrations: Demonstrations) -> None:
         assert isinstance(self.action_space, spaces.Box)
         if not len(self.trained):  # a loaded agent keeps the normalization that its networks learned with
-            spread = np.maximum(shown.observations.std(axis=0), SMALLEST_SPREAD)
-            self.normalization = th.from_numpy(np.stack([shown.observations.mean(axis=0), spread]))
+            spread = np.maximum(demonstrations.observations.std(axis=0), SMALLEST_SPREAD)
+            self.normalization = th.from_numpy(np.stack([demonstrations.observations.mean(axis=0), spread]))
         self._demonstrated = {
-            "observations": self._normalized(shown.observations),
-            "next_observations": self._normalized(shown.next_observations),
-            "actions": scaled_actions(shown, self.action_space),
-            "rewards": shown.rewards,
-            "terminations": shown.terminations,
+            "observations": self._normalized(demonstrations.observations),
+            "next_observations": self._normalized(demonstrations.next_observations),
+            "actions": scaled_actions(demonstrations, self.action_space),
+            "rewards": demonstrations.rewards,
+            "terminations": demonstrations.terminations,
         }
         if self._process is not None:
             self._process.ask("show", self._demonstrated)

@@ -28,7 +28,7 @@ class Comparison(Schema):
     tasks: tuple[Run, ...]  # parts of runs, with ``env``
     variants: tuple[Run, ...]  # parts of runs, with a name and an algorithm
     seeds: Count = 3  # how many
-    first_seed: Seed = 0  # settings that were chosen on some seeds are to be shown on others
+    first_seed: Seed = 0  # report seeds on which no setting was chosen
     shared: Run = Run()  # what holds for all runs; a task's own comes first, and a variant's before that
     output: str = "runs/comparison"  # folder
 
@@ -71,7 +71,7 @@ def read_comparison_file(path: Path) -> dict[str, Any]:
 
 
 def with_options(content: Mapping[str, Any], options: Mapping[str, Any]) -> dict[str, Any]:
-    """The content of a file, with options in the place of its values; a name of its own variants stands for that variant.
+    """The content of a file, with options instead of its values; a name of its own variants stands for that variant.
     ValueError for a name that neither the file nor the package knows."""
     content, options = dict(content), dict(options)
     if "steps" in options:  # a file may call them n_timesteps

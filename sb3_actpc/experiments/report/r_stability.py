@@ -5,7 +5,7 @@
 W are the returns of the last K_e = 100 episodes. W^μ_i is the rolling average of the 100 values before the i-th of them, so
 that 200 episodes are needed. 0 is perfect stability.
 
-What follows from the formula, and is not mended here: it divides by the best return, so that it is undefined where that is 0
+What follows from the formula, and is kept here: it divides by the best return, so that it is undefined where that is 0
 (an agent that never gets anything), and returns far below 0 give large values (the best of a Reacher is near 0: -8 on average
 beside a best of -2 gives 3). A poor agent that is always equally poor gets a good value.
 """

@@ -16,7 +16,7 @@ EPISODES = "episodes.csv"
 
 
 def dense_reward(info: Mapping[str, Any], otherwise: Any) -> float:
-    """What an environment reports beside the reward that it pays; ``otherwise`` where it reports nothing.
+    """What an environment reports beside its reward; ``otherwise`` where it reports nothing.
 
     :raises ValueError: for NaN and infinity, of which no mean could be made
     """

@@ -110,7 +110,7 @@ class EpisodeStatistics:
 
 
 def says_one_return(summary: Mapping[str, Any]) -> bool:
-    """Whether the dense returns of a summary are the sparse ones: of an environment that reports none, or is paid densely."""
+    """Whether the dense returns of a summary equal the sparse ones: the environment reports none, or its reward is dense."""
     return all(summary[f"dense_{name}"] == summary[name] for name in ("return", "return_std"))
 
 
@@ -165,7 +165,7 @@ class EvaluationCallback(CsvCallback):
     since :meth:`begin`, the evaluations' own (``evaluation_seconds``) among them; ``updates`` are the agent's. Where the
     deployed policy is not the one that learns (ActPC with its gate), the columns ``OF_ACTOR`` are of the latter.
 
-    :param envs: environments that only this callback uses, closed by whoever made them
+    :param envs: environments that only this callback uses, closed by their owner
     :param eval_freq: environment steps between two evaluations, of ``eval_episodes`` each; their first episode is of ``seed``
     :param report: given one line of text after each evaluation
     :param keeps_best: keep the agent of the best evaluation, not that of the last

@@ -127,7 +127,7 @@ class Run(Schema):
     task: str | None = None  # of a comparison; ``env`` may be another version of it
     name: Name | None = None  # of this way of running the algorithm in a comparison, a variant
     about: str = ""  # what the variant is, for a report
-    task_prefix: str | None = None  # what the variant's environment begins with, in the place of the task's ``Sparse``
+    task_prefix: str | None = None  # what the variant's environment begins with, instead of the task's ``Sparse``
     is_resolved: bool = False  # whether everything is filled in; the rest is filled in as well
     demonstrations_sha256: str | None = None  # of the file's content
     demonstrators_return: float | None = None  # mean dense return of the demonstrations
