@@ -81,12 +81,13 @@ class IBRL(TD3Demo):
     actor's action or that of the BC policy, whichever the target critics value more. Targets bootstrap from the better of
     the two in the next state. Until ``learning_starts`` the BC policy acts.
 
-    Differences from the paper:
+    Differences from the authors' code (github.com/hengyuan-hu/ibrl, its settings for state observations):
 
     1. Half of every batch is demonstrated; there the replay buffer starts with the demonstrations.
-    2. The actor has no dropout.
-    3. The choice between two actions when acting uses the smallest value of all target critics, not of two drawn ones.
-    4. The actor climbs the first critic, as TD3's does.
+    2. The actor has no dropout (there 0.5). Layers, rates and target steps are ``hyperparams/ibrl.yml``'s; there three hidden
+       layers of 1024, 1e-4 and 0.01.
+    3. The better of two actions is taken; there one is drawn with probabilities softmax(10 Q).
+    4. The choice when acting uses the smallest value of all target critics, not of two drawn ones.
 
     :param args: policy, "MlpPolicy", and env; ``policy_kwargs`` are those of :class:`IBRLPolicy`
     :param bc_steps: steps of :class:`~sb3_actpc.baselines.BC`
@@ -160,6 +161,10 @@ class IBRL(TD3Demo):
             values = self.policy.target_values(observations, th.cat([actions, proposed]))
             bootstrap = values.view(2, -1, 1).amax(dim=0)
             return batch.rewards + (1 - batch.dones) * discounts * bootstrap
+
+    def _actor_values(self, observations: Any, actions: th.Tensor) -> th.Tensor:
+        """The smallest value of all critics."""
+        return th.cat(self.critic(observations, actions), dim=1).amin(dim=1, keepdim=True)
 
     def _update_critic(self, batch: Any) -> None:
         """The target critics follow every update."""

@@ -154,7 +154,7 @@ class TD3Demo(DemonstratedAlgorithm, TD3):
 
     def _actor_loss(self, batch: Any, actions: th.Tensor) -> th.Tensor:
         """Minus the mean action-value of the actor's actions, (B, A), and the cloning loss on the demonstrated rows."""
-        values = self.critic.q1_forward(batch.observations, actions)
+        values = self._actor_values(batch.observations, actions)
         n_demonstrated = self.replay_buffer.n_demonstrated(len(actions))  # type: ignore[union-attr]
         if not (n_demonstrated and self.cloning_weight):
             return -values.mean()
@@ -166,6 +166,10 @@ class TD3Demo(DemonstratedAlgorithm, TD3):
         if self.normalize_values:
             value_weight = value_weight / values.detach().abs().mean().clamp(min=SMALLEST_VALUE).item()
         return self.cloning_weight * (distances * is_cloned).mean() - value_weight * values.mean()
+
+    def _actor_values(self, observations: Any, actions: th.Tensor) -> th.Tensor:
+        """The action-values that the actor climbs, (B, 1): the first critic's."""
+        return self.critic.q1_forward(observations, actions)
 
     def _worth_cloning(self, batch: Any, actions: th.Tensor, demonstrated: slice) -> th.Tensor:
         """The Q-filter: 1 where the critic values the demonstrated action above the actor's, (n_demonstrated, 1)."""
