@@ -9,7 +9,7 @@ import torch as th
 from torch import nn
 
 from sb3_actpc.ngc.activations import ACTIVATIONS, get_activation
-from sb3_actpc.ngc.dynamics import DYNAMICS, ChainSettings, Rates, SettledState, SettlingChain
+from sb3_actpc.ngc.dynamics import DYNAMICS, ChainSettings, SettledState, SettlingChain
 from sb3_actpc.ngc.krylov import settle_krylov
 from sb3_actpc.ngc.normalization import EPSILON, NORMALIZATIONS, jacobian_product, normalize
 from sb3_actpc.ngc.plasticity import SYNAPTIC_SCALINGS, HebbianChanges, bound_columns_, hebbian_changes, mirrored, soft_bound_
@@ -294,15 +294,9 @@ class NGCCircuit(nn.Module):
             chain.predict()
         return chain.state()
 
-    @property
-    def has_fixed_steps(self) -> bool:
-        """Whether settling takes the same steps whatever it settles: a sweep, or eq. 1."""
-        return self.settling == "scheduled" or self.dynamics == "state"
-
-    def layer_rates(self) -> Rates:
+    def layer_rates(self) -> list[float]:
         """β of every hidden layer, first layer first."""
-        rates = self.rates[: self.n_hidden]
-        return rates.unbind() if th.compiler.is_compiling() else rates.tolist()
+        return self.rates[: self.n_hidden].tolist()
 
     def chain(self, x: th.Tensor, memory: th.Tensor | None = None) -> SettlingChain:
         """The projected chain of this circuit's layers, to be clamped and settled; see :meth:`settle` for the shapes."""
@@ -425,8 +419,7 @@ class NGCCircuit(nn.Module):
         for group in self.optimizer.param_groups:
             matrices = [parameter for parameter in group["params"] if id(parameter) not in biases]
             if matrices:
-                kept = 1.0 - group["lr"] * weight_decay  # a tensor where a CUDA graph reads the rate
-                th._foreach_mul_(matrices, kept.clamp_min(0.0) if isinstance(kept, th.Tensor) else max(0.0, kept))
+                th._foreach_mul_(matrices, max(0.0, 1.0 - group["lr"] * weight_decay))
 
     def _scaled_synapses(self) -> list[th.Tensor]:
         return [*self.synapses.weights, *self.synapses.feedback]

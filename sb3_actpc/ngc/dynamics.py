@@ -13,9 +13,6 @@ from sb3_actpc.ngc.synapses import Synapses
 
 DYNAMICS = ("krylov", "state")
 
-# β of every hidden layer: numbers, or, in a compiled graph, 0-d tensors, so that rates that move ask for no other graph
-Rates = Sequence[float] | Sequence[th.Tensor]
-
 
 @dataclass
 class SettledState:
@@ -182,7 +179,7 @@ class SettlingChain:
             return self.damp(layer, signal)
         return signal
 
-    def integrate(self, rates: Rates) -> None:
+    def integrate(self, rates: Sequence[float]) -> None:
         """One step of eq. 1 for every hidden layer that an error has reached; ``rates`` are the β, first layer first."""
         settings = self.settings
         self.lowest_reached = 1 if settings.leak else max(1, self.lowest_reached - 1)
@@ -192,10 +189,8 @@ class SettlingChain:
                 signal.sub_(self.latents[layer], alpha=settings.leak)
             if layer == 1:  # its prediction is constant: the error moves as the state does
                 error.lerp_(signal, rate)
-            elif isinstance(rate, float):
-                self.latents[layer].add_(signal.sub_(error), alpha=rate)
             else:
-                self.latents[layer].add_(signal.sub_(error).mul_(rate))
+                self.latents[layer].add_(signal.sub_(error), alpha=rate)
 
     def predict(self, output: bool = True) -> None:
         """

@@ -146,12 +146,6 @@ def check_nudge(name: str, nudge: Any) -> None:
         raise ValueError(f"{name}={nudge!r} must be above 0 and at most 1")
 
 
-def check_compile(name: str, value: Any) -> None:
-    """True, False or "auto"."""
-    if not isinstance(value, bool) and value != "auto":
-        raise ValueError(f"{name}={value!r} must be True, False or 'auto'")
-
-
 def check_computes(name: str, device: Any) -> None:
     """A device of this machine; the keyword is ``device``."""
     check_device(device)
