@@ -182,7 +182,8 @@ class TD3Demo(DemonstratedAlgorithm, TD3):
 
     def learn(self, total_timesteps: int, *args: Any, **options: Any) -> Self:
         """As SB3's; the first call begins with ``bc_steps`` steps of behavior cloning."""
-        if self.bc_steps and not self._n_updates and getattr(self.replay_buffer, "demonstrated", None) is not None:
+        is_new = not self.num_timesteps and not self._n_updates
+        if self.bc_steps and is_new and getattr(self.replay_buffer, "demonstrated", None) is not None:
             self._clone_actor()
         return super().learn(total_timesteps, *args, **options)
 

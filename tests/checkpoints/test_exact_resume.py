@@ -17,12 +17,13 @@ from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import BitFlippingEnv
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
-from stable_baselines3.common.vec_env import SubprocVecEnv, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 import sb3_actpc.envs  # noqa: F401, registers the sparse tasks
 from sb3_actpc import ActPC
 from sb3_actpc.actpc.reward_signals import PriorError
+from sb3_actpc.baselines import IBRL
 from sb3_actpc.checkpoints import CheckpointCallback, continue_learning, list_bundles, restore
 from sb3_actpc.checkpoints.physics import physics_arrays
 from tests.actpc.envs import CountingEnv, demonstrations
@@ -306,6 +307,18 @@ def test_a_stop_in_the_pretraining_loses_no_update(tmp_path: Path, monkeypatch: 
     assert int(stopped.policy.n_prior_updates) == stop_after
     assert_same(straight, resumed)
     assert log_rows(tmp_path / "straight" / "progress.csv") == log_rows(tmp_path / "resumed" / "progress.csv")
+
+
+@pytest.mark.parametrize("stop_at", [10, 41])
+def test_a_bc_policy_is_trained_once(tmp_path: Path, stop_at: int) -> None:
+    """Also where the run stops before its first update."""
+    sizes = {"policy_kwargs": {"net_arch": [8], "n_critics": 3}, "batch_size": 8, "buffer_size": 200, "bc_steps": 20}
+
+    def make() -> IBRL:
+        env = DummyVecEnv([CountingEnv])
+        return IBRL("MlpPolicy", env, demonstrations=demonstrations(), learning_starts=20, seed=1, device="cpu", **sizes)
+
+    check(make, tmp_path, 70, stop_at)
 
 
 class StopOnce(BaseCallback):
