@@ -213,10 +213,10 @@ class NGCCircuit(nn.Module):
 
     def mirror_feedback(self) -> None:
         """
-        Let learned error synapses copy the weights' action from noise: E = mean of ξ (W ξ)^T over Gaussian noise ξ.
+        Let learned error synapses copy the weights' action from noise: E = sum of ξ (W ξ)^T over orthonormal noise ξ.
 
         Weight mirroring (Akrout et al., "Deep learning without weight transport", NeurIPS 2019): Hebbian, each synapse sees
-        the two neurons it joins and no weight is read across. Cosine with W^T: 0.995. Does nothing where feedback is tied.
+        the two neurons it joins and no weight is read across. Then E is W^T up to rounding. Does nothing with tied feedback.
         """
         above = self.synapses.weights[len(self.synapses.weights) - len(self.synapses.feedback) :]
         for feedback, weights in zip(self.synapses.feedback, above, strict=True):

@@ -6,8 +6,7 @@ import torch as th
 
 from sb3_actpc.ngc.products import sum_outer
 
-N_MIRRORED = 100  # noise vectors per source neuron; the cosine with W^T is (1 + 1 / N_MIRRORED)^-1/2
-LARGEST_MIRRORING = 10**10  # products of numbers, in mirroring one layer; a random number costs about a hundred of them
+MIRRORED_TOGETHER = 512  # source neurons
 SYNAPTIC_SCALINGS = ("none", "soft_bound", "column_norm")
 
 
@@ -75,21 +74,21 @@ def _memory_change(error: th.Tensor, memory: th.Tensor, memory_weight: float) ->
 
 def mirrored(weights: th.Tensor) -> th.Tensor:
     """
-    Error synapses from the answers of ``weights`` to noise: the mean of (W ξ) ξ^T, whose expectation is W.
+    Error synapses from the responses of ``weights`` to noise: the sum of (W ξ) ξ^T over orthonormal noise patterns ξ.
 
-    There are ``N_MIRRORED`` noises for every source neuron; very large layers, whose products would take minutes, hear fewer
-    and start less aligned.
+    Weight mirroring (Akrout et al., arXiv 1904.05391) with orthogonal noise. Independent noise leaves an error of 1 / sqrt(n)
+    after n patterns per neuron, which layer normalization amplifies; orthonormal patterns leave rounding alone. At most
+    ``MIRRORED_TOGETHER`` source neurons are active at a time.
 
     :param weights: W, (n_out, n_in)
     :return: E^T, (n_out, n_in)
     """
-    feedback, (n_out, n_in) = th.zeros_like(weights), weights.shape
-    affordable = max(1, LARGEST_MIRRORING // (max(n_out, 100) * n_in))  # noises
-    n_noises = min(N_MIRRORED * n_in, affordable)
-    for start in range(0, n_noises, n_in):
-        noise = th.randn(min(n_in, n_noises - start), n_in, dtype=weights.dtype, device=weights.device)
-        feedback.addmm_((noise @ weights.t()).t(), noise, alpha=1.0 / n_noises)
-    return feedback
+    parts = []
+    for source in weights.split(MIRRORED_TOGETHER, dim=1):
+        noise = th.linalg.qr(th.randn(source.shape[1], source.shape[1], dtype=weights.dtype, device=weights.device)).Q
+        responses = noise @ source.t()
+        parts.append(responses.t() @ noise)
+    return th.cat(parts, dim=1)
 
 
 def soft_bound_(new: th.Tensor, old: th.Tensor, bound: float) -> None:
