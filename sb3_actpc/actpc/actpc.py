@@ -100,7 +100,8 @@ class ActPC(ActPCBase):
     :param alpha_in: weight of the instrumental signal
     :param alpha_ext: weight of the task's reward (the paper's is 0 with demonstrations)
     :param signal_kwargs: keywords of :class:`~sb3_actpc.actpc.reward_signals.InternalSignals`
-    :param critic_weight: weight of the critic term in the actor's update; 0 leaves imitation alone
+    :param critic_weight: weight of the critic term in the actor's update; the default is TD3+BC's (arXiv 2106.06860); 0 leaves
+        imitation alone
     :param normalize_critic_term: divide that term by the batch's mean absolute action-value (at least 1)
     :param policy_delay: updates of the critic for each of the actor; the paper's is 1
     :param bootstrap: "joint" (at the target actor's next action, the appendix) or "literal" (at the action taken, the main
@@ -152,7 +153,7 @@ class ActPC(ActPCBase):
         alpha_in: Weight = 0.0,
         alpha_ext: float = 1.0,
         signal_kwargs: Settings | None = None,
-        critic_weight: Weight = 1.0,
+        critic_weight: Weight = 2.5,
         normalize_critic_term: bool = True,
         policy_delay: Size = 4,
         bootstrap: Literal["joint", "literal"] = "joint",
