@@ -419,10 +419,11 @@ def test_refresh_imitates_the_agents_own_best_episodes_beside_the_demonstrations
     assert errors[True] < 0.1 < 0.5 < errors[False]
 
 
-def test_the_pressure_has_the_nudge_that_was_asked_for():
+def test_the_critic_term_has_the_nudge_that_was_asked_for():
     """With SGD at rate 1 the step is the change; a whole nudge moves the settled state, an infinitesimal one does not."""
     policy_kwargs = {"net_arch": [16, 16], "optimizer_class": th.optim.SGD, "nudge": 1.0}
     options = {"settling": "iterative", "learning_rate": 1.0, "replay_buffer_kwargs": NO_MEMORY, "learning_starts": 100}
+    options["critic_weight"] = 1.0
     model = make(policy_kwargs=policy_kwargs, **options)
     model.learn(50)
     batch, actor = next(model.sample_batches(1, 16)), model.actor.circuit
