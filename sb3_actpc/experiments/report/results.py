@@ -66,7 +66,8 @@ def load_results(folder: Path, chosen_steps: Sequence[int] = CHOSEN_STEPS) -> Re
     if not folders and (folder / CURVES).is_file():
         runs = pd.read_csv(folder / RESULTS, index_col="run", dtype=dict.fromkeys(_TEXTS, str))
         runs[_TEXTS] = runs[_TEXTS].fillna("")
-        return Results(_labelled(runs), pd.read_csv(folder / CURVES))
+        stored = pd.read_csv(folder / CURVES)
+        return Results(_labelled(_with_steps(runs, stored, chosen_steps)), stored)
     if not folders:
         raise FileNotFoundError(f"no runs in {folder}: make some with sb3-actpc compare --output {folder}")
     names = [path.relative_to(folder).as_posix() for path in folders]
@@ -75,6 +76,14 @@ def load_results(folder: Path, chosen_steps: Sequence[int] = CHOSEN_STEPS) -> Re
     named = [own.assign(run=name) for name, own in zip(names, curves, strict=True) if len(own)]
     joined = pd.concat(named, ignore_index=True) if named else pd.DataFrame(columns=["run", "timesteps", *MEASURES])
     return Results(_labelled(pd.DataFrame(rows, index=pd.Index(names, name="run"))), joined)
+
+
+def _with_steps(runs: pd.DataFrame, curves: pd.DataFrame, chosen_steps: Sequence[int]) -> pd.DataFrame:
+    """Add the measures at steps that the file was not written for."""
+    columns = [f"{name}_at_{step}" for step in chosen_steps for name in MEASURES]
+    missing = [column for column in columns if column not in runs]
+    values = [run_measures(env, curves[curves["run"] == run], chosen_steps) for run, env in runs["env"].items()]
+    return runs.assign(**{column: [one[column] for one in values] for column in missing})
 
 
 def write_results(results: Results, folder: Path) -> list[Path]:
