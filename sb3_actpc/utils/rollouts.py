@@ -47,6 +47,14 @@ class _Deferred:
         return getattr(self.callback, name)
 
 
+def watch(algorithm: Any) -> WatchedVecEnv:
+    """The training environment of an algorithm, watched; the same object until the algorithm is given another one."""
+    assert algorithm.env is not None
+    if algorithm._watched is None or algorithm._watched.venv is not algorithm.env:
+        algorithm._watched = WatchedVecEnv(algorithm.env)
+    return cast(WatchedVecEnv, algorithm._watched)
+
+
 class StoresLastTransition(OffPolicyAlgorithm):
     """
     Every transition is stored, as it was when it arrived, and none joins two episodes.
@@ -63,10 +71,7 @@ class StoresLastTransition(OffPolicyAlgorithm):
 
     def _watch(self) -> WatchedVecEnv:
         """The training environment, watched."""
-        assert self.env is not None
-        if self._watched is None or self._watched.venv is not self.env:
-            self._watched = WatchedVecEnv(self.env)
-        return self._watched
+        return watch(self)
 
     @property
     def is_disturbed(self) -> bool:
@@ -182,14 +187,12 @@ class KeepsEpisodesApart(OnPolicyAlgorithm):
     _watched: WatchedVecEnv | None = None
 
     def _setup_learn(self, *args: Any, **options: Any) -> tuple[int, BaseCallback]:
-        assert self.env is not None
-        if self._watched is None or self._watched.venv is not self.env:
-            self._watched = WatchedVecEnv(self.env)
-        self._watched.finish_step()
+        watched = watch(self)
+        watched.finish_step()
         before = self._last_obs
         result = super()._setup_learn(*args, **options)
         if self._last_obs is not before:  # SB3 has reset the environment
-            self._watched.mark()
+            watched.mark()
         self._last_obs = copied(self._last_obs)
         return result
 
@@ -197,9 +200,9 @@ class KeepsEpisodesApart(OnPolicyAlgorithm):
         self, env: VecEnv, callback: BaseCallback, rollout_buffer: RolloutBuffer, n_rollout_steps: int
     ) -> bool:
         """As SB3's."""
-        assert self._watched is not None
-        apart = cast(BaseCallback, _CutsEpisodes(callback, self, self._watched))
-        return super().collect_rollouts(self._watched, apart, rollout_buffer, n_rollout_steps)
+        watched = watch(self)
+        apart = cast(BaseCallback, _CutsEpisodes(callback, self, watched))
+        return super().collect_rollouts(watched, apart, rollout_buffer, n_rollout_steps)
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_watched"]
