@@ -34,7 +34,9 @@ def write_report(
         picture = target / f"curves_{folder_name(task)}.png"
         left_out = figures.draw_curves(results, task, picture, curves)
         note = f"\n\nNot drawn: {', '.join(left_out)}." if left_out else ""
-        text.append(f"## {task}\n\n{markdown(task_table(results, task, steps))}\n\n![{task}]({picture.name}){note}")
+        text.append(f"## {task}\n\n![{task}]({picture.name}){note}")
+        for measure, table in task_tables(results, task, steps).items():
+            text.append(f"### {measure.replace('_', ' ').capitalize()}\n\n{markdown(table)}")
         files.append(picture)
     scores = normalized_scores(results)
     if scores:
@@ -52,22 +54,32 @@ def write_report(
     return [*files, target / "report.md"]
 
 
-def task_table(results: Results, task: str, steps: Sequence[int]) -> pd.DataFrame:
-    """A row for each variant: mean ± standard deviation over seeds of every measure that is defined."""
+def task_tables(results: Results, task: str, steps: Sequence[int]) -> dict[str, pd.DataFrame]:
+    """Measure -> a row for each variant, mean ± standard deviation over seeds; then the runs and their seconds."""
+    groups = results.groups(task)
+    tables = {}
+    for measure in MEASURES:
+        columns = {f"at {step:,}": f"{measure}_at_{step}" for step in steps}
+        columns |= {"last": measure, "area": f"{measure}_area", "worst after 5,000": f"{measure}_worst"}
+        form = ".2f" if measure.endswith("success") else ".1f"
+        rows = []
+        for label, runs in groups.items():
+            cells = {title: mean_and_deviation(runs[column].to_numpy(), form) for title, column in columns.items()}
+            if any(cell != UNDEFINED for cell in cells.values()):
+                rows.append({"variant": label, **cells})
+        table = pd.DataFrame(rows)
+        tables[measure] = table.loc[:, (table != UNDEFINED).any()]
     rows = []
-    for label, runs in results.groups(task).items():
-        n_episodes = ", ".join(str(n) for n in sorted(runs["eval_episodes"].unique()))
-        row = {"variant": f"{label} †" if runs["dirty"].any() else label, "seeds": str(len(runs)), "episodes": n_episodes}
-        for measure in MEASURES:
-            form = ".2f" if measure.endswith("success") else ".1f"
-            name = measure.replace("_", " ")
-            columns = {f"{name} at {step:,}": f"{measure}_at_{step}" for step in steps}
-            columns |= {f"{name}, last": measure, f"{name}, area": f"{measure}_area"}
-            columns |= {f"{name}, worst after 5,000": f"{measure}_worst"}
-            row |= {title: mean_and_deviation(runs[column].to_numpy(), form) for title, column in columns.items()}
-        rows.append({**row, "seconds": mean_and_deviation(runs["seconds"].to_numpy(), ".0f")})
-    table = pd.DataFrame(rows)
-    return table.loc[:, (table != UNDEFINED).any()]
+    for label, runs in groups.items():
+        rows.append(
+            {
+                "variant": f"{label} †" if runs["dirty"].any() else label,
+                "seeds": str(len(runs)),
+                "evaluation episodes": ", ".join(str(n) for n in sorted(runs["eval_episodes"].unique())),
+                "seconds": mean_and_deviation(runs["seconds"].to_numpy(), ".0f"),
+            }
+        )
+    return {**{name: table for name, table in tables.items() if len(table)}, "runs": pd.DataFrame(rows)}
 
 
 def normalized_scores(results: Results) -> dict[str, list[np.ndarray]]:

@@ -45,7 +45,7 @@ def test_the_two_files_make_the_same_report_again(tmp_path: Path) -> None:
     assert {name: (tmp_path / "kept" / name).read_bytes() for name in files} == files
     assert "50.5 ± 0.7" in first and "Runs that are not in the tables" in first and "| 20 |" in first
     write_report(tmp_path / "kept", tmp_path / "other", (5_000,))
-    assert "return at 5,000" in (tmp_path / "other" / "report.md").read_text(encoding="utf-8")
+    assert "### Return\n\n| variant | at 5,000 |" in (tmp_path / "other" / "report.md").read_text(encoding="utf-8")
     curves = pd.read_csv(tmp_path / "kept" / "curves.csv.gz")
     assert len(curves) == 5 * 3 and curves["run"].nunique() == 5
 
