@@ -349,7 +349,10 @@ class ActPC(ActPCBase):
         # Imitation: settle on demonstrated actions and those of good episodes, ΔΘ_a = e φ(z)ᵀ
         imitation_weight = self.refresh_weight * self.actor_guidance.imitation_weight(self._n_updates)
         if imitation_weight and self.imitated_episodes():
-            state = self.actor.circuit.settle(*self.sample_imitated(len(batch.features)))
+            features, actions, memory = self.sample_imitated(len(batch.features))
+            if self.critic_weight and self.actor_guidance.filters_imitation(self._n_updates):
+                actions = self.q_filter(features, actions, memory)
+            state = self.actor.circuit.settle(features, actions, memory)
             imitation = self.actor.circuit.hebbian_update(state).scale_(imitation_weight)
             self.diagnostics.settled("actor", state)
             self.diagnostics.change_norms("imitation", imitation)
@@ -375,6 +378,19 @@ class ActPC(ActPCBase):
                 total.add_(other)
             self.actor.circuit.apply_changes(total)
             self.actor_guidance.after_update(self._context())
+
+    def q_filter(self, features: th.Tensor, actions: th.Tensor, memory: th.Tensor | None) -> th.Tensor:
+        """Imitated actions, (B, A); the actor's own, which have no error, where all critics value these more (Q-filter, Nair
+        et al., arXiv 1709.10089)."""
+        own = self.actor.circuit.project(features, memory)
+        pairs = [th.cat([features, either], dim=1) for either in (actions, own)]
+        imitated_value, own_value = self.critic.project(th.cat(pairs)).mean(-1, keepdim=True).chunk(2, dim=-2)
+        gain = imitated_value - own_value
+        if self.policy.n_critics > 1:
+            gain = gain.amax(0)
+        is_imitated = gain > 0
+        self.diagnostics.follow(imitated_share=lambda: is_imitated.float().mean())
+        return th.where(is_imitated, actions, own)
 
     def update_critic(self, batch: Batch) -> None:
         """All critics settle on the same targets, ΔΘ_c = e φ(z)ᵀ (lines 21 and 22). Without a weight they have no role."""

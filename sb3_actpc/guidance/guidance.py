@@ -19,7 +19,8 @@ class GuidanceConfig:
     :param bc_updates: BC updates of the actor before learning
     :param critic_warmup: updates before the critic term reaches the actor: the critic first learns from the BC policy's own
         episodes (WSRL, arXiv 2412.07762, warms up on 5,000 such steps)
-    :param imitation_half_life: updates after which the imitation term has half its weight; 0 for a constant one
+    :param q_filter: after the warm-up, imitate only where the critics do not value the actor's own action more (Nair et al.,
+        arXiv 1709.10089)
     :param weighting: "returns" draws imitated steps by their episode's return to the power of four (reward-weighted
         regression, Peters and Schaal 2007), "uniform" as the paper does
     :param gate: whether the deployed policy changes only after evaluation episodes; else the actor is deployed
@@ -31,7 +32,7 @@ class GuidanceConfig:
 
     bc_updates: int = 3000
     critic_warmup: int = 6000
-    imitation_half_life: int = 0
+    q_filter: bool = True
     weighting: Literal["returns", "uniform"] = "returns"
     gate: bool = True
     evaluation_share: float = 0.25
@@ -39,7 +40,7 @@ class GuidanceConfig:
     challenger_interval: int = 4000
 
     def __post_init__(self) -> None:
-        for name in ("bc_updates", "critic_warmup", "imitation_half_life", "challenger_interval"):
+        for name in ("bc_updates", "critic_warmup", "challenger_interval"):
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int) or value < 0:
                 raise ValueError(f"guidance_kwargs[{name!r}]={value!r} must be a whole number of at least 0")
@@ -49,8 +50,9 @@ class GuidanceConfig:
                 raise ValueError(f"guidance_kwargs[{name!r}]={value!r} must be a number from 0 to 1")
         if self.weighting not in ("returns", "uniform"):
             raise ValueError(f"guidance_kwargs['weighting']={self.weighting!r} must be 'returns' or 'uniform'")
-        if not isinstance(self.gate, bool):
-            raise ValueError(f"guidance_kwargs['gate']={self.gate!r} must be True or False")
+        for name in ("q_filter", "gate"):
+            if not isinstance(getattr(self, name), bool):
+                raise ValueError(f"guidance_kwargs[{name!r}]={getattr(self, name)!r} must be True or False")
 
     @classmethod
     def names(cls) -> list[str]:
@@ -128,11 +130,9 @@ class BehaviorGuidance(ActorGuidance):
         """0 during the warm-up, then 1."""
         return float(n_updates > self.config.critic_warmup)
 
-    def imitation_weight(self, n_updates: int) -> float:
-        """Halves every ``imitation_half_life`` updates after the warm-up."""
-        if not self.config.imitation_half_life:
-            return 1.0
-        return 0.5 ** (max(n_updates - self.config.critic_warmup, 0) / self.config.imitation_half_life)
+    def filters_imitation(self, n_updates: int) -> bool:
+        """After the warm-up of the critic."""
+        return self.config.q_filter and n_updates > self.config.critic_warmup
 
     def after_update(self, context: GuidanceContext) -> None:
         """The actor's moving average."""

@@ -8,7 +8,7 @@ import torch as th
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_actpc import ActPC
-from sb3_actpc.guidance import ActorGuidance, BehaviorGuidance, GuidanceConfig
+from sb3_actpc.guidance import ActorGuidance
 from tests.actpc.agents import QUICK, differ, imitating, make, weights_of
 from tests.actpc.envs import CountingEnv, demonstrations
 
@@ -38,9 +38,41 @@ def test_the_critic_term_waits_for_the_end_of_the_warm_up():
     assert differ(before, weights_of(model.actor.circuit))
 
 
-def test_the_imitation_term_halves_after_its_half_life():
-    guidance = BehaviorGuidance(GuidanceConfig(critic_warmup=100, imitation_half_life=50))
-    assert [guidance.imitation_weight(n) for n in (0, 100, 150, 200)] == [1.0, 1.0, 0.5, 0.25]
+@pytest.mark.parametrize("n_critics", [1, 2, 5])
+def test_the_q_filter_imitates_unless_all_critics_value_the_own_action_more(n_critics):
+    model = imitating(policy_kwargs={"n_critics": n_critics, "net_arch": [8]})
+    model.learn(5)
+    rng = np.random.default_rng(0)
+    features = th.as_tensor(rng.normal(size=(64, 3)), dtype=th.float32)
+    actions = th.as_tensor(rng.uniform(-1, 1, size=(64, *model.action_space.shape)), dtype=th.float32)
+    own = model.actor.circuit.project(features)
+    kept = model.q_filter(features, actions, None)
+    is_imitated = (kept == actions).all(1)
+    assert th.equal(kept[~is_imitated], own[~is_imitated])
+    for row in range(len(features)):
+        gains = [
+            model.critic.project(th.cat([features[row], action[row]])[None]).reshape(n_critics, -1).mean(1)
+            for action in (actions, own)
+        ]
+        assert bool(is_imitated[row]) == bool((gains[0] > gains[1]).any())
+    assert 0 < int(is_imitated.sum()) < len(features)
+
+
+@pytest.mark.parametrize(("q_filter", "imitates"), [(True, False), (False, True)])
+def test_what_the_filter_takes_away_is_not_imitated_after_the_warm_up(q_filter, imitates):
+    """A filter that leaves nothing, next to a critic term that weighs next to nothing."""
+    settings = {"bc_updates": 1, "critic_warmup": 20, "q_filter": q_filter}
+    plain = {"net_arch": [8], "optimizer_class": th.optim.SGD, "circuit_kwargs": {"weight_decay": 0.0}}
+    model = imitating(
+        guidance_kwargs=settings, gradient_steps=1, policy_delay=1, critic_weight=1e-9, learning_rate=0.1, policy_kwargs=plain
+    )
+    model.learn(1)
+    model.q_filter = lambda features, actions, memory: model.actor.circuit.project(features, memory)
+    model.train(20, 16)
+    before = weights_of(model.actor.circuit)
+    model.train(1, 16)
+    moved = max(float((a - b).abs().max()) for a, b in zip(before, weights_of(model.actor.circuit), strict=True))
+    assert (moved > 1e-5) == imitates
 
 
 @pytest.mark.parametrize(("weighting", "share"), [("returns", 0.0), ("uniform", 0.5)])
@@ -125,6 +157,7 @@ def test_an_overridden_update_always_runs(method):
         ({"evaluation_share": 2.0}, r"guidance_kwargs\['evaluation_share'\]=2.0 must be a number from 0 to 1"),
         ({"weighting": "best"}, r"'weighting'\]='best' must be 'returns' or 'uniform'"),
         ({"gate": 1}, r"'gate'\]=1 must be True or False"),
+        ({"q_filter": 1}, r"'q_filter'\]=1 must be True or False"),
         ({"warmup": 1}, r"guidance_kwargs has 'warmup'.*choose from"),
     ],
 )
