@@ -105,6 +105,40 @@ SUCCESSES: dict[str, tuple[Player, Curve]] = {
     "a tenth below, from 0.6": chance(0.6, lambda steps, now: now - 0.1),
     "a twentieth below, from 0.85": chance(0.85, lambda steps, now: now - 0.05),
 }
+
+
+@dataclass
+class Locomotion:
+    """Returns count steps beyond a line that takes 150 steps to reach; one episode in ten stops early."""
+
+    learns_from: int = 1500
+    noise: float = 0.0
+
+    def play(self, rng: random.Random, player: Player) -> tuple[float, int]:
+        if rng.random() < player.chance:
+            episode_return = max(rng.gauss(player.full, player.deviation), 0.0)
+        else:
+            episode_return = rng.uniform(0.0, 0.5) * player.full
+        return episode_return, min(150 + int(episode_return), LONGEST)
+
+    def mean(self, player: Player) -> float:
+        return player.full * (player.chance + 0.25 * (1.0 - player.chance))
+
+
+def by_thousands(*returns: float) -> tuple[Player, Curve]:
+    """The actor's return after 0, 1,000, 2,000 steps and so on, then the last one."""
+    players = [Player(0.9, full, 30) for full in returns]
+    return players[0], lambda steps, now: players[min(steps // 1000, len(players) - 1)]
+
+
+# measured returns of the actor's moving average in the Hopper
+UNSTEADY: dict[str, tuple[Player, Curve]] = {
+    "308 to 710, with a drop at 6,000": by_thousands(308, 308, 237, 266, 351, 619, 105, 727, 710),
+    "308 to 800, without": by_thousands(308, 308, 246, 207, 541, 844, 844, 500, 800),
+    "308 to 800, with a drop at 7,000": by_thousands(308, 308, 260, 324, 316, 478, 850, 473, 570, 800),
+    "stays at 308": by_thousands(308, 308, 300, 310, 300, 310),
+    "falls from 308 to 200": by_thousands(308, 308, 240, 200, 240, 200),
+}
 GOES_ON = Fall(ends=False)
 ENDS = Fall(ends=True)
 FALLS: dict[str, tuple[Fall, tuple[Player, Curve]]] = {
@@ -125,7 +159,7 @@ FALLS: dict[str, tuple[Fall, tuple[Player, Curve]]] = {
 
 
 def last_deployed(
-    rng: random.Random, kind: Success | Fall, actor: tuple[Player, Curve], total: int, **settings: float
+    rng: random.Random, kind: Success | Fall | Locomotion, actor: tuple[Player, Curve], total: int, **settings: float
 ) -> tuple[Player, float]:
     """
     :param kind: how an episode goes
@@ -159,9 +193,11 @@ def last_deployed(
     return deployed, selection.evaluation_steps / selection.steps
 
 
-def row(kind: Success | Fall, actor: tuple[Player, Curve], totals: list[int], runs: int, seed: int, **settings: float) -> str:
+def row(
+    kind: Success | Fall | Locomotion, actor: tuple[Player, Curve], totals: list[int], runs: int, seed: int, **settings: float
+) -> str:
     """Mean, and worst twentieth, of so many runs for each number of steps."""
-    unit = kind.mean(actor[0]) if isinstance(kind, Fall) else 1.0
+    unit = 1.0 if isinstance(kind, Success) else kind.mean(actor[0])
     cells = []
     for total in totals:
         rng = random.Random(seed)
@@ -178,7 +214,9 @@ def main() -> None:
     parser.add_argument("--failure", type=int, default=500, help="steps of one that fails")
     parser.add_argument("--set", nargs="*", default=[], help="settings of the gate, as budget=10")
     arguments = parser.parse_args()
-    settings = {name: float(value) for name, value in (one.split("=") for one in arguments.set)}
+    settings = {
+        name: float(value) if "." in value else int(value) for name, value in (one.split("=") for one in arguments.set)
+    }
     kind = Success(arguments.success, arguments.failure)
     print("| the actor | 50,000 steps | 100,000 steps |\n| --- | --- | --- |")
     for name, actor in SUCCESSES.items():
@@ -186,6 +224,10 @@ def main() -> None:
     print("\n| the actor | 15,000 steps | 50,000 steps |\n| --- | --- | --- |")
     for name, (fall, actor) in FALLS.items():
         print(f"| {name} | {row(fall, actor, [15_000, 50_000], arguments.runs, arguments.seed, **settings)} |", flush=True)
+    print("\n| the actor | 10,000 steps | 15,000 steps | 50,000 steps |\n| --- | --- | --- | --- |")
+    for name, actor in UNSTEADY.items():
+        totals = [10_000, 15_000, 50_000]
+        print(f"| {name} | {row(Locomotion(), actor, totals, arguments.runs, arguments.seed, **settings)} |", flush=True)
 
 
 if __name__ == "__main__":

@@ -2,8 +2,8 @@
 
 An *incumbent* is deployed. A *challenger*, a frozen copy of the actor's moving average, plays evaluation episodes until it has
 as many as the incumbent; then both take turns. A group sequential test on the difference of mean returns promotes or rejects
-the challenger; its threshold falls with the number of episodes (O'Brien and Fleming, Biometrics 1979). An incumbent that turns
-out worse than the one before it is rolled back.
+the challenger; its threshold falls with the number of episodes (O'Brien and Fleming, Biometrics 1979). A challenger far below
+the actor's exploration episodes makes room for a new copy. An incumbent that is worse than the one before is rolled back.
 """
 
 from dataclasses import asdict, dataclass, field
@@ -40,6 +40,7 @@ class PolicySelection:
     incumbent_returns: list[float] = field(default_factory=list)
     challenger_returns: list[float] = field(default_factory=list)
     previous_returns: list[float] = field(default_factory=list)
+    exploration_returns: list[float] = field(default_factory=list)  # of the actor, since the challenger was copied
     worst: float | None = None  # return of any episode, exploration episodes included
     n_needed: int = 0  # returns of the incumbent before the next challenger begins: a lucky promotion shows in further ones
     roles: list[Role] = field(default_factory=list)
@@ -67,12 +68,11 @@ class PolicySelection:
 
     def end_episode(self, env: int) -> Decision | None:
         """The episode of ``env`` has ended: what its return decides, if anything."""
-        role = self.roles[env]
-        episode_return = self.running[env]
-        self.running[env] = 0.0
-        self.roles[env] = "actor"
+        role, episode_return = self.roles[env], self.running[env]
+        self.roles[env], self.running[env] = "actor", 0.0
         self.worst = episode_return if self.worst is None else min(self.worst, episode_return)
         if role == "actor":
+            self.exploration_returns = [*self.exploration_returns, episode_return][-self.budget :]
             return None
         if role == "incumbent":
             self.incumbent_returns.append(episode_return)
@@ -81,20 +81,18 @@ class PolicySelection:
         return self._decide()
 
     def begin_episode(self, env: int, actor_differs: bool) -> bool:
-        """
-        Choose who plays the next episode of ``env``.
-
-        :param env: which environment
-        :param actor_differs: whether the actor has learned since it was last copied
-        :return: whether a new challenger begins: the caller then copies the average
-        """
+        """Choose who plays the next episode of ``env``; ``actor_differs`` where the actor has learned since the last copy.
+        True where a new challenger begins: the caller then copies the average."""
         if self.evaluation_steps > self.share * self.steps:
             return False
         n_incumbent = len(self.incumbent_returns)
+        if actor_differs and self.has_challenger and self._is_outdated():
+            self.has_challenger = False
+            self.n_rejected += 1
         begins = actor_differs and not self.has_challenger and n_incumbent >= self.n_needed
         if begins:
             self.has_challenger = True
-            self.challenger_returns = []
+            self.challenger_returns, self.exploration_returns = [], []
             # running episodes of the one before count for nobody
             self.roles = ["actor" if role == "challenger" else role for role in self.roles]
         # steps that the incumbent does not need are saved for the challenger
@@ -105,11 +103,20 @@ class PolicySelection:
             self.roles[env] = "incumbent"
         return begins
 
+    def _is_outdated(self) -> bool:
+        """Whether as many exploration episodes, which noise makes no better, have a clearly higher mean return."""
+        tried = self.challenger_returns
+        newest = self.exploration_returns[-max(len(tried), self.min_episodes) :]
+        return bool(tried) and len(newest) >= self.min_episodes and self._exceed(newest, tried)
+
+    def _exceed(self, ours: list[float], theirs: list[float]) -> bool:
+        gain, error = compare(ours, theirs, self.worst)
+        return gain > self.promote * (self.budget / len(ours)) ** 0.5 * error
+
     def _decide(self) -> Decision | None:
         n_episodes = len(self.challenger_returns)
         if self.has_challenger and n_episodes >= self.min_episodes:
-            gain, error = compare(self.challenger_returns, self.incumbent_returns, self.worst)
-            if gain > self.promote * (self.budget / n_episodes) ** 0.5 * error:
+            if self._exceed(self.challenger_returns, self.incumbent_returns):
                 return self._promote()
             loss, error = compare(self.incumbent_returns, self.challenger_returns)
             if loss > self.reject * error or n_episodes >= self.budget:
@@ -120,8 +127,7 @@ class PolicySelection:
         if self.previous_returns and len(self.incumbent_returns) >= self.min_episodes:
             loss, error = compare(self.previous_returns, self.incumbent_returns)
             if loss > self.reject * error:
-                self.incumbent_returns = self.previous_returns
-                self.previous_returns = []
+                self.incumbent_returns, self.previous_returns = self.previous_returns, []
                 self.has_challenger = False
                 self.roles = ["actor"] * self.n_envs  # running evaluation episodes count for nobody
                 self.n_rolled_back += 1
@@ -129,11 +135,9 @@ class PolicySelection:
         return None
 
     def _promote(self) -> Decision:
-        self.previous_returns = self.incumbent_returns
-        self.incumbent_returns = self.challenger_returns
         self.n_needed = min(2 * len(self.challenger_returns), self.budget)
-        self.challenger_returns = []
-        self.has_challenger = False
+        self.previous_returns, self.incumbent_returns = self.incumbent_returns, self.challenger_returns
+        self.has_challenger, self.challenger_returns = False, []
         # episodes of the old incumbent that are still running count for nobody
         self.roles = ["actor" if role == "incumbent" else role for role in self.roles]
         self.n_promoted += 1
@@ -145,14 +149,8 @@ class PolicySelection:
 
 
 def compare(ours: list[float], theirs: list[float], worst: float | None = None) -> tuple[float, float]:
-    """
-    Difference of mean returns and its standard error.
-
-    :param ours: returns of one policy, at least one
-    :param theirs: returns of the other, at least one
-    :param worst: return of a pseudo-episode that both samples get: a policy with few episodes may not have failed yet; or None
-    :return: mean(ours) - mean(theirs), and the standard error from the pooled variance
-    """
+    """mean(ours) - mean(theirs) of at least one return each, and its standard error from the pooled variance. Both samples get
+    a pseudo-episode of the return ``worst``: a policy with few episodes may not have failed yet."""
     pseudo = [] if worst is None else [worst]
     samples = [[*ours, *pseudo], [*theirs, *pseudo]]
     means = [fmean(sample) for sample in samples]

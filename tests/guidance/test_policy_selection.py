@@ -57,6 +57,29 @@ def test_a_policy_that_fails_in_one_of_three_episodes_seldom_replaces_one_that_n
     assert rate(noisy(100.0, 1.0), risky) < 0.15
 
 
+def play(selection: PolicySelection, returns: dict[str, float], actor_differs: bool) -> bool:
+    """One episode; whether a challenger is copied after it."""
+    selection.step(0, returns[selection.roles[0]])
+    selection.end_episode(0)
+    return selection.begin_episode(0, actor_differs)
+
+
+@pytest.mark.parametrize(
+    ("of_actor", "differs", "is_replaced"), [(90.0, True, True), (90.0, False, False), (31.0, True, False)]
+)
+def test_a_challenger_that_the_actor_has_left_behind_makes_room(of_actor, differs, is_replaced):
+    """Incumbent and challenger are alike, so that no test decides between them."""
+    selection, copies = PolicySelection(1, share=1.0), 0
+    worst = {"actor": 0.0, "incumbent": 30.0, "challenger": 30.0}
+    while not selection.has_challenger:
+        copies += play(selection, worst, True)
+    selection.share = 0.5
+    for _ in range(12):
+        copies += play(selection, {"actor": of_actor, "incumbent": 30.0, "challenger": 30.0}, differs)
+    assert (copies > 1) == is_replaced
+    assert selection.n_promoted == 0
+
+
 def test_evaluation_takes_a_quarter_of_the_steps_at_most():
     game = Game(0, noisy(100.0, 10.0), noisy(100.0, 10.0))
     game.play(20_000)
