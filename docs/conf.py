@@ -18,7 +18,7 @@ copyright = author
 version = release = __version__
 
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.viewcode"]
-exclude_patterns = ["_build", "jupyter_execute", ".jupyter_cache"]
+exclude_patterns = ["_build", "jupyter_execute", ".jupyter_cache", "sb3_projects.rst"]
 html_theme = "furo"
 html_title = "sb3_actpc"
 html_static_path = ["_static"]
