@@ -87,8 +87,10 @@ class ActPCBase(LearnsFromDemonstrations, Persistent):
 
     @property
     def actor_policy(self) -> ActPCActor:
-        """The policy that learns, for ``evaluate_policy(agent.actor_policy, env)``; ``predict`` uses the deployed one."""
-        return self.actor.ungated()
+        """What the deployment gate may deploy next, the actor's moving average (without a gate, the actor itself), for
+        ``evaluate_policy(agent.actor_policy, env)``; ``predict`` uses the deployed policy."""
+        circuits = self.policy.selection_circuits()
+        return self.actor.with_circuit(self.actor.circuit if circuits is None else circuits["average"])
 
     @property
     def inputs(self) -> CircuitInputs:

@@ -153,10 +153,10 @@ class ActPCActor(BasePolicy):
         """The circuit that acts: the deployed one where there is a deployment gate."""
         return self.circuit if self.deployed is None else self.deployed
 
-    def ungated(self) -> "ActPCActor":
-        """The policy that learns, which acts in training: another view of the same circuits, without the deployment gate."""
+    def with_circuit(self, circuit: NGCCircuit) -> "ActPCActor":
+        """A view of this policy in which an equal ``circuit`` acts, without a deployment gate."""
         view = copy.copy(self)
-        view._modules = self._modules.copy()
+        view._modules = {**self._modules, "circuit": circuit}
         view.deployed = None
         return view
 

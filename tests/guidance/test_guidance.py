@@ -100,16 +100,22 @@ def test_predict_uses_the_deployed_policy_and_evaluation_episodes_have_no_noise(
     assert np.allclose(model.policy.scale_action(model.predict(observations)[0]), deployed, atol=1e-6)
 
 
-def test_the_actor_policy_is_the_one_that_learns():
-    model = imitating()
+@pytest.mark.parametrize("gate", [True, False])
+def test_the_actor_policy_is_the_moving_average_and_without_a_gate_the_actor(gate):
+    model = imitating(guidance_kwargs={"bc_updates": 5, "critic_warmup": 10, "averaging_rate": 0.5, "gate": gate})
     model.learn(60)
     observations = np.random.default_rng(0).normal(size=(8, 3)).astype(np.float32)
     with th.no_grad():
         features = model.actor.features(model.actor.obs_to_tensor(observations)[0])
         learned = model.policy.unscale_action(model.actor.circuit.project(features).numpy())
-    assert np.allclose(model.actor_policy.predict(observations)[0], learned, atol=1e-6)
-    assert not np.allclose(model.predict(observations)[0], learned, atol=1e-6)  # nothing was promoted
-    assert model.actor.deployed is not None  # the view took nothing away
+        average = learned
+        if gate:
+            average = model.policy.unscale_action(model.policy.selection["average"].project(features).numpy())
+    assert np.allclose(model.actor_policy.predict(observations)[0], average, atol=1e-6)
+    assert np.allclose(average, learned, atol=0.2)
+    assert np.allclose(average, learned, atol=1e-6) == (not gate)
+    assert np.allclose(model.predict(observations)[0], average, atol=1e-6) == (not gate)  # nothing was promoted
+    assert (model.actor.deployed is not None) == gate  # the view took nothing away
 
 
 def test_guidance_none_has_no_deployed_policy_and_no_bc():

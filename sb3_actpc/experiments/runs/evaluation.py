@@ -163,7 +163,7 @@ class EvaluationCallback(CsvCallback):
     ``model.zip`` (written under another name and renamed, so that a stopped run leaves a whole one), where the agent of the
     best evaluation is to be kept only when no dense return before was higher. ``seconds`` are those
     since :meth:`begin`, the evaluations' own (``evaluation_seconds``) among them; ``updates`` are the agent's. Where the
-    deployed policy is not the one that learns (ActPC with its gate), the columns ``OF_ACTOR`` are of the latter.
+    deployed policy is not the one that learns (ActPC with its gate), the columns ``OF_ACTOR`` are of its moving average.
 
     :param envs: environments that only this callback uses, closed by their owner
     :param eval_freq: environment steps between two evaluations, of ``eval_episodes`` each; their first episode is of ``seed``
@@ -287,7 +287,7 @@ class EvaluationCallback(CsvCallback):
         self.report(f"step {self.num_timesteps:>8}  {' '.join(shown)}")
 
     def _evaluate_actor(self, n_episodes: int) -> dict[str, float | None]:
-        """The columns ``OF_ACTOR``; none where the policy that learns is the one deployed."""
+        """The columns ``OF_ACTOR``; none without a deployment gate."""
         agent: Any = self.model
         if getattr(getattr(agent, "actor", None), "deployed", None) is None:
             return {}
