@@ -112,7 +112,7 @@ class Locomotion:
     """Returns count steps beyond a line that takes 150 steps to reach; one episode in ten stops early."""
 
     learns_from: int = 1500
-    noise: float = 0.0
+    noise: float = 0.1
 
     def play(self, rng: random.Random, player: Player) -> tuple[float, int]:
         if rng.random() < player.chance:
@@ -182,9 +182,11 @@ def last_deployed(
         if selection.roles[0] != "actor":
             selection.evaluation_steps += length
         steps += length
-        decision = selection.end_episode(0)
+        decision = selection.end_episode(0, steps > max(kind.learns_from, copied_at) + 1000)
         if decision == "promoted":
             previous, deployed = deployed, challenger
+        elif decision == "overtaken":
+            previous, deployed, copied_at = deployed, curve(steps, deployed), steps
         elif decision == "rolled back":
             deployed = previous
         if selection.begin_episode(0, steps > max(kind.learns_from, copied_at) + 1000):

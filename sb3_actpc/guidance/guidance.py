@@ -36,7 +36,7 @@ class GuidanceConfig:
     weighting: Literal["returns", "uniform"] = "returns"
     gate: bool = True
     evaluation_share: float = 0.25
-    averaging_rate: float = 0.001
+    averaging_rate: float = 0.005
     challenger_interval: int = 4000
 
     def __post_init__(self) -> None:
@@ -86,11 +86,11 @@ class BehaviorGuidance(ActorGuidance):
             copy_circuit(context.actor, circuit)
 
     def acting_circuits(self, context: GuidanceContext) -> list[NGCCircuit]:
-        """The actor explores; incumbent and challenger play their evaluation episodes."""
+        """The actor's average explores; incumbent and challenger play their evaluation episodes."""
         if self.selection is None or context.selection_circuits is None:
             return [context.actor] * context.n_envs
         circuits = context.selection_circuits
-        players = {"actor": context.actor, "incumbent": circuits["deployed"], "challenger": circuits["challenger"]}
+        players = {"actor": circuits["average"], "incumbent": circuits["deployed"], "challenger": circuits["challenger"]}
         return [players[role] for role in self.selection.roles]
 
     def explores(self, env: int) -> bool:
@@ -106,10 +106,13 @@ class BehaviorGuidance(ActorGuidance):
             selection.step(env, float(rewards[env]))
             if not dones[env]:
                 continue
-            decision = selection.end_episode(env)
-            if decision == "promoted":
+            actor_differs = n_updates > self.copied_at + self.config.challenger_interval
+            decision = selection.end_episode(env, actor_differs)
+            if decision in ("promoted", "overtaken"):
                 copy_circuit(circuits["deployed"], circuits["previous"])
-                copy_circuit(circuits["challenger"], circuits["deployed"])
+                copy_circuit(circuits["challenger" if decision == "promoted" else "average"], circuits["deployed"])
+            if decision == "overtaken":
+                self.copied_at = n_updates
             elif decision == "rolled back":
                 copy_circuit(circuits["previous"], circuits["deployed"])
             actor_differs = n_updates > self.copied_at + self.config.challenger_interval

@@ -1,17 +1,19 @@
 """The deployment gate: which policy ``predict`` uses, decided by evaluation episodes without noise during learning.
 
-An *incumbent* is deployed. A *challenger*, a frozen copy of the actor's moving average, plays evaluation episodes until it has
-as many as the incumbent; then both take turns. A group sequential test on the difference of mean returns promotes or rejects
-the challenger; its threshold falls with the number of episodes (O'Brien and Fleming, Biometrics 1979). A challenger far below
-the actor's exploration episodes makes room for a new copy. An incumbent that is worse than the one before is rolled back.
+An *incumbent* is deployed. The actor's moving average explores. A *challenger*, a frozen copy of it, plays evaluation episodes
+until it has as many as the incumbent; then both take turns. A group sequential test on the difference of mean returns promotes
+or rejects the challenger; its threshold falls with the number of episodes (O'Brien and Fleming, Biometrics 1979). The average
+is deployed at once where its exploration episodes, which noise makes no better, pass the same test. An incumbent that is worse
+than the one before is rolled back.
 """
 
+import math
 from dataclasses import asdict, dataclass, field
 from statistics import fmean
 from typing import Any, Literal
 
 Role = Literal["actor", "challenger", "incumbent"]
-Decision = Literal["promoted", "rejected", "rolled back"]
+Decision = Literal["promoted", "overtaken", "rejected", "rolled back"]
 
 
 @dataclass
@@ -40,8 +42,8 @@ class PolicySelection:
     incumbent_returns: list[float] = field(default_factory=list)
     challenger_returns: list[float] = field(default_factory=list)
     previous_returns: list[float] = field(default_factory=list)
-    exploration_returns: list[float] = field(default_factory=list)  # of the actor, since the challenger was copied
-    worst: float | None = None  # return of any episode, exploration episodes included
+    exploration_returns: list[float] = field(default_factory=list)  # of the average, since the last copy
+    worst: float = math.inf  # return of any episode, exploration episodes included
     n_needed: int = 0  # returns of the incumbent before the next challenger begins: a lucky promotion shows in further ones
     roles: list[Role] = field(default_factory=list)
     running: list[float] = field(default_factory=list)
@@ -66,14 +68,15 @@ class PolicySelection:
         if self.roles[env] != "actor":
             self.evaluation_steps += 1
 
-    def end_episode(self, env: int) -> Decision | None:
-        """The episode of ``env`` has ended: what its return decides, if anything."""
+    def end_episode(self, env: int, actor_differs: bool) -> Decision | None:
+        """The episode of ``env`` has ended: what its return decides, if anything. See :meth:`begin_episode`."""
         role, episode_return = self.roles[env], self.running[env]
         self.roles[env], self.running[env] = "actor", 0.0
-        self.worst = episode_return if self.worst is None else min(self.worst, episode_return)
-        if role == "actor":
-            self.exploration_returns = [*self.exploration_returns, episode_return][-self.budget :]
+        if math.isnan(episode_return):
             return None
+        self.worst = min(self.worst, episode_return)
+        if role == "actor":
+            return self._explored(episode_return) if actor_differs else None
         if role == "incumbent":
             self.incumbent_returns.append(episode_return)
         elif self.has_challenger:
@@ -86,15 +89,10 @@ class PolicySelection:
         if self.evaluation_steps > self.share * self.steps:
             return False
         n_incumbent = len(self.incumbent_returns)
-        if actor_differs and self.has_challenger and self._is_outdated():
-            self.has_challenger = False
-            self.n_rejected += 1
         begins = actor_differs and not self.has_challenger and n_incumbent >= self.n_needed
         if begins:
-            self.has_challenger = True
-            self.challenger_returns, self.exploration_returns = [], []
-            # running episodes of the one before count for nobody
-            self.roles = ["actor" if role == "challenger" else role for role in self.roles]
+            self.has_challenger, self.challenger_returns, self.exploration_returns = True, [], []
+            self._cut("challenger")
         # steps that the incumbent does not need are saved for the challenger
         n_needed = self.budget if self.has_challenger else self.n_needed
         if self.has_challenger and (len(self.challenger_returns) <= n_incumbent or n_incumbent >= n_needed):
@@ -103,23 +101,32 @@ class PolicySelection:
             self.roles[env] = "incumbent"
         return begins
 
-    def _is_outdated(self) -> bool:
-        """Whether as many exploration episodes, which noise makes no better, have a clearly higher mean return."""
-        tried = self.challenger_returns
-        newest = self.exploration_returns[-max(len(tried), self.min_episodes) :]
-        return bool(tried) and len(newest) >= self.min_episodes and self._exceed(newest, tried)
+    def _cut(self, *roles: Role) -> None:
+        """Running episodes of policies that are replaced count for nobody."""
+        for env, role in enumerate(self.roles):
+            if role in roles:
+                self.roles[env], self.running[env] = "actor", math.nan
+
+    def _explored(self, episode_return: float) -> Decision | None:
+        self.exploration_returns = [*self.exploration_returns, episode_return][-self.budget :]
+        ours, theirs = self.exploration_returns, self.incumbent_returns
+        if min(len(ours), len(theirs)) < self.min_episodes or not self._exceed(ours, theirs):
+            return None
+        self._replace([])
+        return "overtaken"
 
     def _exceed(self, ours: list[float], theirs: list[float]) -> bool:
-        gain, error = compare(ours, theirs, self.worst)
+        """Ours get a pseudo-episode of the worst return: a policy with few episodes may not have failed yet."""
+        gain, error = compare([*ours, self.worst], theirs)
         return gain > self.promote * (self.budget / len(ours)) ** 0.5 * error
 
     def _decide(self) -> Decision | None:
-        n_episodes = len(self.challenger_returns)
-        if self.has_challenger and n_episodes >= self.min_episodes:
-            if self._exceed(self.challenger_returns, self.incumbent_returns):
-                return self._promote()
+        if self.has_challenger and len(self.challenger_returns) >= self.min_episodes:
+            if self._exceed(self.challenger_returns, [*self.incumbent_returns, self.worst]):
+                self._replace(self.challenger_returns)
+                return "promoted"
             loss, error = compare(self.incumbent_returns, self.challenger_returns)
-            if loss > self.reject * error or n_episodes >= self.budget:
+            if loss > self.reject * error or len(self.challenger_returns) >= self.budget:
                 self.has_challenger = False
                 self.n_needed = min(len(self.incumbent_returns) + 1, self.budget)
                 self.n_rejected += 1
@@ -129,32 +136,27 @@ class PolicySelection:
             if loss > self.reject * error:
                 self.incumbent_returns, self.previous_returns = self.previous_returns, []
                 self.has_challenger = False
-                self.roles = ["actor"] * self.n_envs  # running evaluation episodes count for nobody
+                self._cut("incumbent", "challenger")
                 self.n_rolled_back += 1
                 return "rolled back"
         return None
 
-    def _promote(self) -> Decision:
-        self.n_needed = min(2 * len(self.challenger_returns), self.budget)
-        self.previous_returns, self.incumbent_returns = self.incumbent_returns, self.challenger_returns
-        self.has_challenger, self.challenger_returns = False, []
-        # episodes of the old incumbent that are still running count for nobody
-        self.roles = ["actor" if role == "incumbent" else role for role in self.roles]
+    def _replace(self, returns: list[float]) -> None:
+        """The incumbent by a policy with these returns."""
+        self._cut("incumbent", "challenger")
+        self.n_needed = min(max(2 * len(returns), self.min_episodes), self.budget)
+        self.previous_returns, self.incumbent_returns = self.incumbent_returns, returns
+        self.has_challenger, self.challenger_returns, self.exploration_returns = False, [], []
         self.n_promoted += 1
-        return "promoted"
 
     def state_dict(self) -> dict[str, Any]:
         """All fields, as plain values."""
         return asdict(self)
 
 
-def compare(ours: list[float], theirs: list[float], worst: float | None = None) -> tuple[float, float]:
-    """mean(ours) - mean(theirs) of at least one return each, and its standard error from the pooled variance. Both samples get
-    a pseudo-episode of the return ``worst``: a policy with few episodes may not have failed yet."""
-    pseudo = [] if worst is None else [worst]
-    samples = [[*ours, *pseudo], [*theirs, *pseudo]]
-    means = [fmean(sample) for sample in samples]
-    squares = sum((one - mean) ** 2 for sample, mean in zip(samples, means, strict=True) for one in sample)
-    degrees = max(len(samples[0]) + len(samples[1]) - 2, 1)
-    error = (squares / degrees * (1 / len(samples[0]) + 1 / len(samples[1]))) ** 0.5
-    return means[0] - means[1], error
+def compare(ours: list[float], theirs: list[float]) -> tuple[float, float]:
+    """mean(ours) - mean(theirs) of at least one return each, and its standard error from the pooled variance."""
+    means = [fmean(ours), fmean(theirs)]
+    squares = sum((one - mean) ** 2 for sample, mean in zip((ours, theirs), means, strict=True) for one in sample)
+    degrees = max(len(ours) + len(theirs) - 2, 1)
+    return means[0] - means[1], (squares / degrees * (1 / len(ours) + 1 / len(theirs))) ** 0.5

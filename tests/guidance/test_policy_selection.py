@@ -25,7 +25,7 @@ class Game:
             episode_return = policy(self.rng)
             for _ in range(LENGTH):
                 self.selection.step(0, episode_return / LENGTH)
-            decision = self.selection.end_episode(0)
+            decision = self.selection.end_episode(0, actor_differs=True)
             if decision is not None:
                 self.decisions.append(decision)
             if decision == "promoted":
@@ -57,27 +57,32 @@ def test_a_policy_that_fails_in_one_of_three_episodes_seldom_replaces_one_that_n
     assert rate(noisy(100.0, 1.0), risky) < 0.15
 
 
-def play(selection: PolicySelection, returns: dict[str, float], actor_differs: bool) -> bool:
-    """One episode; whether a challenger is copied after it."""
-    selection.step(0, returns[selection.roles[0]])
-    selection.end_episode(0)
-    return selection.begin_episode(0, actor_differs)
+@pytest.mark.parametrize(("of_average", "differs", "expected"), [(90.0, True, 1), (90.0, False, 0), (31.0, True, 0)])
+def test_an_average_whose_exploration_episodes_are_far_better_is_deployed_at_once(of_average, differs, expected):
+    selection = PolicySelection(1)
+    returns = {"actor": 10.0, "incumbent": 30.0, "challenger": 30.0}
+    decisions = []
+    for n in range(60):
+        if n == 30:
+            returns["actor"] = of_average
+        selection.step(0, returns[selection.roles[0]])
+        decisions.append(selection.end_episode(0, differs and n >= 30))
+        selection.begin_episode(0, False)
+        if decisions[-1] == "overtaken":
+            returns["incumbent"] = returns["actor"]
+    assert decisions.count("overtaken") == selection.n_promoted == expected
 
 
-@pytest.mark.parametrize(
-    ("of_actor", "differs", "is_replaced"), [(90.0, True, True), (90.0, False, False), (31.0, True, False)]
-)
-def test_a_challenger_that_the_actor_has_left_behind_makes_room(of_actor, differs, is_replaced):
-    """Incumbent and challenger are alike, so that no test decides between them."""
-    selection, copies = PolicySelection(1, share=1.0), 0
-    worst = {"actor": 0.0, "incumbent": 30.0, "challenger": 30.0}
-    while not selection.has_challenger:
-        copies += play(selection, worst, True)
-    selection.share = 0.5
-    for _ in range(12):
-        copies += play(selection, {"actor": of_actor, "incumbent": 30.0, "challenger": 30.0}, differs)
-    assert (copies > 1) == is_replaced
-    assert selection.n_promoted == 0
+def test_running_episodes_of_a_replaced_policy_count_for_nobody():
+    """Of two environments the second plays the incumbent when the first deploys the average."""
+    selection = PolicySelection(2, incumbent_returns=[30.0, 31.0], exploration_returns=[90.0] * 4, worst=0.0)
+    selection.roles[1] = "incumbent"
+    selection.step(0, 91.0)
+    selection.step(1, -5.0)
+    assert selection.end_episode(0, True) == "overtaken"
+    selection.step(1, 1.0)
+    assert selection.end_episode(1, True) is None
+    assert (selection.worst, selection.incumbent_returns, selection.exploration_returns) == (0.0, [], [])
 
 
 def test_evaluation_takes_a_quarter_of_the_steps_at_most():
@@ -118,9 +123,9 @@ def test_equal_returns_of_zero_change_nothing():
     assert set(game.decisions) == {"rejected"}
 
 
-def test_the_comparison_adds_one_episode_at_the_worst_return_to_both():
-    gain, error = compare([4.0, 6.0], [2.0, 2.0], worst=2.0)
-    ours, theirs = np.array([4.0, 6.0, 2.0]), np.array([2.0, 2.0, 2.0])
+def test_the_comparison_has_a_pooled_standard_error():
+    ours, theirs = np.array([4.0, 6.0, 2.0]), np.array([2.0, 2.5, 2.0])
+    gain, error = compare(ours.tolist(), theirs.tolist())
     pooled = (ours.var(ddof=1) + theirs.var(ddof=1)) / 2
     assert gain == pytest.approx(ours.mean() - theirs.mean())
     assert error == pytest.approx(np.sqrt(pooled * 2 / 3))
@@ -141,6 +146,6 @@ def test_a_gate_that_is_stored_in_the_middle_goes_on_as_one_that_is_not():
 def test_a_rollback_ends_the_other_evaluation_episodes():
     selection = PolicySelection(2, previous_returns=[10.0, 10.0, 10.0], incumbent_returns=[0.0])
     selection.roles = ["incumbent", "incumbent"]
-    assert selection.end_episode(0) == "rolled back"
-    assert selection.end_episode(1) is None
+    assert selection.end_episode(0, True) == "rolled back"
+    assert selection.end_episode(1, True) is None
     assert selection.incumbent_returns == [10.0, 10.0, 10.0]
