@@ -23,9 +23,9 @@ class GuidanceConfig:
         arXiv 1709.10089)
     :param weighting: "returns" draws imitated steps by their episode's return to the power of four (reward-weighted
         regression, Peters and Schaal 2007), "uniform" as the paper does
-    :param gate: whether the deployed policy changes only after evaluation episodes; else the actor is deployed
+    :param gate: whether the deployed policy changes only after a test; else the actor explores and is deployed
     :param evaluation_share: largest share of environment steps in evaluation episodes
-    :param averaging_rate: step of the actor's moving average per update of the actor
+    :param averaging_rate: step of the actor's moving average per update of the actor, with the gate
     :param challenger_interval: updates before the average may be copied for evaluation, after the warm-up and after a copy
     :raises ValueError: for a value out of range
     """
@@ -106,19 +106,23 @@ class BehaviorGuidance(ActorGuidance):
             selection.step(env, float(rewards[env]))
             if not dones[env]:
                 continue
-            actor_differs = n_updates > self.copied_at + self.config.challenger_interval
-            decision = selection.end_episode(env, actor_differs)
+            decision = selection.end_episode(env, self._actor_differs(n_updates))
             if decision in ("promoted", "overtaken"):
                 copy_circuit(circuits["deployed"], circuits["previous"])
-                copy_circuit(circuits["challenger" if decision == "promoted" else "average"], circuits["deployed"])
-            if decision == "overtaken":
+            if decision == "promoted":
+                copy_circuit(circuits["challenger"], circuits["deployed"])
+            elif decision == "overtaken":
+                copy_circuit(circuits["average"], circuits["deployed"])
                 self.copied_at = n_updates
             elif decision == "rolled back":
                 copy_circuit(circuits["previous"], circuits["deployed"])
-            actor_differs = n_updates > self.copied_at + self.config.challenger_interval
-            if selection.begin_episode(env, actor_differs):
+            if selection.begin_episode(env, self._actor_differs(n_updates)):
                 copy_circuit(circuits["average"], circuits["challenger"])
                 self.copied_at = n_updates
+
+    def _actor_differs(self, n_updates: int) -> bool:
+        """Whether the actor has learned long enough since the last copy."""
+        return n_updates > self.copied_at + self.config.challenger_interval
 
     def on_reset(self) -> None:
         """Cut episodes have no return."""
