@@ -36,7 +36,7 @@ class GuidanceConfig:
     weighting: Literal["returns", "uniform"] = "returns"
     gate: bool = True
     evaluation_share: float = 0.25
-    averaging_rate: float = 0.005
+    averaging_rate: float = 0.002
     challenger_interval: int = 4000
 
     def __post_init__(self) -> None:
