@@ -54,7 +54,8 @@ def vec_env(kind="box", n_envs=1, is_truncated=True, monitor=True, vec=DummyVecE
         env = OneArray(kind, is_truncated)
         return Monitor(env) if monitor else env
 
-    env = vec([make for _ in range(n_envs)])
+    quick = {"start_method": "fork"} if vec is SubprocVecEnv else {}
+    env = vec([make for _ in range(n_envs)], **quick)
     if wrapper == "normalize":
         return VecNormalize(env, norm_reward=False, clip_obs=1e6)
     return VecMonitor(env) if wrapper == "monitor" else env
