@@ -4,9 +4,9 @@
     python benchmarks/trials.py --failure 500 --success 400 --runs 600
 
 Either an episode succeeds and has the return 1, or it fails; or the robot falls at a random time and gets a part of the full
-return. The actor follows a curve of environment steps; a challenger is the actor as it was when it was copied. Prints the
-deployed policy's mean return at the end: mean, and worst twentieth, over the runs. The first column is 1 for the first policy
-where episodes are falls, and the chance of a success elsewhere.
+return; or the return counts steps beyond a line. The actor follows a curve of environment steps; a challenger is the actor
+as it was when it was copied. Prints the deployed policy's mean return at the end: mean, and worst twentieth, over the runs.
+It is the chance of a success in the first table; in the others, 1 is the first policy's.
 """
 
 import argparse
@@ -175,11 +175,11 @@ def last_deployed(
     while steps < total:
         learner = curve(steps, deployed) if steps > kind.learns_from else actor[0]
         explores = learner._replace(chance=max(learner.chance - kind.noise, 0.0))
-        players = {"actor": explores, "incumbent": deployed, "challenger": challenger}
+        players = {"average": explores, "incumbent": deployed, "challenger": challenger}
         episode_return, length = kind.play(rng, players[selection.roles[0]])
         selection.running[0] = episode_return
         selection.steps += length
-        if selection.roles[0] != "actor":
+        if selection.roles[0] != "average":
             selection.evaluation_steps += length
         steps += length
         decision = selection.end_episode(0, steps > max(kind.learns_from, copied_at) + 1000)
@@ -217,7 +217,7 @@ def main() -> None:
     parser.add_argument("--set", nargs="*", default=[], help="settings of the gate, as budget=10")
     arguments = parser.parse_args()
     settings = {
-        name: float(value) if "." in value else int(value) for name, value in (one.split("=") for one in arguments.set)
+        name: int(value) if value.isdigit() else float(value) for name, value in (one.split("=") for one in arguments.set)
     }
     kind = Success(arguments.success, arguments.failure)
     print("| the actor | 50,000 steps | 100,000 steps |\n| --- | --- | --- |")

@@ -299,11 +299,12 @@ class ActPC(ActPCBase):
             replay_buffer.store_signals(*self.score_newest())
         self._last_obs = new_obs
         self._last_original_obs = next_observations
+        starts = self._rollout_starts
         self._rollout_starts = np.array(dones, dtype=bool)
         self._is_stepping = False
         # Guidance counts steps of policies, not random ones
         if self.num_timesteps >= self.learning_starts + self.n_envs:
-            self.actor_guidance.on_step(self._context(), rewards, dones, self._n_updates)
+            self.actor_guidance.on_step(self._context(starts), rewards, dones, self._n_updates)
         if self.expert is not None and np.any(dones):
             self.expert.check_scale(replay_buffer.rewards[: replay_buffer.size()])
         if ENDLESS in replay_buffer.running_lengths:
@@ -380,15 +381,15 @@ class ActPC(ActPCBase):
             self.actor_guidance.after_update(self._context())
 
     def q_filter(self, features: th.Tensor, actions: th.Tensor, memory: th.Tensor | None) -> th.Tensor:
-        """Imitated actions, (B, A); the actor's own, which have no error, where all critics value these more (Q-filter, Nair
-        et al., arXiv 1709.10089)."""
+        """Imitated actions, (B, A); the actor's own, which have no error (without a leak), where all critics value these more
+        (Q-filter, Nair et al., arXiv 1709.10089)."""
         own = self.actor.circuit.project(features, memory)
         pairs = [th.cat([features, either], dim=1) for either in (actions, own)]
         imitated_value, own_value = self.critic.project(th.cat(pairs)).mean(-1, keepdim=True).chunk(2, dim=-2)
         gain = imitated_value - own_value
         if self.policy.n_critics > 1:
             gain = gain.amax(0)
-        is_imitated = gain > 0
+        is_imitated = gain >= 0
         self.diagnostics.follow(imitated_share=lambda: is_imitated.float().mean())
         return th.where(is_imitated, actions, own)
 

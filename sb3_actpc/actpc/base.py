@@ -87,10 +87,9 @@ class ActPCBase(LearnsFromDemonstrations, Persistent):
 
     @property
     def actor_policy(self) -> ActPCActor:
-        """What the deployment gate may deploy next, the actor's moving average (without a gate, the actor itself), for
-        ``evaluate_policy(agent.actor_policy, env)``; ``predict`` uses the deployed policy."""
-        circuits = self.policy.selection_circuits()
-        return self.actor.with_circuit(self.actor.circuit if circuits is None else circuits["average"])
+        """What the deployment gate may deploy next: by default the actor's moving average, without a gate the actor itself.
+        For ``evaluate_policy(agent.actor_policy, env)``; ``predict`` uses the deployed policy."""
+        return self.actor.with_circuit(self.actor_guidance.candidate(self._context()))
 
     @property
     def inputs(self) -> CircuitInputs:
@@ -360,12 +359,13 @@ class ActPCBase(LearnsFromDemonstrations, Persistent):
         if reset_num_timesteps or self._last_obs is None:
             self._cut_running_episodes()
 
-    def _context(self) -> GuidanceContext:
+    def _context(self, episode_starts: np.ndarray | None = None) -> GuidanceContext:
         """What guidance may use of this agent."""
         return GuidanceContext(
             actor=self.actor.circuit,
             targets=[self.policy.actor_target],
             n_envs=self.n_envs,
+            episode_starts=np.zeros(self.n_envs, dtype=bool) if episode_starts is None else episode_starts,
             sample=self.sample_imitated if self.imitated_episodes() else None,
             selection_circuits=self.policy.selection_circuits(),
         )

@@ -21,6 +21,7 @@ class GuidanceContext:
     :param actor: the circuit that learns
     :param targets: circuits that start as copies of the actor (its target circuit)
     :param n_envs: environments
+    :param episode_starts: (n_envs,), in ``on_step`` whether the step was the first of its episode
     :param sample: draws a batch of so many imitated steps; None where there is nothing to imitate
     :param selection_circuits: "deployed", "average", "challenger" and "previous"; None without a deployment gate
     """
@@ -28,6 +29,7 @@ class GuidanceContext:
     actor: NGCCircuit
     targets: list[NGCCircuit]
     n_envs: int
+    episode_starts: np.ndarray
     sample: Callable[[int], ImitationBatch] | None
     selection_circuits: dict[str, NGCCircuit] | None
 
@@ -45,6 +47,10 @@ class ActorGuidance:
     def acting_circuits(self, context: GuidanceContext) -> list[NGCCircuit]:
         """The circuit that acts in each environment, n_envs of them."""
         return [context.actor] * context.n_envs
+
+    def candidate(self, context: GuidanceContext) -> NGCCircuit:
+        """What may be deployed next; ``actor_policy`` and the evaluations beside the deployed policy use it."""
+        return context.actor
 
     def explores(self, env: int) -> bool:
         """Whether the running episode of environment ``env`` has exploration noise."""

@@ -26,7 +26,7 @@ class GuidanceConfig:
     :param gate: whether the deployed policy changes only after a test; else the actor explores and is deployed
     :param evaluation_share: largest share of environment steps in evaluation episodes
     :param averaging_rate: step of the actor's moving average per update of the actor, with the gate
-    :param challenger_interval: updates before the average may be copied for evaluation, after the warm-up and after a copy
+    :param challenger_interval: updates after the warm-up, and after each copy, before the average may be copied
     :raises ValueError: for a value out of range
     """
 
@@ -72,7 +72,7 @@ class BehaviorGuidance(ActorGuidance):
         self.weighting = config.weighting
         self.has_gate = config.gate
         self.selection: PolicySelection | None = None
-        self.copied_at = config.critic_warmup  # update of the last challenger
+        self.copied_at = config.critic_warmup  # update of the last copy of the average
 
     def on_training_start(self, context: GuidanceContext, is_pretrained: bool) -> None:
         """BC pre-training, once."""
@@ -90,12 +90,16 @@ class BehaviorGuidance(ActorGuidance):
         if self.selection is None or context.selection_circuits is None:
             return [context.actor] * context.n_envs
         circuits = context.selection_circuits
-        players = {"actor": circuits["average"], "incumbent": circuits["deployed"], "challenger": circuits["challenger"]}
+        players = {"average": circuits["average"], "incumbent": circuits["deployed"], "challenger": circuits["challenger"]}
         return [players[role] for role in self.selection.roles]
 
     def explores(self, env: int) -> bool:
-        """Only the actor's episodes have noise."""
-        return self.selection is None or self.selection.roles[env] == "actor"
+        """Only episodes of the average have noise."""
+        return self.selection is None or self.selection.roles[env] == "average"
+
+    def candidate(self, context: GuidanceContext) -> NGCCircuit:
+        """The actor's moving average; without a gate the actor."""
+        return context.actor if context.selection_circuits is None else context.selection_circuits["average"]
 
     def on_step(self, context: GuidanceContext, rewards: np.ndarray, dones: np.ndarray, n_updates: int) -> None:
         """Evaluation episodes end, policies are promoted, rejected or rolled back, the next episodes begin."""
@@ -103,7 +107,7 @@ class BehaviorGuidance(ActorGuidance):
         if selection is None or circuits is None:
             return
         for env in range(context.n_envs):
-            selection.step(env, float(rewards[env]))
+            selection.step(env, float(rewards[env]), bool(context.episode_starts[env]))
             if not dones[env]:
                 continue
             decision = selection.end_episode(env, self._actor_differs(n_updates))

@@ -3,8 +3,8 @@
 An *incumbent* is deployed. The actor's moving average explores. A *challenger*, a frozen copy of it, plays evaluation episodes
 until it has as many as the incumbent; then both take turns. A group sequential test on the difference of mean returns promotes
 or rejects the challenger; its threshold falls with the number of episodes (O'Brien and Fleming, Biometrics 1979). The average
-is deployed at once where its exploration episodes, which noise makes no better, pass the same test. An incumbent that is worse
-than the one before is rolled back.
+is deployed at once where its exploration episodes are as clearly better: noise is taken to make them no better. An incumbent
+that is worse than the one before is rolled back.
 """
 
 import math
@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass, field
 from statistics import fmean
 from typing import Any, Literal
 
-Role = Literal["actor", "challenger", "incumbent"]
+Role = Literal["average", "challenger", "incumbent"]
 Decision = Literal["promoted", "overtaken", "rejected", "rolled back"]
 
 
@@ -42,7 +42,7 @@ class PolicySelection:
     incumbent_returns: list[float] = field(default_factory=list)
     challenger_returns: list[float] = field(default_factory=list)
     previous_returns: list[float] = field(default_factory=list)
-    exploration_returns: list[float] = field(default_factory=list)  # of the average, since the last copy
+    exploration_returns: list[float] = field(default_factory=list)  # the newest of the average, some time after the last copy
     worst: float = math.inf  # return of any episode, exploration episodes included
     n_needed: int = 0  # returns of the incumbent before the next challenger begins: a lucky promotion shows in further ones
     roles: list[Role] = field(default_factory=list)
@@ -58,24 +58,24 @@ class PolicySelection:
 
     def reset(self) -> None:
         """All running episodes are cut: exploration episodes begin."""
-        self.roles = ["actor"] * self.n_envs
-        self.running = [0.0] * self.n_envs
+        self.roles = ["average"] * self.n_envs
+        self.running = [math.nan] * self.n_envs  # a part of an episode has no return
 
-    def step(self, env: int, reward: float) -> None:
-        """One environment step of ``env`` with the task's reward."""
-        self.running[env] += reward
+    def step(self, env: int, reward: float, begins: bool) -> None:
+        """One environment step of ``env`` with the task's reward; ``begins`` with the first of an episode."""
+        self.running[env] = reward + (0.0 if begins else self.running[env])
         self.steps += 1
-        if self.roles[env] != "actor":
+        if self.roles[env] != "average":
             self.evaluation_steps += 1
 
     def end_episode(self, env: int, actor_differs: bool) -> Decision | None:
         """The episode of ``env`` has ended: what its return decides, if anything. See :meth:`begin_episode`."""
         role, episode_return = self.roles[env], self.running[env]
-        self.roles[env], self.running[env] = "actor", 0.0
+        self.roles[env], self.running[env] = "average", 0.0
         if math.isnan(episode_return):
             return None
         self.worst = min(self.worst, episode_return)
-        if role == "actor":
+        if role == "average":
             return self._explored(episode_return) if actor_differs else None
         if role == "incumbent":
             self.incumbent_returns.append(episode_return)
@@ -105,7 +105,7 @@ class PolicySelection:
         """Running episodes of policies that are replaced count for nobody."""
         for env, role in enumerate(self.roles):
             if role in roles:
-                self.roles[env], self.running[env] = "actor", math.nan
+                self.roles[env], self.running[env] = "average", math.nan
 
     def _explored(self, episode_return: float) -> Decision | None:
         self.exploration_returns = [*self.exploration_returns, episode_return][-self.budget :]
@@ -122,6 +122,7 @@ class PolicySelection:
 
     def _decide(self) -> Decision | None:
         if self.has_challenger and len(self.challenger_returns) >= self.min_episodes:
+            # as many episodes of both: the incumbent gets a pseudo-episode too
             if self._exceed(self.challenger_returns, [*self.incumbent_returns, self.worst]):
                 self._replace(self.challenger_returns)
                 return "promoted"

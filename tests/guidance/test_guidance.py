@@ -8,7 +8,8 @@ import torch as th
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_actpc import ActPC
-from sb3_actpc.guidance import ActorGuidance
+from sb3_actpc.guidance import ActorGuidance, BehaviorGuidance, GuidanceConfig, GuidanceContext
+from sb3_actpc.ngc import NGCCircuit
 from tests.actpc.agents import QUICK, differ, imitating, make, weights_of
 from tests.actpc.envs import CountingEnv, demonstrations
 
@@ -98,6 +99,69 @@ def test_predict_uses_the_deployed_policy_and_evaluation_episodes_have_no_noise(
         features = model.actor.features(model.actor.obs_to_tensor(observations)[0])
         deployed = model.actor.deployed.project(features).numpy()
     assert np.allclose(model.policy.scale_action(model.predict(observations)[0]), deployed, atol=1e-6)
+
+
+def gated(n_envs: int = 1) -> tuple[BehaviorGuidance, GuidanceContext]:
+    """A gate whose circuits all differ."""
+    actor, deployed, average, challenger, previous = (NGCCircuit(2, 1, [4]) for _ in range(5))
+    circuits = {"deployed": deployed, "average": average, "challenger": challenger, "previous": previous}
+    context = GuidanceContext(actor, [], n_envs, np.ones(n_envs, dtype=bool), None, circuits)
+    guidance = BehaviorGuidance(GuidanceConfig(critic_warmup=0, challenger_interval=0))
+    guidance.on_training_start(context, is_pretrained=True)
+    return guidance, context
+
+
+def test_the_average_explores_with_noise_and_evaluation_episodes_have_none():
+    guidance, context = gated(3)
+    guidance.selection.roles = ["average", "incumbent", "challenger"]
+    circuits = context.selection_circuits
+    expected = [circuits["average"], circuits["deployed"], circuits["challenger"]]
+    assert all(mine is theirs for mine, theirs in zip(guidance.acting_circuits(context), expected, strict=True))
+    assert [guidance.explores(env) for env in range(3)] == [True, False, False]
+
+
+def test_an_average_that_has_overtaken_the_incumbent_is_deployed():
+    guidance, context = gated()
+    guidance.selection.incumbent_returns = [1.0, 1.1]
+    guidance.selection.exploration_returns = [9.0] * 4
+    guidance.selection.worst = 0.0
+    before = {name: weights_of(circuit) for name, circuit in context.selection_circuits.items()}
+    guidance.on_step(context, np.array([9.0]), np.array([True]), n_updates=8)
+    after = {name: weights_of(circuit) for name, circuit in context.selection_circuits.items()}
+    assert guidance.selection.n_promoted == 1
+    assert not differ(after["deployed"], before["average"])
+    assert not differ(after["previous"], before["deployed"])
+    assert differ(before["average"], before["deployed"])
+    assert guidance.state_dict()["copied_at"] == 8
+
+
+def test_evaluations_beside_the_deployed_policy_are_of_what_the_gate_may_deploy():
+    class Own(ActorGuidance):
+        has_gate = True
+
+    model = make(demonstrations=demonstrations(), guidance=Own(), learning_starts=5).learn(30)
+    assert not differ(weights_of(model.actor_policy.circuit), weights_of(model.actor.circuit))
+
+
+def test_random_steps_and_the_rest_of_their_episode_count_for_nobody():
+    """Every step is rewarded, every episode has ten; random steps end within the second."""
+
+    class EveryStep(CountingEnv):
+        def step(self, action):
+            observation, _, *ends = super().step(action)
+            return observation, 1.0, *ends
+
+    model = imitating(
+        DummyVecEnv([lambda: EveryStep(lengths=(10,))]),
+        learning_starts=15,
+        guidance_kwargs={"critic_warmup": 0, "challenger_interval": 0, "bc_updates": 1},
+    )
+    counted = []
+    for n_steps in (25, 20, 20):
+        model.learn(n_steps, reset_num_timesteps=False)
+        selection = model.actor_guidance.selection
+        counted.append({*selection.incumbent_returns, *selection.exploration_returns, *selection.challenger_returns})
+    assert counted == [set(), {10.0}, {10.0}]
 
 
 @pytest.mark.parametrize("gate", [True, False])

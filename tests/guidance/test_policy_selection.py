@@ -21,10 +21,10 @@ class Game:
         candidate = self.challenger
         for _ in range(n_steps // LENGTH):
             role = self.selection.roles[0]
-            policy = {"incumbent": self.deployed, "challenger": candidate, "actor": lambda rng: 0.0}[role]
+            policy = {"incumbent": self.deployed, "challenger": candidate, "average": lambda rng: 0.0}[role]
             episode_return = policy(self.rng)
-            for _ in range(LENGTH):
-                self.selection.step(0, episode_return / LENGTH)
+            for step in range(LENGTH):
+                self.selection.step(0, episode_return / LENGTH, step == 0)
             decision = self.selection.end_episode(0, actor_differs=True)
             if decision is not None:
                 self.decisions.append(decision)
@@ -60,27 +60,37 @@ def test_a_policy_that_fails_in_one_of_three_episodes_seldom_replaces_one_that_n
 @pytest.mark.parametrize(("of_average", "differs", "expected"), [(90.0, True, 1), (90.0, False, 0), (31.0, True, 0)])
 def test_an_average_whose_exploration_episodes_are_far_better_is_deployed_at_once(of_average, differs, expected):
     selection = PolicySelection(1)
-    returns = {"actor": 10.0, "incumbent": 30.0, "challenger": 30.0}
+    returns = {"average": 10.0, "incumbent": 30.0, "challenger": 30.0}
     decisions = []
     for n in range(60):
         if n == 30:
-            returns["actor"] = of_average
-        selection.step(0, returns[selection.roles[0]])
+            returns["average"] = of_average
+        selection.step(0, returns[selection.roles[0]], True)
         decisions.append(selection.end_episode(0, differs and n >= 30))
         selection.begin_episode(0, False)
         if decisions[-1] == "overtaken":
-            returns["incumbent"] = returns["actor"]
+            returns["incumbent"] = returns["average"]
     assert decisions.count("overtaken") == selection.n_promoted == expected
+
+
+def test_a_part_of_an_episode_has_no_return():
+    selection = PolicySelection(1)
+    selection.step(0, 1.0, False)
+    assert selection.end_episode(0, True) is None
+    assert selection.exploration_returns == []
+    selection.step(0, 1.0, True)
+    selection.end_episode(0, True)
+    assert selection.exploration_returns == [1.0]
 
 
 def test_running_episodes_of_a_replaced_policy_count_for_nobody():
     """Of two environments the second plays the incumbent when the first deploys the average."""
     selection = PolicySelection(2, incumbent_returns=[30.0, 31.0], exploration_returns=[90.0] * 4, worst=0.0)
     selection.roles[1] = "incumbent"
-    selection.step(0, 91.0)
-    selection.step(1, -5.0)
+    selection.step(0, 91.0, True)
+    selection.step(1, -5.0, True)
     assert selection.end_episode(0, True) == "overtaken"
-    selection.step(1, 1.0)
+    selection.step(1, 1.0, False)
     assert selection.end_episode(1, True) is None
     assert (selection.worst, selection.incumbent_returns, selection.exploration_returns) == (0.0, [], [])
 
@@ -146,6 +156,8 @@ def test_a_gate_that_is_stored_in_the_middle_goes_on_as_one_that_is_not():
 def test_a_rollback_ends_the_other_evaluation_episodes():
     selection = PolicySelection(2, previous_returns=[10.0, 10.0, 10.0], incumbent_returns=[0.0])
     selection.roles = ["incumbent", "incumbent"]
+    for env in range(2):
+        selection.step(env, 0.0, True)
     assert selection.end_episode(0, True) == "rolled back"
     assert selection.end_episode(1, True) is None
     assert selection.incumbent_returns == [10.0, 10.0, 10.0]
