@@ -85,6 +85,18 @@ def test_actpc_with_dictionaries_of_observations(tmp_path: Path) -> None:
     check(make, tmp_path, 80, 41)
 
 
+@pytest.mark.parametrize("n_envs", [1, 2])
+@pytest.mark.parametrize("stop_at", [2, 60])
+def test_the_gate_goes_on_among_its_decisions(tmp_path: Path, n_envs: int, stop_at: int) -> None:
+    """Before the first episode has ended there is no worst return yet."""
+    settings = {"critic_warmup": 0, "challenger_interval": 0, "bc_updates": 5}
+    make = lambda: make_actpc(CountingEnv, n_envs, demonstrations=demonstrations(), guidance_kwargs=settings)  # noqa: E731
+    check(make, tmp_path, 240, stop_at)
+    model = learn_straight(make, tmp_path / "again", 240)
+    gate = model.actor_guidance.logs()
+    assert gate["policies_promoted"] + gate["policies_rejected"] > 0
+
+
 class ContinuousBitFlipping(BitFlippingEnv):
     """SB3's with a Box of actions, as ActPC and TD3 need."""
 
