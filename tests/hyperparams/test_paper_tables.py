@@ -38,6 +38,7 @@ RUNGS = {
     "guidance",
     "guidance_kwargs.bc_updates",
     "guidance_kwargs.critic_warmup",
+    "guidance_kwargs.q_filter",
     "guidance_kwargs.weighting",
 }
 
