@@ -271,7 +271,7 @@ class ActPCBase(LearnsFromDemonstrations, Persistent):
             self.policy.set_learning_rate(self.lr_schedule(1.0))
             seconds = 0.1 if sys.stderr.isatty() else 5.0  # between two drawings: a file or a notebook keeps them all
             updates: Iterable[int] = range(n_updates)
-            if progress_bar:
+            if progress_bar and n_updates > 0:
                 updates = import_extra("tqdm", "experiments").tqdm(updates, "prior", mininterval=seconds)
             for _ in updates:
                 before_update()
