@@ -544,3 +544,9 @@ def test_help_is_quick_and_lists_the_commands() -> None:
     assert result.returncode == 0
     for command in ("train", "evaluate", "demos"):
         assert command in result.stdout
+
+
+def test_a_pipe_that_is_closed_early_is_no_error() -> None:
+    command = f"{sys.executable} -m sb3_actpc list presets | true; echo ${{PIPESTATUS[0]}}"
+    done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, check=True)
+    assert (done.stdout.strip(), done.stderr) == ("0", "")
