@@ -115,6 +115,8 @@ class Locomotion:
     noise: float = 0.1
 
     def play(self, rng: random.Random, player: Player) -> tuple[float, int]:
+        if player.full < 0.0:  # noise sets it free
+            return (-player.full, LONGEST) if player.chance < STUCK else (0.0, LONGEST)
         if rng.random() < player.chance:
             episode_return = max(rng.gauss(player.full, player.deviation), 0.0)
         else:
@@ -122,7 +124,10 @@ class Locomotion:
         return episode_return, min(150 + int(episode_return), LONGEST)
 
     def mean(self, player: Player) -> float:
-        return player.full * (player.chance + 0.25 * (1.0 - player.chance))
+        return max(player.full, 0.0) * (player.chance + 0.25 * (1.0 - player.chance))
+
+
+STUCK = 0.85  # noise takes a tenth from a chance of 0.9
 
 
 def by_thousands(*returns: float) -> tuple[Player, Curve]:
@@ -136,6 +141,7 @@ UNSTEADY: dict[str, tuple[Player, Curve]] = {
     "308 to 710, with a drop at 6,000": by_thousands(308, 308, 237, 266, 351, 619, 105, 727, 710),
     "308 to 800, without": by_thousands(308, 308, 246, 207, 541, 844, 844, 500, 800),
     "308 to 800, with a drop at 7,000": by_thousands(308, 308, 260, 324, 316, 478, 850, 473, 570, 800),
+    "stuck at 0 without noise, from 5,000 on": by_thousands(308, 308, 308, 308, 308, -800),
     "stays at 308": by_thousands(308, 308, 300, 310, 300, 310),
     "falls from 308 to 200": by_thousands(308, 308, 240, 200, 240, 200),
 }
@@ -185,8 +191,6 @@ def last_deployed(
         decision = selection.end_episode(0, steps > max(kind.learns_from, copied_at) + 1000)
         if decision == "promoted":
             previous, deployed = deployed, challenger
-        elif decision == "overtaken":
-            previous, deployed, copied_at = deployed, curve(steps, deployed), steps
         elif decision == "rolled back":
             deployed = previous
         if selection.begin_episode(0, steps > max(kind.learns_from, copied_at) + 1000):

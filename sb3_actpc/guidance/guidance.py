@@ -111,13 +111,9 @@ class BehaviorGuidance(ActorGuidance):
             if not dones[env]:
                 continue
             decision = selection.end_episode(env, self._actor_differs(n_updates))
-            if decision in ("promoted", "overtaken"):
-                copy_circuit(circuits["deployed"], circuits["previous"])
             if decision == "promoted":
+                copy_circuit(circuits["deployed"], circuits["previous"])
                 copy_circuit(circuits["challenger"], circuits["deployed"])
-            elif decision == "overtaken":
-                copy_circuit(circuits["average"], circuits["deployed"])
-                self.copied_at = n_updates
             elif decision == "rolled back":
                 copy_circuit(circuits["previous"], circuits["deployed"])
             if selection.begin_episode(env, self._actor_differs(n_updates)):

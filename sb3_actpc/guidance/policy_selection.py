@@ -2,9 +2,9 @@
 
 An *incumbent* is deployed. The actor's moving average explores. A *challenger*, a frozen copy of it, plays evaluation episodes
 until it has as many as the incumbent; then both take turns. A group sequential test on the difference of mean returns promotes
-or rejects the challenger; its threshold falls with the number of episodes (O'Brien and Fleming, Biometrics 1979). The average
-is deployed at once where its exploration episodes are as clearly better: noise is taken to make them no better. An incumbent
-that is worse than the one before is rolled back.
+or rejects the challenger; its threshold falls with the number of episodes (O'Brien and Fleming, Biometrics 1979). Where
+exploration episodes of the average are as clearly better, it is copied at once, and one evaluation episode confirms it: without
+noise, the robot may be stuck. An incumbent that is worse than the one before is rolled back.
 """
 
 import math
@@ -13,7 +13,7 @@ from statistics import fmean
 from typing import Any, Literal
 
 Role = Literal["average", "challenger", "incumbent"]
-Decision = Literal["promoted", "overtaken", "rejected", "rolled back"]
+Decision = Literal["promoted", "rejected", "rolled back"]
 
 
 @dataclass
@@ -43,6 +43,7 @@ class PolicySelection:
     challenger_returns: list[float] = field(default_factory=list)
     previous_returns: list[float] = field(default_factory=list)
     exploration_returns: list[float] = field(default_factory=list)  # the newest of the average, some time after the last copy
+    support: list[float] = field(default_factory=list)  # exploration returns for which the challenger was copied at once
     worst: float = math.inf  # return of any episode, exploration episodes included
     n_needed: int = 0  # returns of the incumbent before the next challenger begins: a lucky promotion shows in further ones
     roles: list[Role] = field(default_factory=list)
@@ -76,7 +77,9 @@ class PolicySelection:
             return None
         self.worst = min(self.worst, episode_return)
         if role == "average":
-            return self._explored(episode_return) if actor_differs else None
+            if actor_differs:
+                self._explored(episode_return)
+            return None
         if role == "incumbent":
             self.incumbent_returns.append(episode_return)
         elif self.has_challenger:
@@ -89,7 +92,8 @@ class PolicySelection:
         if self.evaluation_steps > self.share * self.steps:
             return False
         n_incumbent = len(self.incumbent_returns)
-        begins = actor_differs and not self.has_challenger and n_incumbent >= self.n_needed
+        is_due = n_incumbent >= self.n_needed or bool(self.support)
+        begins = actor_differs and not self.has_challenger and is_due
         if begins:
             self.has_challenger, self.challenger_returns, self.exploration_returns = True, [], []
             self._cut("challenger")
@@ -107,13 +111,12 @@ class PolicySelection:
             if role in roles:
                 self.roles[env], self.running[env] = "average", math.nan
 
-    def _explored(self, episode_return: float) -> Decision | None:
+    def _explored(self, episode_return: float) -> None:
         self.exploration_returns = [*self.exploration_returns, episode_return][-self.budget :]
         ours, theirs = self.exploration_returns, self.incumbent_returns
-        if min(len(ours), len(theirs)) < self.min_episodes or not self._exceed(ours, theirs):
-            return None
-        self._replace([])
-        return "overtaken"
+        if min(len(ours), len(theirs)) >= self.min_episodes and not self.support and self._exceed(ours, theirs):
+            self.support = ours
+            self.has_challenger = False  # an older copy makes room
 
     def _exceed(self, ours: list[float], theirs: list[float]) -> bool:
         """Ours get a pseudo-episode of the worst return: a policy with few episodes may not have failed yet."""
@@ -121,34 +124,45 @@ class PolicySelection:
         return gain > self.promote * (self.budget / len(ours)) ** 0.5 * error
 
     def _decide(self) -> Decision | None:
+        if self.has_challenger and self.support and self.challenger_returns:
+            # one evaluation episode of a copy that exploration speaks for
+            ours = [*self.support, *self.challenger_returns]
+            self.support = []
+            is_confirmed = self.challenger_returns[0] > fmean(self.incumbent_returns)
+            if is_confirmed and self._exceed(ours, self.incumbent_returns):
+                return self._promote()
+            if not is_confirmed:
+                return self._reject()
         if self.has_challenger and len(self.challenger_returns) >= self.min_episodes:
             # as many episodes of both: the incumbent gets a pseudo-episode too
             if self._exceed(self.challenger_returns, [*self.incumbent_returns, self.worst]):
-                self._replace(self.challenger_returns)
-                return "promoted"
+                return self._promote()
             loss, error = compare(self.incumbent_returns, self.challenger_returns)
             if loss > self.reject * error or len(self.challenger_returns) >= self.budget:
-                self.has_challenger = False
                 self.n_needed = min(len(self.incumbent_returns) + 1, self.budget)
-                self.n_rejected += 1
-                return "rejected"
+                return self._reject()
         if self.previous_returns and len(self.incumbent_returns) >= self.min_episodes:
             loss, error = compare(self.previous_returns, self.incumbent_returns)
             if loss > self.reject * error:
                 self.incumbent_returns, self.previous_returns = self.previous_returns, []
-                self.has_challenger = False
+                self.has_challenger, self.support = False, []
                 self._cut("incumbent", "challenger")
                 self.n_rolled_back += 1
                 return "rolled back"
         return None
 
-    def _replace(self, returns: list[float]) -> None:
-        """The incumbent by a policy with these returns."""
+    def _promote(self) -> Decision:
         self._cut("incumbent", "challenger")
-        self.n_needed = min(max(2 * len(returns), self.min_episodes), self.budget)
-        self.previous_returns, self.incumbent_returns = self.incumbent_returns, returns
-        self.has_challenger, self.challenger_returns, self.exploration_returns = False, [], []
+        self.n_needed = min(max(2 * len(self.challenger_returns), self.min_episodes), self.budget)
+        self.previous_returns, self.incumbent_returns = self.incumbent_returns, self.challenger_returns
+        self.has_challenger, self.challenger_returns, self.exploration_returns, self.support = False, [], [], []
         self.n_promoted += 1
+        return "promoted"
+
+    def _reject(self) -> Decision:
+        self.has_challenger = False
+        self.n_rejected += 1
+        return "rejected"
 
     def state_dict(self) -> dict[str, Any]:
         """All fields, as plain values."""

@@ -57,20 +57,27 @@ def test_a_policy_that_fails_in_one_of_three_episodes_seldom_replaces_one_that_n
     assert rate(noisy(100.0, 1.0), risky) < 0.15
 
 
-@pytest.mark.parametrize(("of_average", "differs", "expected"), [(90.0, True, 1), (90.0, False, 0), (31.0, True, 0)])
-def test_an_average_whose_exploration_episodes_are_far_better_is_deployed_at_once(of_average, differs, expected):
-    selection = PolicySelection(1)
-    returns = {"average": 10.0, "incumbent": 30.0, "challenger": 30.0}
-    decisions = []
-    for n in range(60):
-        if n == 30:
-            returns["average"] = of_average
-        selection.step(0, returns[selection.roles[0]], True)
-        decisions.append(selection.end_episode(0, differs and n >= 30))
-        selection.begin_episode(0, False)
-        if decisions[-1] == "overtaken":
-            returns["incumbent"] = returns["average"]
-    assert decisions.count("overtaken") == selection.n_promoted == expected
+@pytest.mark.parametrize(
+    ("of_average", "of_copy", "differs", "expected"),
+    [(90.0, 80.0, True, "promoted"), (90.0, 20.0, True, "rejected"), (90.0, 80.0, False, None), (31.0, 31.0, True, None)],
+)
+def test_one_evaluation_episode_confirms_an_average_with_far_better_exploration_episodes(
+    of_average, of_copy, differs, expected
+):
+    """A robot that is stuck without noise (20 instead of 90) is not deployed."""
+    selection = PolicySelection(1, incumbent_returns=[30.0, 31.0], n_needed=20, worst=10.0, share=1.0)
+    for _ in range(4):
+        selection.step(0, of_average, True)
+        assert selection.end_episode(0, differs) is None
+    assert selection.begin_episode(0, differs) == (expected is not None)
+    if expected is None:
+        assert selection.roles == ["incumbent"]
+        return
+    assert selection.roles == ["challenger"]
+    selection.step(0, of_copy, True)
+    assert selection.end_episode(0, differs) == expected
+    assert (selection.n_promoted, selection.n_rejected) == (expected == "promoted", expected == "rejected")
+    assert selection.incumbent_returns == ([80.0] if expected == "promoted" else [30.0, 31.0])
 
 
 def test_a_part_of_an_episode_has_no_return():
@@ -84,15 +91,15 @@ def test_a_part_of_an_episode_has_no_return():
 
 
 def test_running_episodes_of_a_replaced_policy_count_for_nobody():
-    """Of two environments the second plays the incumbent when the first deploys the average."""
-    selection = PolicySelection(2, incumbent_returns=[30.0, 31.0], exploration_returns=[90.0] * 4, worst=0.0)
-    selection.roles[1] = "incumbent"
+    """Of two environments the second plays the incumbent when the first's challenger is promoted."""
+    selection = PolicySelection(2, incumbent_returns=[30.0, 31.0], challenger_returns=[90.0], has_challenger=True, worst=0.0)
+    selection.roles = ["challenger", "incumbent"]
     selection.step(0, 91.0, True)
     selection.step(1, -5.0, True)
-    assert selection.end_episode(0, True) == "overtaken"
+    assert selection.end_episode(0, True) == "promoted"
     selection.step(1, 1.0, False)
     assert selection.end_episode(1, True) is None
-    assert (selection.worst, selection.incumbent_returns, selection.exploration_returns) == (0.0, [], [])
+    assert (selection.worst, selection.incumbent_returns, selection.exploration_returns) == (0.0, [90.0, 91.0], [])
 
 
 def test_evaluation_takes_a_quarter_of_the_steps_at_most():
