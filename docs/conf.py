@@ -22,6 +22,7 @@ exclude_patterns = ["_build", "jupyter_execute", ".jupyter_cache", "sb3_projects
 html_theme = "furo"
 html_title = "sb3_actpc"
 html_static_path = ["_static"]
+html_css_files = ["narrow.css"]
 html_theme_options = {"navigation_with_keys": True}
 
 myst_enable_extensions = ["colon_fence", "deflist"]
