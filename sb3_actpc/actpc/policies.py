@@ -133,7 +133,7 @@ class ActPCActor(BasePolicy):
             n_memory=self.memory.size if self.memory else 0,
             **circuit_kwargs,
         )
-        self.deployed = copy.deepcopy(self.circuit) if is_gated else None
+        self.deployed = self.circuit.projection_copy() if is_gated else None
         self._warned_of_empty_memory = False
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
@@ -379,13 +379,13 @@ class ActPCPolicy(BasePolicy):
         self.generator = self._circuit("generator", n_features + n_actions, n_features, n_memory=n_memory)
         self.prior = self._circuit("prior", n_features, n_features, n_memory=n_memory)
         check_agreement(self.actor.circuit, self.critic)
-        self.actor_target = copy.deepcopy(self.actor.circuit)
-        self.critic_target = copy.deepcopy(self.critic)
+        self.actor_target = self.actor.circuit.projection_copy()
+        self.critic_target = self.critic.projection_copy()
         # what the demonstrations have taught, which goes where the synapses go; floats, as SB3 expects of parameters
         self.register_buffer("has_imitated", th.tensor(0.0))
         self.register_buffer("n_prior_updates", th.tensor(0.0))
         names = ("average", "challenger", "previous") if self.is_gated else ()
-        self.selection = nn.ModuleDict({name: copy.deepcopy(self.actor.circuit) for name in names})
+        self.selection = nn.ModuleDict({name: self.actor.circuit.projection_copy() for name in names})
         for name, circuit in self.named_circuits():
             circuit.optimizer = self._optimizer(name.partition(".")[0], circuit)
 

@@ -1,5 +1,6 @@
 """The neural generative coding (NGC) circuit: one stack of layers that predict, settle and learn by Hebbian changes."""
 
+import copy
 from collections.abc import Sequence
 from math import inf
 from numbers import Integral, Real
@@ -432,9 +433,26 @@ class NGCCircuit(nn.Module):
             for synapses in self._scaled_synapses():
                 bound_columns_(synapses, self.weight_bound)
 
+    def projection_copy(self) -> "NGCCircuit":
+        """An equal circuit that only projects: a target circuit or a deployed policy. It has no learned error synapses."""
+        twin = copy.deepcopy(self)
+        twin.feedback, twin.feedback_weights = "tied", nn.ParameterList()
+        twin._list_synapses()
+        return twin
+
     def move_towards(self, other: "NGCCircuit", share: float) -> None:
-        """Move all synapses by ``share`` (0 to 1) of the way towards those of an equal circuit (Polyak averaging)."""
-        mine, theirs = ([p for kind in circuit.synapses for p in kind] for circuit in (self, other))
+        """
+        Move the synapses by ``share`` (0 to 1) of the way towards those of an equal circuit (Polyak averaging).
+
+        :param other: the circuit; where this one is a :meth:`projection_copy`, its error synapses are left out
+        :param share: 1 copies them
+        """
+        mine: list[th.Tensor] = []
+        theirs: list[th.Tensor] = []
+        for own, others in zip(self.synapses, other.synapses, strict=True):
+            if own:
+                mine += own
+                theirs += others
         th._foreach_lerp_(mine, theirs, share)
 
     # ------------------------------------------------------------------ stability

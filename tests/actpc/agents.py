@@ -67,7 +67,8 @@ def make(env=None, n_envs=1, **keywords) -> ActPC:
 
 
 def weights_of(circuit) -> list[th.Tensor]:
-    return [p.clone() for p in circuit.parameters()]
+    """All but the error synapses, which a target circuit has not."""
+    return [p.clone() for name, p in circuit.named_parameters() if "feedback_weights" not in name]
 
 
 def differ(one, other) -> bool:

@@ -331,7 +331,7 @@ def test_targets_of_actor_and_critic_move_by_tau():
     before = [weights_of(target) for target, _ in pairs]
     model.update_targets()
     for olds, (target, circuit) in zip(before, pairs, strict=True):
-        for old, new, source in zip(olds, target.parameters(), circuit.parameters(), strict=True):
+        for old, new, source in zip(olds, weights_of(target), weights_of(circuit), strict=True):
             assert th.allclose(new, 0.75 * old + 0.25 * source, atol=1e-6)
 
 

@@ -214,3 +214,17 @@ def test_mirrored_error_synapses_carry_the_gradient_while_the_weights_change():
     mine, theirs = (c.hebbian_update(c.settle(x, target)).weights for c in (learned, tied))
     for one, other in zip(mine, theirs, strict=True):
         assert th.nn.functional.cosine_similarity(one.flatten(), other.flatten(), dim=0) > 0.9999
+
+
+@pytest.mark.parametrize("n_members", [0, 2])
+def test_a_projection_copy_projects_as_its_circuit_and_follows_it_without_error_synapses(n_members):
+    circuit = NGCCircuit(5, 3, [8, 7], feedback="learned", n_members=n_members)
+    copy = circuit.projection_copy()
+    x = th.randn(4, 5)
+    assert th.equal(copy.project(x), circuit.project(x))
+    assert not list(copy.feedback_weights) and list(circuit.feedback_weights)
+    for weights in (*circuit.weights, *circuit.biases):
+        weights.add_(th.randn_like(weights))
+    assert not th.equal(copy.project(x), circuit.project(x))
+    copy.move_towards(circuit, 1.0)
+    assert th.equal(copy.project(x), circuit.project(x))
