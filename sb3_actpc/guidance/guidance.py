@@ -1,6 +1,7 @@
 """The default guidance: BC pre-training, critic warm-up, return-weighted imitation and the deployment gate, as hooks."""
 
 from dataclasses import dataclass, fields
+from numbers import Integral, Real
 from typing import Any, Literal
 
 import numpy as np
@@ -24,7 +25,7 @@ class GuidanceConfig:
     :param weighting: "returns" draws imitated steps by their episode's return to the power of four (reward-weighted
         regression, Peters and Schaal 2007), "uniform" as the paper does
     :param gate: whether the deployed policy changes only after a test; else the actor explores and is deployed
-    :param evaluation_share: largest share of environment steps in evaluation episodes
+    :param evaluation_share: share of environment steps in evaluation episodes above which none begins
     :param averaging_rate: step of the actor's moving average per update of the actor, with the gate
     :param challenger_interval: updates after the warm-up, and after each copy, before the average may be copied
     :raises ValueError: for a value out of range
@@ -42,11 +43,11 @@ class GuidanceConfig:
     def __post_init__(self) -> None:
         for name in ("bc_updates", "critic_warmup", "challenger_interval"):
             value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int) or value < 0:
+            if isinstance(value, bool) or not isinstance(value, Integral) or value < 0:
                 raise ValueError(f"guidance_kwargs[{name!r}]={value!r} must be a whole number of at least 0")
         for name in ("evaluation_share", "averaging_rate"):
             value = getattr(self, name)
-            if not isinstance(value, (int, float)) or not 0.0 <= value <= 1.0:
+            if isinstance(value, bool) or not isinstance(value, Real) or not 0.0 <= float(value) <= 1.0:
                 raise ValueError(f"guidance_kwargs[{name!r}]={value!r} must be a number from 0 to 1")
         if self.weighting not in ("returns", "uniform"):
             raise ValueError(f"guidance_kwargs['weighting']={self.weighting!r} must be 'returns' or 'uniform'")
@@ -76,14 +77,16 @@ class BehaviorGuidance(ActorGuidance):
 
     def on_training_start(self, context: GuidanceContext, is_pretrained: bool) -> None:
         """BC pre-training, once."""
-        if self.has_gate and (self.selection is None or self.selection.n_envs != context.n_envs):
+        imitates = not is_pretrained and context.sample is not None and self.config.bc_updates > 0
+        # Returns of another policy, or of parts of episodes, say nothing of this one
+        if self.has_gate and (self.selection is None or self.selection.n_envs != context.n_envs or imitates):
             self.selection = PolicySelection(context.n_envs, self.config.evaluation_share)
-        if is_pretrained or context.sample is None or not self.config.bc_updates:
+        if not imitates or context.sample is None:
             return
         clone_behavior(context.actor, context.sample, self.config.bc_updates)
         copies = [*context.targets, *(context.selection_circuits or {}).values()]
         for circuit in copies:
-            copy_circuit(context.actor, circuit)
+            circuit.move_towards(context.actor, 1.0)
 
     def acting_circuits(self, context: GuidanceContext) -> list[NGCCircuit]:
         """The actor's average explores; incumbent and challenger play their evaluation episodes."""
@@ -112,12 +115,12 @@ class BehaviorGuidance(ActorGuidance):
                 continue
             decision = selection.end_episode(env, self._actor_differs(n_updates))
             if decision == "promoted":
-                copy_circuit(circuits["deployed"], circuits["previous"])
-                copy_circuit(circuits["challenger"], circuits["deployed"])
+                circuits["previous"].move_towards(circuits["deployed"], 1.0)
+                circuits["deployed"].move_towards(circuits["challenger"], 1.0)
             elif decision == "rolled back":
-                copy_circuit(circuits["previous"], circuits["deployed"])
+                circuits["deployed"].move_towards(circuits["previous"], 1.0)
             if selection.begin_episode(env, self._actor_differs(n_updates)):
-                copy_circuit(circuits["average"], circuits["challenger"])
+                circuits["challenger"].move_towards(circuits["average"], 1.0)
                 self.copied_at = n_updates
 
     def _actor_differs(self, n_updates: int) -> bool:
@@ -177,8 +180,3 @@ class BehaviorGuidance(ActorGuidance):
         stored = state["selection"]
         self.selection = None if stored is None else PolicySelection(**{**stored, "share": self.config.evaluation_share})
         self.copied_at = state["copied_at"]
-
-
-def copy_circuit(source: NGCCircuit, target: NGCCircuit) -> None:
-    """All synapses of ``source`` into ``target``."""
-    target.load_state_dict(source.state_dict())

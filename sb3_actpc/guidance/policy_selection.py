@@ -22,7 +22,7 @@ class PolicySelection:
     Who plays the next episode, and what follows from returns. Holds no circuits.
 
     :param n_envs: environments
-    :param share: largest share of environment steps in evaluation episodes
+    :param share: share of environment steps in evaluation episodes above which none begins
     :param promote: standard errors by which the challenger's mean return must exceed the incumbent's after ``budget``
         episodes; after n of them sqrt(budget / n) times as many
     :param reject: standard errors by which it, or a new incumbent that is rolled back, must fall short
@@ -89,7 +89,9 @@ class PolicySelection:
     def begin_episode(self, env: int, actor_differs: bool) -> bool:
         """Choose who plays the next episode of ``env``; ``actor_differs`` where the actor has learned since the last copy.
         True where a new challenger begins: the caller then copies the average."""
-        if self.evaluation_steps > self.share * self.steps:
+        # one at a time: of several that begin together, the short episodes would be counted first
+        is_busy = any(role != "average" for role in self.roles)
+        if is_busy or self.evaluation_steps > self.share * self.steps:
             return False
         n_incumbent = len(self.incumbent_returns)
         is_due = n_incumbent >= self.n_needed or bool(self.support)

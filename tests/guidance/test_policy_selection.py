@@ -168,3 +168,26 @@ def test_a_rollback_ends_the_other_evaluation_episodes():
     assert selection.end_episode(0, True) == "rolled back"
     assert selection.end_episode(1, True) is None
     assert selection.incumbent_returns == [10.0, 10.0, 10.0]
+
+
+@pytest.mark.parametrize("n_envs", [1, 8])
+def test_several_environments_promote_a_worse_policy_no_more_often_than_one(n_envs):
+    """Successes end after 50 steps, failures after 500: of episodes that begin together, successes would count first."""
+    chances = {"average": 0.4, "challenger": 0.4, "incumbent": 0.8}
+    promoted = []
+    for seed in range(60):
+        rng, selection, decision = np.random.default_rng(seed), PolicySelection(n_envs), None
+        left, returns = np.zeros(n_envs, dtype=int), np.zeros(n_envs)
+        while decision is None and selection.steps < 60_000:
+            for env in range(n_envs):
+                begins = left[env] == 0
+                if begins:
+                    returns[env] = rng.random() < chances[selection.roles[env]]
+                    left[env] = 50 if returns[env] else 500
+                left[env] -= 1
+                selection.step(env, returns[env] if left[env] == 0 else 0.0, begins)
+                if left[env] == 0 and decision is None:
+                    decision = selection.end_episode(env, True)
+                    selection.begin_episode(env, True)
+        promoted.append(decision == "promoted")
+    assert np.mean(promoted) < 0.25
