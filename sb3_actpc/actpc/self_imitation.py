@@ -180,9 +180,11 @@ class SelfImitationMemory:
 
 
 def is_by_return(parts: list[Episodes], weighting: Weighting) -> bool:
-    """Whether steps of the union of ``parts`` are drawn by returns: not where the first (the demonstrations) have none, as one
-    episode of the agent's own would end their imitation."""
-    return weighting == "returns" and bool(parts[0].cumulative_weights[-1] > 0.0)
+    """Whether steps of the union of ``parts`` are drawn by returns. Not if the first (the demonstrations) has no positive
+    return, as one episode of the agent's own would end their imitation. Not if it has a negative one: then the fourth power
+    depends on where the rewards have their zero."""
+    first = parts[0]
+    return weighting == "returns" and bool(first.cumulative_weights[-1] > 0.0) and bool(first.returns.min() >= 0.0)
 
 
 def sample_union(parts: list[Episodes], n: int, history: int = 0, weighting: Weighting = "uniform") -> ImitationSamples:

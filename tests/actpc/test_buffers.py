@@ -257,38 +257,45 @@ def test_a_task_that_pays_negative_rewards_alone_is_warned_of_once():
         assert not any(sparse.takes(5, 0.0) for _ in range(60))
 
 
-def paid_episodes(*paid: tuple[int, float]) -> Episodes:
+def episodes_of(*given: tuple[int, float]) -> Episodes:
     """An episode for each (length, return), its number as the observation."""
-    lengths, returns = zip(*paid, strict=True)
-    numbers = np.repeat(np.arange(len(paid), dtype=float), lengths)[:, None]
+    lengths, returns = zip(*given, strict=True)
+    numbers = np.repeat(np.arange(len(given), dtype=float), lengths)[:, None]
     starts = np.repeat(np.cumsum([0, *lengths[:-1]]), lengths)
     return Episodes(numbers, np.zeros((len(numbers), 1)), starts, np.repeat(returns, lengths))
 
 
 def test_the_union_is_drawn_uniformly():
-    parts = [paid_episodes((30, 5.0)), paid_episodes((0, 0.0), (10, 1.0))]
+    parts = [episodes_of((30, 5.0)), episodes_of((0, 0.0), (10, 1.0))]
     share = np.mean([sample_union(parts, 100).observations.mean() for _ in range(200)])
     assert share == pytest.approx(0.25, abs=0.02)
 
 
-def test_refresh_draws_a_step_by_what_its_episode_was_paid():
+def test_imitation_draws_a_step_by_the_return_of_its_episode():
     """p ∝ length * max(return, 0)^k, over the union of both parts."""
-    shown = paid_episodes((10, 1.0), (20, 2.0), (30, -3.0))
-    own = paid_episodes((0, 0.0), (0, 0.0), (0, 0.0), (5, 4.0), (7, 0.0))
+    shown = episodes_of((10, 1.0), (20, 2.0), (30, 0.0))
+    own = episodes_of((0, 0.0), (0, 0.0), (0, 0.0), (5, 4.0), (7, 0.0))
     drawn = sample_union([shown, own], 40_000, weighting="returns").observations[:, 0].astype(int)
     expected = np.array([10, 20 * 2.0**RETURN_EXPONENT, 0, 5 * 4.0**RETURN_EXPONENT, 0])
     assert np.bincount(drawn, minlength=5) / 40_000 == pytest.approx(expected / expected.sum(), abs=0.01)
 
 
-def test_an_own_episode_that_was_paid_does_not_end_the_imitation_of_unpaid_demonstrations():
-    shown, own = paid_episodes((30, 0.0)), paid_episodes((0, 0.0), (10, 0.01))
+def test_a_rewarded_own_episode_does_not_end_the_imitation_of_demonstrations_without_reward():
+    shown, own = episodes_of((30, 0.0)), episodes_of((0, 0.0), (10, 0.01))
     drawn = sample_union([shown, own], 20_000, weighting="returns").observations
     assert drawn.mean() == pytest.approx(0.25, abs=0.02)
 
 
-@pytest.mark.parametrize("unpaid", [0.0, -5.0])
-def test_where_nothing_was_paid_refresh_draws_uniformly(unpaid):
-    drawn = sample_union([paid_episodes((10, unpaid), (30, 2 * unpaid))], 20_000, weighting="returns").observations
+def test_with_a_negative_demonstrated_return_imitation_draws_uniformly():
+    """A constant added to the rewards would else change what is imitated."""
+    shown, own = episodes_of((10, 0.1), (30, -3.0)), episodes_of((0, 0.0), (0, 0.0), (40, 9.0))
+    drawn = sample_union([shown, own], 20_000, weighting="returns").observations[:, 0].astype(int)
+    assert np.bincount(drawn, minlength=3) / 20_000 == pytest.approx([0.125, 0.375, 0.5], abs=0.02)
+
+
+@pytest.mark.parametrize("low", [0.0, -5.0])
+def test_without_a_positive_return_imitation_draws_uniformly(low):
+    drawn = sample_union([episodes_of((10, low), (30, 2 * low))], 20_000, weighting="returns").observations
     assert drawn.mean() == pytest.approx(0.75, abs=0.02)
 
 
