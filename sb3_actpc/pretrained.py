@@ -132,6 +132,7 @@ def load_agent(path: Path, env: GymEnv | str, **keywords: Any) -> ActPC:
         raise ValueError(f"{path} does not fit its own settings: it is damaged or of another version")
     model.policy.load_state_dict({**state, **tensors})
     model.actor.circuit.mirror_feedback()
+    model.only_acts = True
     return model
 
 

@@ -237,6 +237,7 @@ class ActPC(ActPCBase):
         self._rollout_starts = np.ones(1, dtype=bool)  # (n_envs,), where an episode begins with the next step
         self._is_stepping = False  # between a choice of actions and the storage of what followed
         self._described = ""  # what ``learn`` has said
+        self.only_acts = False  # a bundled agent, whose critic is not trained
         if _init_setup_model:
             self._setup_model()
             check_own_learning_rates(self.policy.kwargs_of, self.lr_schedule(1.0))

@@ -74,6 +74,7 @@ class ActPCBase(LearnsFromDemonstrations, Persistent):
     _used_demonstrations: tuple[Any, ...]
     _described: str
     _is_stepping: bool
+    only_acts: bool
 
     @property
     def is_pretrained(self) -> bool:
@@ -237,6 +238,13 @@ class ActPCBase(LearnsFromDemonstrations, Persistent):
         """
         if isinstance(self.demonstrations, Path):  # which one system could not unpickle from another
             self.demonstrations = str(self.demonstrations)
+        if self.demonstrations is not None and self._used_demonstrations[0] is None and self.guidance == "none":
+            warnings.warn(
+                "demonstrations were set after the agent was made without: guidance='none' "
+                f"(no BC pre-training), n_steps={self.n_steps} and demonstration_fraction={self.demonstration_fraction:g} "
+                "stay. For the defaults with demonstrations, pass demonstrations= to the constructor",
+                stacklevel=5,
+            )
         now = self.demonstrations, self.n_demonstrations, self.n_demonstration_transitions
         if self.expert is None or any(mine is not used for mine, used in zip(now, self._used_demonstrations, strict=True)):
             self._setup_demonstrations()
@@ -310,6 +318,8 @@ class ActPCBase(LearnsFromDemonstrations, Persistent):
     ) -> SelfBase:
         """As in SB3, after BC pre-training (:meth:`pretrain`) where there are demonstrations; ValueError for a bad number of
         environment steps, and where something that was set since does not fit."""
+        if self.only_acts:
+            raise ValueError("a bundled agent comes without its critic and only acts: train a new agent, ActPC(...)")
         check_kind("total_timesteps", total_timesteps, float)
         Between(0)("total_timesteps", total_timesteps)
         try:
@@ -481,16 +491,25 @@ class ActPCBase(LearnsFromDemonstrations, Persistent):
 def make_guidance(given: ActorGuidance | str, settings: Settings | None) -> ActorGuidance:
     """:raises ValueError: for another name, or keywords that the guidance has not"""
     if isinstance(given, ActorGuidance):
+        if settings:
+            raise ValueError(f"guidance_kwargs={settings!r} are for guidance='default': set up the ActorGuidance itself")
         return given
     if given not in ("default", "none"):
         raise ValueError(f"guidance={given!r} must be None, 'default', 'none' or an ActorGuidance")
-    if given == "none":
-        return ActorGuidance()
     known = GuidanceConfig.names()
     for name in settings or {}:
         if name not in known:
             raise ValueError(f"guidance_kwargs has {name!r}{nearest(name, known)}; choose from {known}")
-    return BehaviorGuidance(GuidanceConfig(**(settings or {})))
+    config = GuidanceConfig(**(settings or {}))
+    if given == "default":
+        return BehaviorGuidance(config)
+    if settings:
+        warnings.warn(
+            f"guidance_kwargs={settings!r} have no effect without guidance, which is on with demonstrations= or "
+            "guidance='default'",
+            stacklevel=4,
+        )
+    return ActorGuidance()
 
 
 def has_progress_bar(callback: BaseCallback) -> bool:

@@ -39,7 +39,8 @@ class Diagnostics:
             if not all(bool(th.isfinite(parameter).all()) for parameter in circuit.parameters()):
                 raise ValueError(
                     f"{name}: synapses are not finite at step {step}; lower its learning rate, bound them with "
-                    "circuit_kwargs=dict(synaptic_scaling='column_norm', weight_bound=...), or normalise the observations"
+                    "policy_kwargs=dict(circuit_kwargs=dict(synaptic_scaling='column_norm', weight_bound=...)), or normalise "
+                    "the observations"
                 )
 
     def follow(self, **values: Any) -> None:

@@ -53,8 +53,11 @@ def record_episodes(
 
     For the other parameters see ``Demonstrations.record``.
     """
-    if isinstance(n_episodes, bool) or not isinstance(n_episodes, int | np.integer) or n_episodes < 1:
-        raise ValueError(f"n_episodes={n_episodes} must be at least 1, a whole number: give the number of episodes")
+    numbers: list[tuple[str, Any, int]] = [("n_episodes", n_episodes, 1), ("max_tries", max_tries, 1), ("seed", seed, 0)]
+    for name, value, least in numbers:
+        is_whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
+        if not (is_whole and value >= least) and (value is not None or name == "n_episodes"):
+            raise ValueError(f"{name}={value!r} must be at least {least}, a whole number")
     if not isinstance(env.action_space, spaces.Box):
         raise ValueError(f"demonstrations need a Box action space, found {env.action_space}")
     box_paths(env.observation_space)
