@@ -114,6 +114,11 @@ def test_what_cannot_be_played_is_said_in_one_line(
     assert message in capsys.readouterr().err
 
 
+def test_a_bundled_agent_does_not_learn():
+    with pytest.raises(ValueError, match="comes without its critic and only acts"):
+        load_pretrained(ENV_ID).learn(100)
+
+
 def test_keywords_for_learning_are_refused():
     with pytest.raises(ValueError, match="train a new agent"):
         load_pretrained("SparseReacher-v5", guidance="default")

@@ -286,7 +286,8 @@ class ActPCBase(LearnsFromDemonstrations, Persistent):
                 batch = expert.sample(batch_size, self.inputs, self.reward_weights, self.gamma)
                 self.instrumental.update(batch.features, batch.actions, batch.next_features, batch.memory)
                 self.policy.n_prior_updates.add_(1)
-        self.actor_guidance.on_training_start(self._context(), self.is_pretrained)
+        # BC is of demonstrations: an agent without does not imitate its own episodes first
+        self.actor_guidance.on_training_start(self._context(), self.is_pretrained or expert is None)
         if expert is not None:
             self.policy.has_imitated.fill_(1.0)
 

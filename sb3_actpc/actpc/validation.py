@@ -260,7 +260,10 @@ def named_file_errors(path: str | PathLike[str]) -> Iterator[None]:
     except RuntimeError as error:
         if "in state_dict" not in str(error):
             raise
-        raise ValueError(_OF_ANOTHER_VERSION.format(path=path, why="its policy has other parts")) from error
+        raise ValueError(
+            f"{path} holds a policy with other parts: leave out guidance=, guidance_kwargs= and policy_kwargs=, or load it "
+            "with the version of sb3_actpc that saved it"
+        ) from error
 
 
 def check_expert_rows(stored: int, present: int) -> None:

@@ -107,7 +107,8 @@ def load_weights(
     try:
         model.policy.load_state_dict(tensors)
     except RuntimeError as error:
-        raise ValueError(f"{path} does not fit its own settings: {' '.join(str(error).split())}") from error
+        hint = f"; leave out {', '.join(sorted(overrides))}" if overrides else ""
+        raise ValueError(f"{path} does not fit these settings{hint}: {' '.join(str(error).split())}") from error
     return model
 
 

@@ -155,7 +155,7 @@ def test_files_that_do_not_fit_are_refused(tmp_path: Path) -> None:
         ActPC.from_weights(path, "MountainCarContinuous-v0")
     with pytest.raises(ValueError, match="was saved without VecNormalize: wrap"):
         ActPC.from_weights(path, VecNormalize(make_vec_env(CountingEnv)))
-    with pytest.raises(ValueError, match="does not fit its own settings"):
+    with pytest.raises(ValueError, match="does not fit these settings"):
         ActPC.from_weights(path, make_vec_env(CountingEnv), policy_kwargs={"net_arch": [16, 16], "n_critics": 3})
     (tmp_path / "bad.safetensors").write_bytes(path.read_bytes()[:100])
     with pytest.raises(ValueError, match="not a file of save_weights"):

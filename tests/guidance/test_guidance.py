@@ -241,3 +241,37 @@ def test_wrong_guidance_keywords_are_named(wrong, named):
 def test_an_unknown_guidance_is_named():
     with pytest.raises(ValueError, match="guidance='best' must be None, 'default', 'none' or an ActorGuidance"):
         imitating(guidance="best", guidance_kwargs=None)
+
+
+def test_guidance_keywords_without_guidance_are_named():
+    with pytest.warns(UserWarning, match=r"guidance_kwargs=.*have no effect without guidance"):
+        make(guidance_kwargs={"gate": False})
+    with pytest.raises(ValueError, match="guidance_kwargs has 'gatee'"):
+        make(guidance_kwargs={"gatee": False})
+    with pytest.raises(ValueError, match="are for guidance='default'"):
+        make(guidance=ActorGuidance(), guidance_kwargs={"gate": False})
+
+
+def test_demonstrations_that_come_later_warn_of_what_stays():
+    model = make(learning_starts=5)
+    model.demonstrations = demonstrations()
+    with pytest.warns(UserWarning, match="demonstrations were set after the agent was made without"):
+        model.learn(10)
+
+
+def test_without_demonstrations_there_is_no_bc_of_own_episodes():
+    model = make(guidance="default", guidance_kwargs={"bc_updates": 500}, learning_starts=0)
+    model.learn(80)
+    assert model.imitated_episodes()
+    before = weights_of(model.actor.circuit)
+    model.pretrain()
+    assert not differ(before, weights_of(model.actor.circuit))
+
+
+def test_bc_of_a_trained_agent_begins_with_a_gate_without_returns():
+    model = make(guidance="default", guidance_kwargs={"bc_updates": 5}, learning_starts=0)
+    model.learn(80)
+    assert model.actor_guidance.selection.steps > 0
+    model.demonstrations = demonstrations()
+    model.learn(1, reset_num_timesteps=False)
+    assert model.actor_guidance.selection.steps <= 1
