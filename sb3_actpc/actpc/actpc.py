@@ -352,9 +352,10 @@ class ActPC(ActPCBase):
         imitation_weight = self.refresh_weight * self.actor_guidance.imitation_weight(self._n_updates)
         if imitation_weight and self.imitated_episodes():
             features, actions, memory = self.sample_imitated(len(batch.features))
+            chain = self.actor.circuit.chain(features, memory)
             if self.critic_weight and self.actor_guidance.filters_imitation(self._n_updates):
-                actions = self.q_filter(features, actions, memory)
-            state = self.actor.circuit.settle(features, actions, memory)
+                actions = self.q_filter(features, actions, chain.output)
+            state = self.actor.circuit.settle_chain(chain, actions)
             imitation = self.actor.circuit.hebbian_update(state).scale_(imitation_weight)
             self.diagnostics.settled("actor", state)
             self.diagnostics.change_norms("imitation", imitation)
@@ -381,10 +382,9 @@ class ActPC(ActPCBase):
             self.actor.circuit.apply_changes(total)
             self.actor_guidance.after_update(self._context())
 
-    def q_filter(self, features: th.Tensor, actions: th.Tensor, memory: th.Tensor | None) -> th.Tensor:
-        """Imitated actions, (B, A); the actor's own, which have no error (without a leak), where all critics value these more
-        (Q-filter, Nair et al., arXiv 1709.10089)."""
-        own = self.actor.circuit.project(features, memory)
+    def q_filter(self, features: th.Tensor, actions: th.Tensor, own: th.Tensor) -> th.Tensor:
+        """Imitated actions, (B, A); the actor's ``own``, which have no error (without a leak), where all critics value these
+        more (Q-filter, Nair et al., arXiv 1709.10089)."""
         pairs = [th.cat([features, either], dim=1) for either in (actions, own)]
         imitated_value, own_value = self.critic.project(th.cat(pairs)).mean(-1, keepdim=True).chunk(2, dim=-2)
         gain = imitated_value - own_value

@@ -276,7 +276,10 @@ class NGCCircuit(nn.Module):
         :return: latents, activations and errors of every layer
         :raises ValueError: as :meth:`project`, and for a target of another shape than the outputs'
         """
-        chain = self.chain(x, memory)
+        return self.settle_chain(self.chain(x, memory), target)
+
+    def settle_chain(self, chain: SettlingChain, target: th.Tensor) -> SettledState:
+        """:meth:`settle` for a :meth:`chain` that is projected already; ``target`` may depend on its output."""
         if self.n_members and target.dim() == 2:
             target = target.expand(self.n_members, -1, -1)
         chain.clamp_output(target)

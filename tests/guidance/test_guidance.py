@@ -47,7 +47,7 @@ def test_the_q_filter_imitates_unless_all_critics_value_the_own_action_more(n_cr
     features = th.as_tensor(rng.normal(size=(64, 3)), dtype=th.float32)
     actions = th.as_tensor(rng.uniform(-1, 1, size=(64, *model.action_space.shape)), dtype=th.float32)
     own = model.actor.circuit.project(features)
-    kept = model.q_filter(features, actions, None)
+    kept = model.q_filter(features, actions, own)
     is_imitated = (kept == actions).all(1)
     assert th.equal(kept[~is_imitated], own[~is_imitated])
     for row in range(len(features)):
