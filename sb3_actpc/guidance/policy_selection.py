@@ -116,7 +116,12 @@ class PolicySelection:
     def _explored(self, episode_return: float) -> None:
         self.exploration_returns = [*self.exploration_returns, episode_return][-self.budget :]
         ours, theirs = self.exploration_returns, self.incumbent_returns
-        if min(len(ours), len(theirs)) >= self.min_episodes and not self.support and self._exceed(ours, theirs):
+        if self.support or len(theirs) < self.min_episodes:
+            return
+        # one episode far beyond the incumbent's is enough, unless a challenger is under evaluation
+        is_free = not (self.has_challenger and self.challenger_returns)
+        is_far = is_free and episode_return > 2 * max(theirs) - min(theirs)
+        if is_far or (len(ours) >= self.min_episodes and self._exceed(ours, theirs)):
             self.support = ours
             self.has_challenger = False  # an older copy makes room
 
