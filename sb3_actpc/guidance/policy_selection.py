@@ -1,10 +1,11 @@
 """The deployment gate: which policy ``predict`` uses, decided by evaluation episodes without noise during learning.
 
-An *incumbent* is deployed. The actor's moving average explores. A *challenger*, a frozen copy of it, plays evaluation episodes
-until it has as many as the incumbent; then both take turns. A group sequential test on the difference of mean returns promotes
-or rejects the challenger; its threshold falls with the number of episodes (O'Brien and Fleming, Biometrics 1979). If exploration
-episodes of the average are as clearly better, or one is far beyond the incumbent's, the average is the next challenger, and one
-evaluation episode confirms it: it may be stuck without noise. An incumbent that is worse than the one before is rolled back.
+An *incumbent* is deployed. The actor's moving average explores. A *challenger*, a frozen copy of it, plays evaluation
+episodes until it has as many as the incumbent; then both take turns. A group sequential test on the difference of mean
+returns promotes or rejects the challenger; its threshold falls with the number of episodes (O'Brien and Fleming,
+Biometrics 1979). If exploration episodes of the average are as clearly better, or one is far beyond the incumbent's,
+the average is the next challenger, and one evaluation episode confirms it: it may be stuck without noise. An incumbent
+that is worse than the one before is rolled back.
 """
 
 import math
