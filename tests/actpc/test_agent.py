@@ -443,13 +443,13 @@ def test_every_circuit_learns_from_as_many_rows_as_train_was_asked_for(monkeypat
     own = {"net_arch": [16, 16], "generator_kwargs": {"batch_size": 5}}
     model = make(demonstrations=demonstrations(), policy_kwargs=own)
     model.learn(30)
-    sizes, settle = {}, NGCCircuit.settle
+    sizes, chain = {}, NGCCircuit.chain
 
     def counting(self, x, *rest):
         sizes[self] = len(x)
-        return settle(self, x, *rest)
+        return chain(self, x, *rest)
 
-    monkeypatch.setattr(NGCCircuit, "settle", counting)
+    monkeypatch.setattr(NGCCircuit, "chain", counting)
     model.train(1, 11)
     assert [sizes[circuit] for circuit in (model.actor.circuit, model.critic, model.generator)] == [11, 11, 5]
 
