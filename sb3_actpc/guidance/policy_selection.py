@@ -3,9 +3,9 @@
 An *incumbent* is deployed. The actor's moving average explores. A *challenger*, a frozen copy of it, plays evaluation
 episodes until it has as many as the incumbent; then both take turns. A group sequential test on the difference of mean
 returns promotes or rejects the challenger; its threshold falls with the number of episodes (O'Brien and Fleming,
-Biometrics 1979). If exploration episodes of the average are as clearly better, or one is far beyond the incumbent's,
-the average is the next challenger, and one evaluation episode confirms it: it may be stuck without noise. An incumbent
-that is worse than the one before is rolled back.
+Biometrics 1979). If exploration episodes of the average are as clearly better, the average is the next challenger, and
+one evaluation episode confirms it: it may be stuck without noise. An incumbent that is worse than the one before is
+rolled back.
 """
 
 import math
@@ -116,37 +116,27 @@ class PolicySelection:
 
     def _explored(self, episode_return: float) -> None:
         self.exploration_returns = [*self.exploration_returns, episode_return][-self.budget :]
-        ours, theirs = self.exploration_returns, self.incumbent_returns
-        if self.support or len(theirs) < self.min_episodes:
+        if self.support or min(len(self.exploration_returns), len(self.incumbent_returns)) < self.min_episodes:
             return
-        # one episode far beyond the incumbent's is enough, unless a challenger is under evaluation
-        is_free = not (self.has_challenger and self.challenger_returns)
-        is_far = is_free and episode_return > 2 * max(theirs) - min(theirs)
-        if is_far or (len(ours) >= self.min_episodes and self._exceed(ours, theirs)):
-            self.support = ours
+        if self._exceed(self.exploration_returns):
+            self.support = self.exploration_returns
             self.has_challenger = False  # an older copy makes room
 
-    def _exceed(self, ours: list[float], theirs: list[float]) -> bool:
-        """Ours get a pseudo-episode of the worst return: a policy with few episodes may not have failed yet."""
-        gain, error = compare([*ours, self.worst], theirs)
+    def _exceed(self, ours: list[float]) -> bool:
+        """Both get a pseudo-episode of the worst return: a policy with few episodes may not have failed yet."""
+        gain, error = compare([*ours, self.worst], [*self.incumbent_returns, self.worst])
         return gain > self.promote * (self.budget / len(ours)) ** 0.5 * error
 
     def _decide(self) -> Decision | None:
-        if self.has_challenger and self.support and self.challenger_returns:
-            # one evaluation episode of a copy that exploration speaks for
+        n = len(self.challenger_returns)
+        if self.has_challenger and n:
             ours = [*self.support, *self.challenger_returns]
-            self.support = []
-            is_confirmed = self.challenger_returns[0] > fmean(self.incumbent_returns)
-            if is_confirmed and self._exceed(ours, self.incumbent_returns):
-                return self._promote()
-            if not is_confirmed:
-                return self._reject()
-        if self.has_challenger and len(self.challenger_returns) >= self.min_episodes:
-            # as many episodes of both: the incumbent gets a pseudo-episode too
-            if self._exceed(self.challenger_returns, [*self.incumbent_returns, self.worst]):
-                return self._promote()
             loss, error = compare(self.incumbent_returns, self.challenger_returns)
-            if loss > self.reject * error or len(self.challenger_returns) >= self.budget:
+            # one evaluation episode is enough for a copy that exploration speaks for
+            if loss < 0 and len(ours) >= self.min_episodes and self._exceed(ours):
+                return self._promote()
+            is_enough = n >= self.min_episodes or bool(self.support)
+            if (is_enough and loss > self.reject * error) or n >= self.budget:
                 self.n_needed = min(len(self.incumbent_returns) + 1, self.budget)
                 return self._reject()
         if self.previous_returns and len(self.incumbent_returns) >= self.min_episodes:
@@ -168,7 +158,7 @@ class PolicySelection:
         return "promoted"
 
     def _reject(self) -> Decision:
-        self.has_challenger = False
+        self.has_challenger, self.support = False, []
         self.n_rejected += 1
         return "rejected"
 
