@@ -1,6 +1,6 @@
 """The default guidance: BC pre-training, critic warm-up, return-weighted imitation and the deployment gate, as hooks."""
 
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass, fields
 from numbers import Integral, Real
 from typing import Any, Literal
 
@@ -171,7 +171,7 @@ class BehaviorGuidance(ActorGuidance):
     def state_dict(self) -> dict[str, Any]:
         """The gate's fields."""
         return {
-            "selection": None if self.selection is None else self.selection.state_dict(),
+            "selection": None if self.selection is None else asdict(self.selection),
             "copied_at": self.copied_at,
         }
 

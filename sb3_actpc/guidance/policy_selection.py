@@ -2,16 +2,15 @@
 
 An *incumbent* is deployed. The actor's moving average explores. A *challenger*, a frozen copy of it, plays evaluation
 episodes until it has as many as the incumbent; then both take turns. A group sequential test on the difference of mean
-returns promotes or rejects the challenger; its threshold falls with the number of episodes (O'Brien and Fleming,
-Biometrics 1979). If exploration episodes of the average are as clearly better, the average is the next challenger, and
-one evaluation episode confirms it: it may be stuck without noise. An incumbent that is worse than the one before is
-rolled back.
+returns promotes or rejects the challenger; its threshold falls with the number of episodes (O'Brien and Fleming, Biometrics
+1979). If exploration returns of the average are as clearly better, it is the next challenger, and one evaluation episode
+confirms it: it may be stuck without noise. An incumbent that is worse than the one before is rolled back.
 """
 
 import math
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from statistics import fmean
-from typing import Any, Literal
+from typing import Literal
 
 Role = Literal["average", "challenger", "incumbent"]
 Decision = Literal["promoted", "rejected", "rolled back"]
@@ -79,7 +78,11 @@ class PolicySelection:
         self.worst = min(self.worst, episode_return)
         if role == "average":
             if actor_differs:
-                self._explored(episode_return)
+                self.exploration_returns = [*self.exploration_returns, episode_return][-self.budget :]
+            n = min(len(self.exploration_returns), len(self.incumbent_returns))
+            if not self.support and n >= self.min_episodes and self._exceed(self.exploration_returns):
+                self.support = self.exploration_returns
+                self.has_challenger = False  # an older copy makes room
             return None
         if role == "incumbent":
             self.incumbent_returns.append(episode_return)
@@ -114,14 +117,6 @@ class PolicySelection:
             if role in roles:
                 self.roles[env], self.running[env] = "average", math.nan
 
-    def _explored(self, episode_return: float) -> None:
-        self.exploration_returns = [*self.exploration_returns, episode_return][-self.budget :]
-        if self.support or min(len(self.exploration_returns), len(self.incumbent_returns)) < self.min_episodes:
-            return
-        if self._exceed(self.exploration_returns):
-            self.support = self.exploration_returns
-            self.has_challenger = False  # an older copy makes room
-
     def _exceed(self, ours: list[float]) -> bool:
         """Both get a pseudo-episode of the worst return: a policy with few episodes may not have failed yet."""
         gain, error = compare([*ours, self.worst], [*self.incumbent_returns, self.worst])
@@ -134,11 +129,18 @@ class PolicySelection:
             loss, error = compare(self.incumbent_returns, self.challenger_returns)
             # one evaluation episode is enough for a copy that exploration speaks for
             if loss < 0 and len(ours) >= self.min_episodes and self._exceed(ours):
-                return self._promote()
+                self._cut("incumbent", "challenger")
+                self.n_needed = min(max(2 * n, self.min_episodes), self.budget)
+                self.previous_returns, self.incumbent_returns = self.incumbent_returns, self.challenger_returns
+                self.has_challenger, self.challenger_returns, self.exploration_returns, self.support = False, [], [], []
+                self.n_promoted += 1
+                return "promoted"
             is_enough = n >= self.min_episodes or bool(self.support)
             if (is_enough and loss > self.reject * error) or n >= self.budget:
                 self.n_needed = min(len(self.incumbent_returns) + 1, self.budget)
-                return self._reject()
+                self.has_challenger, self.support = False, []
+                self.n_rejected += 1
+                return "rejected"
         if self.previous_returns and len(self.incumbent_returns) >= self.min_episodes:
             loss, error = compare(self.previous_returns, self.incumbent_returns)
             if loss > self.reject * error:
@@ -148,23 +150,6 @@ class PolicySelection:
                 self.n_rolled_back += 1
                 return "rolled back"
         return None
-
-    def _promote(self) -> Decision:
-        self._cut("incumbent", "challenger")
-        self.n_needed = min(max(2 * len(self.challenger_returns), self.min_episodes), self.budget)
-        self.previous_returns, self.incumbent_returns = self.incumbent_returns, self.challenger_returns
-        self.has_challenger, self.challenger_returns, self.exploration_returns, self.support = False, [], [], []
-        self.n_promoted += 1
-        return "promoted"
-
-    def _reject(self) -> Decision:
-        self.has_challenger, self.support = False, []
-        self.n_rejected += 1
-        return "rejected"
-
-    def state_dict(self) -> dict[str, Any]:
-        """All fields, as plain values."""
-        return asdict(self)
 
 
 def compare(ours: list[float], theirs: list[float]) -> tuple[float, float]:

@@ -1,5 +1,7 @@
 """The deployment gate, played with policies whose returns are known."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -153,7 +155,7 @@ def test_a_gate_that_is_stored_in_the_middle_goes_on_as_one_that_is_not():
     stored = Game(3, straight.deployed, straight.challenger)
     straight.play(3000)
     stored.play(3000)
-    stored.selection = PolicySelection(**stored.selection.state_dict())
+    stored.selection = PolicySelection(**dataclasses.asdict(stored.selection))
     straight.play(3000)
     stored.play(3000)
     assert straight.decisions == stored.decisions
