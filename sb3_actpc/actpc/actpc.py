@@ -353,8 +353,9 @@ class ActPC(ActPCBase):
         if imitation_weight and self.imitated_episodes():
             features, actions, memory = self.sample_imitated(len(batch.features))
             chain = self.actor.circuit.chain(features, memory)
-            if self.critic_weight and self.actor_guidance.filters_imitation(self._n_updates):
-                actions = self.q_filter(features, actions, chain.output)
+            filtered_weight = self.actor_guidance.filtered_weight(self._n_updates)
+            if self.critic_weight and filtered_weight < 1.0:
+                actions = self.q_filter(features, actions, chain.output, filtered_weight)
             state = self.actor.circuit.settle_chain(chain, actions)
             imitation = self.actor.circuit.hebbian_update(state).scale_(imitation_weight)
             self.diagnostics.settled("actor", state)
@@ -382,9 +383,9 @@ class ActPC(ActPCBase):
             self.actor.circuit.apply_changes(total)
             self.actor_guidance.after_update(self._context())
 
-    def q_filter(self, features: th.Tensor, actions: th.Tensor, own: th.Tensor) -> th.Tensor:
-        """Imitated actions, (B, A); the actor's ``own``, which have no error (without a leak), where all critics value these
-        more (Q-filter, Nair et al., arXiv 1709.10089)."""
+    def q_filter(self, features: th.Tensor, actions: th.Tensor, own: th.Tensor, weight: float = 0.0) -> th.Tensor:
+        """Imitated actions, (B, A). Where all critics value the actor's ``own`` more, these, which have no error (without a
+        leak), or the point a ``weight`` of the way to the imitated ones (Q-filter, Nair et al., arXiv 1709.10089)."""
         pairs = [th.cat([features, either], dim=1) for either in (actions, own)]
         imitated_value, own_value = self.critic.project(th.cat(pairs)).mean(-1, keepdim=True).chunk(2, dim=-2)
         gain = imitated_value - own_value
@@ -392,7 +393,7 @@ class ActPC(ActPCBase):
             gain = gain.amax(0)
         is_imitated = gain >= 0
         self.diagnostics.follow(imitated_share=lambda: is_imitated.float().mean())
-        return th.where(is_imitated, actions, own)
+        return th.where(is_imitated, actions, th.lerp(own, actions, weight))
 
     def update_critic(self, batch: Batch) -> None:
         """All critics settle on the same targets, ΔΘ_c = e φ(z)ᵀ (lines 21 and 22). Without a weight they have no role."""

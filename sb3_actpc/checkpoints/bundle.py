@@ -18,7 +18,7 @@ import numpy as np
 from sb3_actpc.utils.files import file_hash, named_errors
 
 FORMAT = "sb3_actpc checkpoint"
-VERSION = 11
+VERSION = 12
 MANIFEST = "manifest.json"
 _NAME = re.compile(r"(\d{6,})_step_(\d+)")
 _TEMPORARY = ".writing-"

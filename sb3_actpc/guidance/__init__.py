@@ -7,7 +7,8 @@ The actor circuit maximizes, by local changes alone,
 
 over replayed states s (value term) and over demonstrated and self-imitated steps (s, a) (imitation term). Learning starts
 from a behavior-cloned (BC) policy. During a warm-up w_c is 0, so that the critic first sees what the BC policy's own actions
-lead to. f is the Q-filter, 1 or 0. The deployed policy, which ``predict`` uses, changes only after a test on returns.
+lead to. f is the Q-filter, 1 or less, by the precision of the imitated actions. The deployed policy, which ``predict`` uses,
+changes only after a test on returns.
 """
 
 from sb3_actpc.guidance.base import ActorGuidance, GuidanceContext

@@ -69,9 +69,9 @@ class ActorGuidance:
         """Factor of the critic term in the actor's update."""
         return 1.0
 
-    def filters_imitation(self, n_updates: int) -> bool:
-        """Whether actions are imitated only where the critics do not value the actor's own more."""
-        return False
+    def filtered_weight(self, n_updates: int) -> float:
+        """Weight, from 0 to 1, that imitation keeps where the critics value the actor's own action more; 1 for no filter."""
+        return 1.0
 
     def imitation_weight(self, n_updates: int) -> float:
         """Factor of the imitation term (refresh) in the actor's update."""

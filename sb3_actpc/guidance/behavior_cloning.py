@@ -6,16 +6,18 @@ from sb3_actpc.guidance.base import ImitationBatch
 from sb3_actpc.ngc import NGCCircuit
 
 BATCH_SIZE = 256
+N_EVALUATED = 4096  # steps of which the error is returned
 LEARNING_RATES = (1e-3, 5e-5)  # first and last; the rate falls geometrically
 
 
-def clone_behavior(actor: NGCCircuit, sample: Callable[[int], ImitationBatch], n_updates: int) -> None:
+def clone_behavior(actor: NGCCircuit, sample: Callable[[int], ImitationBatch], n_updates: int) -> float:
     """
     Train ``actor`` on imitated steps with a falling learning rate. Its optimizer's moments are dropped afterwards.
 
     :param actor: changed in place; has an optimizer
     :param sample: draws a batch of so many steps
     :param n_updates: updates
+    :return: the mean squared error of the trained actor's actions
     """
     first, last = LEARNING_RATES
     rates = [group["lr"] for group in actor.optimizer.param_groups]
@@ -28,3 +30,5 @@ def clone_behavior(actor: NGCCircuit, sample: Callable[[int], ImitationBatch], n
     for group, rate in zip(actor.optimizer.param_groups, rates, strict=True):
         group["lr"] = rate
     actor.optimizer.state.clear()
+    features, actions, memory = sample(N_EVALUATED)
+    return float((actor.project(features, memory) - actions).square().mean())

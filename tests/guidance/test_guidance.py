@@ -68,12 +68,48 @@ def test_what_the_filter_takes_away_is_not_imitated_after_the_warm_up(q_filter, 
         guidance_kwargs=settings, gradient_steps=1, policy_delay=1, critic_weight=1e-9, learning_rate=0.1, policy_kwargs=plain
     )
     model.learn(1)
-    model.q_filter = lambda features, actions, own: own
+    model.q_filter = lambda features, actions, own, weight: own
     model.train(20, 16)
     before = weights_of(model.actor.circuit)
     model.train(1, 16)
     moved = max(float((a - b).abs().max()) for a, b in zip(before, weights_of(model.actor.circuit), strict=True))
     assert (moved > 1e-5) == imitates
+
+
+@pytest.mark.parametrize(("std", "expected"), [(0.05, 1.0), (0.2, 0.25), (None, 0.0)])
+def test_filtered_steps_count_by_the_precision_of_their_actions(std, expected):
+    guidance = BehaviorGuidance(GuidanceConfig(critic_warmup=10, filter_std=0.1))
+    guidance.action_variance = None if std is None else std**2
+    assert guidance.filtered_weight(10) == 1.0
+    assert guidance.filtered_weight(11) == pytest.approx(expected)
+    copy = BehaviorGuidance(guidance.config)
+    copy.load_state_dict(guidance.state_dict())
+    assert copy.filtered_weight(11) == guidance.filtered_weight(11)
+    unfiltered = BehaviorGuidance(GuidanceConfig(critic_warmup=10, q_filter=False))
+    assert unfiltered.filtered_weight(11) == 1.0
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.3])
+def test_bc_measures_how_far_demonstrated_actions_are_from_its_policy(noise):
+    """Actions that are a function of the observations, plus noise."""
+    rng = np.random.default_rng(0)
+    data = demonstrations(n_episodes=40)
+    clean = 0.5 * np.tanh(data.observations[:, :2])
+    actions = 2 * (clean + rng.normal(scale=noise, size=clean.shape)).clip(-1, 1)  # the actions' limits are -2 and 2
+    guidance = BehaviorGuidance(GuidanceConfig(bc_updates=1000))
+    model = imitating(demonstrations=dataclasses.replace(data, actions=actions), guidance=guidance, guidance_kwargs=None)
+    model.learn(1)
+    assert guidance.action_variance == pytest.approx(noise**2, rel=0.3, abs=0.005)
+
+
+def test_a_filter_of_some_weight_pulls_part_of_the_way():
+    model = imitating()
+    model.learn(10)
+    features, actions, _ = model.sample_imitated(64)
+    none, half, whole = (model.q_filter(features, actions, -actions, weight) for weight in (0.0, 0.5, 1.0))
+    assert th.allclose(half, (none + actions) / 2, atol=1e-6)
+    assert th.allclose(whole, actions, atol=1e-6)
+    assert not th.equal(none, actions)
 
 
 @pytest.mark.parametrize(("weighting", "share"), [("returns", 0.0), ("uniform", 0.5)])
