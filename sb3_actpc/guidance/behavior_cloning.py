@@ -7,6 +7,7 @@ from sb3_actpc.ngc import NGCCircuit
 
 BATCH_SIZE = 256
 N_EVALUATED = 4096  # steps of which the error is returned
+SMALLEST_VARIANCE = 1e-12
 LEARNING_RATES = (1e-3, 5e-5)  # first and last; the rate falls geometrically
 
 
@@ -17,7 +18,7 @@ def clone_behavior(actor: NGCCircuit, sample: Callable[[int], ImitationBatch], n
     :param actor: changed in place; has an optimizer
     :param sample: draws a batch of so many steps
     :param n_updates: updates
-    :return: the mean squared error of the trained actor's actions
+    :return: mean squared error of the trained actor's actions, as a share of the variance of the imitated ones
     """
     first, last = LEARNING_RATES
     rates = [group["lr"] for group in actor.optimizer.param_groups]
@@ -31,4 +32,5 @@ def clone_behavior(actor: NGCCircuit, sample: Callable[[int], ImitationBatch], n
         group["lr"] = rate
     actor.optimizer.state.clear()
     features, actions, memory = sample(N_EVALUATED)
-    return float((actor.project(features, memory) - actions).square().mean())
+    error = (actor.project(features, memory) - actions).square().mean()
+    return float(error / actions.var(0, unbiased=False).mean().clamp_min(SMALLEST_VARIANCE))

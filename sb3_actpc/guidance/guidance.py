@@ -11,8 +11,6 @@ from sb3_actpc.guidance.behavior_cloning import clone_behavior
 from sb3_actpc.guidance.policy_selection import PolicySelection
 from sb3_actpc.ngc import NGCCircuit
 
-SMALLEST_VARIANCE = 1e-12
-
 
 @dataclass(frozen=True)
 class GuidanceConfig:
@@ -24,9 +22,9 @@ class GuidanceConfig:
         episodes (WSRL, arXiv 2412.07762, warms up on 5,000 such steps)
     :param q_filter: after the warm-up, imitate less where the critics value the actor's own action more (Nair et al., arXiv
         1709.10089, do not imitate there)
-    :param filter_std: such steps keep the weight (filter_std / std)^2, at most 1, with the standard deviation of demonstrated
-        actions from the BC policy: errors count by their precision, as in predictive coding (Whittington and Bogacz, Neural
-        Computation 2017). 0 for no weight
+    :param filter_residual: such steps keep the weight filter_residual / residual, at most 1. The residual is BC's error as a
+        share of the variance of demonstrated actions: errors count by their precision, as in predictive coding (Whittington
+        and Bogacz, Neural Computation 2017). 0 for no weight
     :param weighting: "returns" draws imitated steps by their episode's return to the power of four (reward-weighted
         regression, Peters and Schaal 2007), "uniform" as the paper does
     :param gate: whether the deployed policy changes only after a test; else the actor explores and is deployed
@@ -39,7 +37,7 @@ class GuidanceConfig:
     bc_updates: int = 3000
     critic_warmup: int = 6000
     q_filter: bool = True
-    filter_std: float = 0.1
+    filter_residual: float = 0.01
     weighting: Literal["returns", "uniform"] = "returns"
     gate: bool = True
     evaluation_share: float = 0.25
@@ -51,7 +49,7 @@ class GuidanceConfig:
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, Integral) or value < 0:
                 raise ValueError(f"guidance_kwargs[{name!r}]={value!r} must be a whole number of at least 0")
-        for name in ("evaluation_share", "averaging_rate", "filter_std"):
+        for name in ("evaluation_share", "averaging_rate", "filter_residual"):
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, Real) or not 0.0 <= float(value) <= 1.0:
                 raise ValueError(f"guidance_kwargs[{name!r}]={value!r} must be a number from 0 to 1")
@@ -80,7 +78,7 @@ class BehaviorGuidance(ActorGuidance):
         self.has_gate = config.gate
         self.selection: PolicySelection | None = None
         self.copied_at = config.critic_warmup  # update of the last copy of the average
-        self.action_variance: float | None = None  # of the imitated actions around the BC policy's; None without BC
+        self.bc_residual: float | None = None  # error of BC, as a share of the actions' variance; None without BC
 
     def on_training_start(self, context: GuidanceContext, is_pretrained: bool) -> None:
         """BC pre-training, once."""
@@ -90,7 +88,7 @@ class BehaviorGuidance(ActorGuidance):
             self.selection = PolicySelection(context.n_envs, self.config.evaluation_share)
         if not imitates or context.sample is None:
             return
-        self.action_variance = clone_behavior(context.actor, context.sample, self.config.bc_updates)
+        self.bc_residual = clone_behavior(context.actor, context.sample, self.config.bc_updates)
         copies = [*context.targets, *(context.selection_circuits or {}).values()]
         for circuit in copies:
             circuit.move_towards(context.actor, 1.0)
@@ -148,12 +146,13 @@ class BehaviorGuidance(ActorGuidance):
         return float(n_updates > self.config.critic_warmup)
 
     def filtered_weight(self, n_updates: int) -> float:
-        """1 during the warm-up of the critic, then the precision of the demonstrated actions, relative to ``filter_std``."""
+        """1 during the warm-up of the critic, then by the precision of the demonstrated actions."""
         if not self.config.q_filter or n_updates <= self.config.critic_warmup:
             return 1.0
-        if self.action_variance is None:
+        if self.bc_residual is None:
             return 0.0
-        return self.config.filter_std**2 / max(self.action_variance, self.config.filter_std**2, SMALLEST_VARIANCE)
+        largest = self.config.filter_residual
+        return largest / max(self.bc_residual, largest) if largest else 0.0
 
     def after_update(self, context: GuidanceContext) -> None:
         """The actor's moving average."""
@@ -184,11 +183,11 @@ class BehaviorGuidance(ActorGuidance):
         return {
             "selection": None if self.selection is None else asdict(self.selection),
             "copied_at": self.copied_at,
-            "action_variance": self.action_variance,
+            "bc_residual": self.bc_residual,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """As stored."""
         stored = state["selection"]
         self.selection = None if stored is None else PolicySelection(**{**stored, "share": self.config.evaluation_share})
-        self.copied_at, self.action_variance = state["copied_at"], state["action_variance"]
+        self.copied_at, self.bc_residual = state["copied_at"], state["bc_residual"]

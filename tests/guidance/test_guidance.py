@@ -76,10 +76,10 @@ def test_what_the_filter_takes_away_is_not_imitated_after_the_warm_up(q_filter, 
     assert (moved > 1e-5) == imitates
 
 
-@pytest.mark.parametrize(("std", "expected"), [(0.05, 1.0), (0.2, 0.25), (None, 0.0)])
-def test_filtered_steps_count_by_the_precision_of_their_actions(std, expected):
-    guidance = BehaviorGuidance(GuidanceConfig(critic_warmup=10, filter_std=0.1))
-    guidance.action_variance = None if std is None else std**2
+@pytest.mark.parametrize(("residual", "expected"), [(0.005, 1.0), (0.04, 0.25), (0.0, 1.0), (None, 0.0)])
+def test_filtered_steps_count_by_the_precision_of_their_actions(residual, expected):
+    guidance = BehaviorGuidance(GuidanceConfig(critic_warmup=10, filter_residual=0.01))
+    guidance.bc_residual = residual
     assert guidance.filtered_weight(10) == 1.0
     assert guidance.filtered_weight(11) == pytest.approx(expected)
     copy = BehaviorGuidance(guidance.config)
@@ -87,19 +87,25 @@ def test_filtered_steps_count_by_the_precision_of_their_actions(std, expected):
     assert copy.filtered_weight(11) == guidance.filtered_weight(11)
     unfiltered = BehaviorGuidance(GuidanceConfig(critic_warmup=10, q_filter=False))
     assert unfiltered.filtered_weight(11) == 1.0
+    plain = BehaviorGuidance(GuidanceConfig(critic_warmup=10, filter_residual=0.0))
+    plain.bc_residual = residual
+    assert plain.filtered_weight(11) == 0.0
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.3])
-def test_bc_measures_how_far_demonstrated_actions_are_from_its_policy(noise):
-    """Actions that are a function of the observations, plus noise."""
+@pytest.mark.parametrize("scale", [1.0, 0.1])
+def test_bc_measures_how_much_of_the_demonstrated_actions_it_leaves_unexplained(noise, scale):
+    """Actions that are a function of the observations, plus noise: its share of the variance, whatever their scale."""
     rng = np.random.default_rng(0)
     data = demonstrations(n_episodes=40)
-    clean = 0.5 * np.tanh(data.observations[:, :2])
-    actions = 2 * (clean + rng.normal(scale=noise, size=clean.shape)).clip(-1, 1)  # the actions' limits are -2 and 2
+    clean = 0.5 * scale * np.tanh(data.observations[:, :2])
+    actions = clean + rng.normal(scale=noise * scale, size=clean.shape).clip(-0.5 * scale, 0.5 * scale)
     guidance = BehaviorGuidance(GuidanceConfig(bc_updates=1000))
-    model = imitating(demonstrations=dataclasses.replace(data, actions=actions), guidance=guidance, guidance_kwargs=None)
+    demonstrated = dataclasses.replace(data, actions=2 * actions)  # the actions' limits are -2 and 2
+    model = imitating(demonstrations=demonstrated, guidance=guidance, guidance_kwargs=None)
     model.learn(1)
-    assert guidance.action_variance == pytest.approx(noise**2, rel=0.3, abs=0.005)
+    expected = np.square(actions - clean).mean() / actions.var(0).mean()
+    assert guidance.bc_residual == pytest.approx(expected, rel=0.3, abs=0.1)
 
 
 def test_a_filter_of_some_weight_pulls_part_of_the_way():
