@@ -160,14 +160,13 @@ class BehaviorGuidance(ActorGuidance):
             context.selection_circuits["average"].move_towards(context.actor, self.config.averaging_rate)
 
     def logs(self) -> dict[str, float]:
-        """Decisions of the gate, and the incumbent's mean return."""
+        """BC's residual, the decisions of the gate, and the incumbent's mean return."""
+        values = {} if self.bc_residual is None else {"bc_residual": self.bc_residual}
         if self.selection is None:
-            return {}
-        values = {
-            "policies_promoted": float(self.selection.n_promoted),
-            "policies_rejected": float(self.selection.n_rejected),
-            "policies_rolled_back": float(self.selection.n_rolled_back),
-        }
+            return values
+        values["policies_promoted"] = float(self.selection.n_promoted)
+        values["policies_rejected"] = float(self.selection.n_rejected)
+        values["policies_rolled_back"] = float(self.selection.n_rolled_back)
         if self.selection.incumbent_returns:
             values["deployed_return"] = float(np.mean(self.selection.incumbent_returns))
         return values
