@@ -178,7 +178,7 @@ class BehaviorGuidance(ActorGuidance):
         return f"guidance: {config.bc_updates} BC updates, {config.critic_warmup} updates of critic warm-up, {gate}"
 
     def state_dict(self) -> dict[str, Any]:
-        """The gate's fields."""
+        """The gate's fields, and the residual of BC."""
         return {
             "selection": None if self.selection is None else asdict(self.selection),
             "copied_at": self.copied_at,
