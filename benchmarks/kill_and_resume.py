@@ -83,13 +83,13 @@ def start(folder: Path, n_steps: int) -> BaseProcess:
 def end_state(folder: Path) -> dict[str, Any]:
     """What the run has come to, without times of the clock and without names of folders."""
     bundle = find_bundle(folder / "checkpoints")
-    state = json.loads(bundle.read_bytes("state.json"))
-    nodes, arrays = state.pop("nodes"), safetensors.numpy.load(bundle.read_bytes("arrays.safetensors"))
+    state = json.loads((bundle.path / "state.json").read_bytes())
+    nodes, arrays = state.pop("nodes"), safetensors.numpy.load_file(bundle.path / "arrays.safetensors")
     return {
         "files": {name: digest for name, digest in bundle.manifest["files"].items() if name.endswith(".npy")},
         "state": resolved(state, nodes, arrays),
         "progress": log_rows(folder / "progress.csv"),
-        "steps": bundle.num_timesteps,
+        "steps": bundle.manifest["num_timesteps"],
     }
 
 

@@ -3,7 +3,7 @@
 import sys
 import time
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -38,7 +38,6 @@ from sb3_actpc.demonstrations.mixin import LearnsFromDemonstrations
 from sb3_actpc.guidance import ActorGuidance, BehaviorGuidance, GuidanceConfig, GuidanceContext
 from sb3_actpc.guidance.base import ImitationBatch
 from sb3_actpc.utils.arguments import Between
-from sb3_actpc.utils.callbacks import between_updates
 from sb3_actpc.utils.checks import Settings, check_finite, check_kind, named_in_errors, nearest
 from sb3_actpc.utils.extras import import_extra
 
@@ -261,11 +260,10 @@ class ActPCBase(LearnsFromDemonstrations, Persistent):
         imitates = self.is_pretrained and self.refresh_weight > 0
         warn_of_idle_settings(self.demonstrations is not None, imitates, (self.alpha_ext, self.alpha_ep, self.alpha_in))
 
-    def pretrain(self, before_update: Callable[[], None] = lambda: None, progress_bar: bool = False) -> None:
+    def pretrain(self, progress_bar: bool = False) -> None:
         """
         Train the prior on the demonstrations and let guidance start, once; ``learn`` calls this.
 
-        :param before_update: called before each update
         :param progress_bar: show one
         """
         expert = self.expert
@@ -282,7 +280,6 @@ class ActPCBase(LearnsFromDemonstrations, Persistent):
             if progress_bar and n_updates > 0:
                 updates = import_extra("tqdm", "experiments").tqdm(updates, "prior", mininterval=seconds)
             for _ in updates:
-                before_update()
                 batch = expert.sample(batch_size, self.inputs, self.reward_weights, self.gamma)
                 self.instrumental.update(batch.features, batch.actions, batch.next_features, batch.memory)
                 self.policy.n_prior_updates.add_(1)
@@ -350,7 +347,7 @@ class ActPCBase(LearnsFromDemonstrations, Persistent):
         if self.verbose and self._described != self.describe():
             self._described = self.describe()
             print(self._described, flush=True)
-        self.pretrain(between_updates(callback), has_progress_bar(callback))
+        self.pretrain(has_progress_bar(callback))
         self.start_time = time.time_ns()  # of the frames per second: pre-training has none
         return total_timesteps, callback
 

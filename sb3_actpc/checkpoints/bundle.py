@@ -8,7 +8,7 @@ import shutil
 import uuid
 import warnings
 from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -17,10 +17,9 @@ import numpy as np
 
 from sb3_actpc.utils.files import file_hash, named_errors
 
-FORMAT = "sb3_actpc checkpoint"
-VERSION = 12
+VERSION = 13
 MANIFEST = "manifest.json"
-_NAME = re.compile(r"(\d{6,})_step_(\d+)")
+_NAME = re.compile(r"\d{6}_step_\d+")
 _TEMPORARY = ".writing-"
 _USE_ANOTHER = "use another checkpoint of the run"
 Report = Callable[[str], None]
@@ -29,20 +28,6 @@ Write = Callable[[str, bytes | np.ndarray], None]
 
 class DamagedCheckpoint(ValueError):
     """A checkpoint whose files are not what was written."""
-
-
-def warn(line: str) -> None:
-    """Where nobody has said to whom to report."""
-    warnings.warn(line, stacklevel=3)
-
-
-def _write_file(path: Path, content: bytes | np.ndarray) -> None:
-    """Write bytes, or an array as ``.npy`` straight from its memory; OSError, with the file's name, when the disk is full."""
-    with named_errors(path):
-        if isinstance(content, bytes):
-            path.write_bytes(content)
-        else:
-            np.save(path, content, allow_pickle=False)
 
 
 def _seal(path: Path) -> str:
@@ -58,58 +43,54 @@ class Bundle:
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path)
-        self.manifest = _read_manifest(self.path)
-
-    @property
-    def num_timesteps(self) -> int:
-        """Environment steps of the run until then."""
-        return int(self.manifest["num_timesteps"])
+        try:
+            self.manifest = json.loads((self.path / MANIFEST).read_bytes())
+        except (OSError, ValueError) as error:
+            raise DamagedCheckpoint(f"{path}: {MANIFEST} cannot be read ({error}); {_USE_ANOTHER}") from error
+        if self.manifest.pop("sha256", None) != manifest_hash(self.manifest):
+            raise DamagedCheckpoint(f"{path}: {MANIFEST} is not what was written; {_USE_ANOTHER}")
+        if self.manifest["version"] != VERSION:
+            raise ValueError(
+                f"{path} has format version {self.manifest['version']}, this sb3_actpc reads {VERSION}: begin the run again, "
+                "or go on with the version that wrote it"
+            )
 
     def verify(self) -> "Bundle":
         """The checkpoint itself; DamagedCheckpoint names the first file that is missing or not what was written."""
         for name, digest in self.manifest["files"].items():
-            if not (self.path / name).is_file():
-                raise DamagedCheckpoint(f"{self.path}: {name} is missing; {_USE_ANOTHER}")
-            if file_hash(self.path / name) != digest:
-                raise DamagedCheckpoint(f"{self.path}: {name} does not have the recorded SHA-256; {_USE_ANOTHER}")
+            if not (self.path / name).is_file() or file_hash(self.path / name) != digest:
+                raise DamagedCheckpoint(f"{self.path}: {name} is missing, or is not what was written; {_USE_ANOTHER}")
         return self
-
-    def read_bytes(self, name: str) -> bytes:
-        """A file's content."""
-        return (self.path / name).read_bytes()
-
-    def read_array(self, name: str) -> np.ndarray:
-        """An array, memory-mapped: nothing is read before it is used."""
-        return np.load(self.path / name, mmap_mode="r", allow_pickle=False)
 
 
 @contextmanager
 def write_bundle(folder: Path, num_timesteps: int, keep: int, manifest: Mapping[str, Any]) -> Iterator[Write]:
     """Write a checkpoint: the block is given a function of a file's name and content. It appears among the checkpoints of the
-    run, in ``folder``, when everything has worked, and ``keep`` of them stay. Each file is flushed and hashed while the next
-    one is written. OSError when the disk is full or the folder cannot be written; nothing is left behind then."""
+    run, in ``folder``, when everything has worked, and ``keep`` of them stay. OSError when the disk is full or the folder
+    cannot be written; nothing is left behind then."""
     folder.mkdir(parents=True, exist_ok=True)
     for left in folder.glob(f"{_TEMPORARY}*"):  # of a killed process
         shutil.rmtree(left, ignore_errors=True)
     temporary = folder / f"{_TEMPORARY}{uuid.uuid4().hex[:12]}"
     temporary.mkdir()
     try:
+
+        def write(name: str, content: bytes | np.ndarray) -> None:
+            with named_errors(temporary / name):
+                if isinstance(content, bytes):
+                    (temporary / name).write_bytes(content)
+                else:
+                    np.save(temporary / name, content, allow_pickle=False)
+
+        yield write
+        names = sorted(path.name for path in temporary.iterdir())
         with ThreadPoolExecutor(max_workers=4) as workers:
-            sealed: dict[str, Future[str]] = {}
-
-            def write(name: str, content: bytes | np.ndarray) -> None:
-                _write_file(temporary / name, content)
-                sealed[name] = workers.submit(_seal, temporary / name)
-
-            yield write
-            files = {name: digest.result() for name, digest in sealed.items()}
-        record = {"format": FORMAT, "version": VERSION, "num_timesteps": num_timesteps, **manifest, "files": files}
-        _write_file(temporary / MANIFEST, json.dumps({**record, "sha256": manifest_hash(record)}).encode())
+            files = dict(zip(names, workers.map(lambda name: _seal(temporary / name), names), strict=True))
+        record = {"version": VERSION, "num_timesteps": num_timesteps, **manifest, "files": files}
+        write(MANIFEST, json.dumps({**record, "sha256": manifest_hash(record)}).encode())
         _seal(temporary / MANIFEST)
-        _sync_folder(temporary)
-        number = 1 + max(map(_number, list_bundles(folder)), default=0)
+        number = 1 + max((int(path.name.partition("_")[0]) for path in list_bundles(folder)), default=0)
         os.replace(temporary, folder / f"{number:06d}_step_{num_timesteps}")
-        _sync_folder(folder)
     except BaseException:
         shutil.rmtree(temporary, ignore_errors=True)
         raise
@@ -120,11 +101,10 @@ def write_bundle(folder: Path, num_timesteps: int, keep: int, manifest: Mapping[
 
 def list_bundles(folder: str | os.PathLike[str]) -> list[Path]:
     """Folders of all checkpoints of a run, oldest first; empty when there are none."""
-    found = Path(folder).glob("*_step_*")
-    return sorted((path for path in found if _NAME.fullmatch(path.name) and path.is_dir()), key=_number)
+    return sorted(path for path in Path(folder).glob("*_step_*") if _NAME.fullmatch(path.name) and path.is_dir())
 
 
-def find_bundle(path: str | os.PathLike[str], report: Report = warn) -> Bundle:
+def find_bundle(path: str | os.PathLike[str], report: Report = warnings.warn) -> Bundle:
     """The checkpoint at ``path``, or the newest whole one of those in it, verified; damaged ones are skipped, and ``report``
     is given a line for each. FileNotFoundError when there is none, DamagedCheckpoint when all are damaged, or ``path`` is one
     that is, ValueError when the newest was written in another version of the format."""
@@ -145,34 +125,3 @@ def find_bundle(path: str | os.PathLike[str], report: Report = warn) -> Bundle:
 def manifest_hash(manifest: Mapping[str, Any]) -> str:
     """SHA-256 of a manifest's other entries."""
     return hashlib.sha256(json.dumps(manifest, sort_keys=True).encode()).hexdigest()
-
-
-def _number(path: Path) -> int:
-    return int(path.name.partition("_")[0])
-
-
-def _read_manifest(path: Path) -> dict[str, Any]:
-    try:
-        manifest = json.loads((path / MANIFEST).read_bytes())
-    except (OSError, ValueError) as error:
-        raise DamagedCheckpoint(f"{path}: {MANIFEST} cannot be read ({error}); {_USE_ANOTHER}") from error
-    if not isinstance(manifest, dict) or manifest.pop("sha256", None) != manifest_hash(manifest):
-        raise DamagedCheckpoint(f"{path}: {MANIFEST} is not what was written; {_USE_ANOTHER}")
-    if manifest["version"] != VERSION:
-        raise ValueError(
-            f"{path} has format version {manifest['version']}, this sb3_actpc reads {VERSION}: go on with the version that "
-            f"wrote it ({manifest.get('versions', {}).get('sb3-actpc', 'unknown')}), or begin the run again"
-        )
-    return manifest
-
-
-def _sync_folder(folder: Path) -> None:
-    """Flush the names in a folder to the disk, where the system can."""
-    try:
-        descriptor = os.open(folder, os.O_RDONLY)
-    except OSError:  # folders cannot be opened on Windows
-        return
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

@@ -1,7 +1,7 @@
 """Checkpoints while an SB3 algorithm learns, and going on from them."""
 
 import os
-import tempfile
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 
-from sb3_actpc.checkpoints.bundle import Report, find_bundle, list_bundles, warn, write_bundle
+from sb3_actpc.checkpoints.bundle import Report, find_bundle, list_bundles, write_bundle
 from sb3_actpc.checkpoints.interrupts import StopSignals, TrainingStopped
 from sb3_actpc.checkpoints.state import (
     Restored,
@@ -21,7 +21,6 @@ from sb3_actpc.checkpoints.state import (
     describe_model,
     restore_learning,
     restore_model,
-    restore_tensorboard,
 )
 from sb3_actpc.utils.callbacks import callback_tree
 from sb3_actpc.utils.checks import check_finite
@@ -33,9 +32,8 @@ class CheckpointCallback(BaseCallback):
     Saves everything that the training of an SB3 algorithm depends on, every ``save_freq`` steps and when the process is told
     to stop (SIGTERM, SIGINT); the latter raises :class:`~sb3_actpc.checkpoints.TrainingStopped`.
 
-    A checkpoint is taken between two rollouts (``train_freq`` steps), or between two updates of a pre-training that a signal
-    interrupts. The handlers that were there before come back when ``learn`` ends; after an error, call :meth:`close`. To go
-    on, see :func:`restore` and :func:`continue_learning`.
+    A checkpoint is taken between two rollouts (``train_freq`` steps). The handlers that were there before come back when
+    ``learn`` ends; after an error, call :meth:`close`. To go on, see :func:`restore` and :func:`continue_learning`.
 
     :param folder: of this run's checkpoints; made when it does not exist
     :param save_freq: environment steps between two checkpoints
@@ -45,8 +43,6 @@ class CheckpointCallback(BaseCallback):
     :param report: given a line when something cannot be saved or restored; by default a warning
     :param restored: what :func:`restore` returned, where this ``learn`` goes on from a checkpoint; :func:`continue_learning`
         says so itself
-    :param verbose: 1 to report each checkpoint
-    :raises ValueError: when a number is less than 1
     """
 
     def __init__(
@@ -56,21 +52,16 @@ class CheckpointCallback(BaseCallback):
         keep: int = 3,
         handle_signals: bool = True,
         at_end: bool = True,
-        report: Report = warn,
+        report: Report = warnings.warn,
         restored: Restored | None = None,
-        verbose: int = 0,
     ) -> None:
-        super().__init__(verbose)
-        for name, value in (("save_freq", save_freq), ("keep", keep)):
-            if value < 1:
-                raise ValueError(f"{name}={value!r} must be at least 1")
+        super().__init__()
         self.folder, self.save_freq, self.keep = Path(folder), save_freq, keep
         self.handle_signals, self.at_end = handle_signals, at_end
         self.report, self.restored = report, restored
         self.signals = StopSignals()
         self._others: list[BaseCallback] = []
         self._last_saved = 0
-        self._newest: Path | None = None  # checkpoint of this run
 
     def close(self) -> None:
         """Put the old signal handlers back; ``learn`` does so when it ends."""
@@ -80,61 +71,31 @@ class CheckpointCallback(BaseCallback):
         """Write a checkpoint now, and return its folder; ValueError when a weight is not finite, OSError when it cannot be
         written: those there before stay."""
         model = self.model
-        self._report_others()
         manifest = {**describe_model(model), "settings": constructor_settings(model)}
         with write_bundle(self.folder, model.num_timesteps, self.keep, manifest) as write:
             capture_model(model, self._others, write)
         self._last_saved = model.num_timesteps
-        path = list_bundles(self.folder)[-1]
-        self._newest = path
-        if self.verbose:
-            self.report(f"step {model.num_timesteps:>8}  saved in {path}")
-        return path
-
-    def _report_others(self) -> None:
-        """A line where another run's checkpoints are about to be replaced."""
-        present = list_bundles(self.folder)
-        if present and present[-1] != self._newest:
-            self.report(
-                f"{present[-1]} is of another run, and this one's checkpoints replace it: give each run a folder of its own, "
-                "or go on from it with load_checkpoint"
-            )
-
-    def on_pretraining_update(self, callback: BaseCallback) -> None:
-        """Go on from a checkpoint taken in a pre-training, and save and stop on a signal.
-
-        :param callback: all callbacks of this ``learn``
-        """
-        self._others = self._beside(callback)
-        self._resume_or_stop()
+        return list_bundles(self.folder)[-1]
 
     def _init_callback(self) -> None:
-        if why_no_checkpoints(type(self.model)):
-            raise ValueError(f"{type(self.model).__name__} {why_no_checkpoints(type(self.model))}: leave the callback out")
-        try:
-            self.folder.mkdir(parents=True, exist_ok=True)
-            with tempfile.TemporaryFile(dir=self.folder):
-                pass
-        except OSError as error:
-            reason = error.strerror or error
-            raise ValueError(
-                f"folder={str(self.folder)!r}: no checkpoint can be written there ({reason}): choose another folder"
-            ) from error
+        if reason := why_no_checkpoints(type(self.model)):
+            raise ValueError(f"{type(self.model).__name__} {reason}: leave the callback out")
+        self.folder.mkdir(parents=True, exist_ok=True)
         if self.handle_signals:
             self.signals.install()
 
     def _on_training_start(self) -> None:
-        self._others = self._beside(self.locals.get("callback"))
+        self._others = [one for one in callback_tree(self.locals.get("callback")) if one is not self]
         self._last_saved = self.num_timesteps
-        if self.num_timesteps:
-            self._know_present()
-
-    def _know_present(self) -> None:
-        """The checkpoints that are there are of this run, which goes on."""
-        self._newest = next(reversed(list_bundles(self.folder)), None)
 
     def _on_rollout_start(self) -> None:
-        self._resume_or_stop()
+        self._resume()
+        if self.signals.received is not None:
+            try:
+                path = self.save()
+            finally:
+                self.close()
+            raise TrainingStopped(self.signals.received, self.model.num_timesteps, str(path))
         if self.num_timesteps - self._last_saved >= self.save_freq:
             self._save_or_report()
 
@@ -152,24 +113,10 @@ class CheckpointCallback(BaseCallback):
         if self.at_end and self._last_saved != self.model.num_timesteps:
             self._save_or_report()
 
-    def _beside(self, callback: Any) -> list[BaseCallback]:
-        return [one for one in callback_tree(callback) if one is not self]
-
     def _resume(self) -> None:
         restored, self.restored = self.restored, None
         if restored is not None:
-            self._know_present()
             restore_learning(restored, self._others)
-
-    def _resume_or_stop(self) -> None:
-        self._resume()
-        if self.signals.received is None:
-            return
-        try:
-            path = self.save()
-        finally:
-            self.close()
-        raise TrainingStopped(self.signals.received, self.model.num_timesteps, str(path))
 
     def _save_or_report(self) -> None:
         """A full disk does not end the training: the checkpoints written before stay."""
@@ -187,7 +134,7 @@ def why_no_checkpoints(algorithm: type[BaseAlgorithm]) -> str:
     return "" if learns_by_rollouts and getattr(algorithm, "is_resumable", True) else "keeps no checkpoints"
 
 
-def restore(model: BaseAlgorithm, path: str | os.PathLike[str], report: Report = warn) -> Restored:
+def restore(model: BaseAlgorithm, path: str | os.PathLike[str], report: Report = warnings.warn) -> Restored:
     """
     Put a checkpoint back into an agent made with the settings of the stopped run; :func:`continue_learning` goes on with it.
 
@@ -206,15 +153,14 @@ def load_checkpoint(
     path: str | os.PathLike[str],
     env: GymEnv | str,
     device: th.device | str = "auto",
-    report: Report = warn,
+    report: Report = warnings.warn,
     **overrides: Any,
 ) -> Restored:
     """Make an agent with the settings of a checkpoint and put everything back into it; no code is run from the file.
 
     :param algorithm: the agent's class
-    :param path: a checkpoint, or the folder of several: the newest whole one is taken
+    :param path: as in :func:`restore`, and ``report`` too
     :param env: an environment made as the stopped run's
-    :param report: given a line for each damaged checkpoint, and when episodes must start again
     :param overrides: constructor keywords: those that could not be stored by name, and what may differ (``verbose``, ...)
     :return: as :func:`restore` does, and raises the same
     """
@@ -241,7 +187,6 @@ def continue_learning(restored: Restored, callback: MaybeCallback = None, **opti
         raise ValueError(f"callback={callback!r} has no CheckpointCallback: add one, it puts back what learn() itself sets up")
     savers[0].restored = restored
     model = restored.model
-    restore_tensorboard(restored)
     left = model._total_timesteps - model.num_timesteps
     try:
         return model.learn(max(0, left), callback=callback, reset_num_timesteps=False, **options)

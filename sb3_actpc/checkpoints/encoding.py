@@ -1,91 +1,47 @@
 """Values to JSON and arrays, and back. Reading them runs no code from the file.
 
 A value that JSON does not have becomes a node in a table and is referred to by its number, ``[number]``. So what is held twice
-is written once, and a value may hold itself. Functions and classes go by their names: the program that reads must have them.
+is written once, and a value may hold itself. What cannot be written becomes a node that says so. Functions and classes go by
+their names, and objects by their attributes: the program that reads must have them.
 """
 
+import copyreg
 import functools
 import random
-import sys
 import types
-from collections import Counter, OrderedDict, defaultdict, deque
+from collections import Counter, OrderedDict, deque
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
-from enum import Enum, Flag
+from enum import Enum
 from typing import Any
 
+import gymnasium as gym
 import mujoco
 import numpy as np
 import torch as th
-from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
-from gymnasium.wrappers import utils as gymnasium_utils
 from stable_baselines3.common.monitor import ResultsWriter
-from stable_baselines3.common.noise import ActionNoise
-from stable_baselines3.common.running_mean_std import RunningMeanStd
-from stable_baselines3.common.vec_env.stacked_observations import StackedObservations
+from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_actpc.checkpoints.callables import function_state, name_of
 from sb3_actpc.checkpoints.physics import capture_physics, restore_physics
 
 Node = dict[str, Any]
-_DICTS: tuple[type, ...] = (dict, OrderedDict, Counter, defaultdict)
+_DICTS: tuple[type, ...] = (dict, OrderedDict, Counter)
 _CONTAINERS: dict[str, Any] = {kind.__name__: kind for kind in (list, tuple, set, frozenset, deque, *_DICTS)}
-_PLAIN_TYPES = {f"builtins.{kind.__name__}": kind for kind in (int, float, bool, str, list, dict, set, tuple)}
 # constructors make these again, or they never change
-_UNCHANGED: tuple[type, ...] = (type, np.dtype, th.device, EnvSpec, ResultsWriter, types.ModuleType, mujoco.MjModel)
+_UNCHANGED: tuple[Any, ...] = (type, np.dtype, th.device, EnvSpec, ResultsWriter, types.ModuleType, mujoco.MjModel)
 _METHODS = (types.MethodType, types.BuiltinFunctionType)
 # made from one array
 _FROM_ARRAY: dict[str, Callable[[np.ndarray], Any]] = {
     "array": np.copy,
     "scalar": lambda array: array[()],
     "tensor": lambda array: th.from_numpy(array.copy()),
-    "bytes": lambda array: array.tobytes(),
-    "empty": lambda array: array.astype(object),
 }
-
-
-def _new_generator(kind: Callable[[], Any]) -> np.random.Generator:
-    return np.random.Generator(kind())
-
-
-_BIT_GENERATORS: tuple[Any, ...] = (np.random.MT19937, np.random.PCG64, np.random.PCG64DXSM, np.random.Philox, np.random.SFC64)
+# generators that are made where there is none yet, by the name of their class
 _NEW: dict[str, Callable[[], Any]] = {
-    **{kind.__name__: functools.partial(_new_generator, kind) for kind in _BIT_GENERATORS},
+    "PCG64": np.random.default_rng,
     "RandomState": np.random.RandomState,
     "Random": random.Random,
 }
-
-
-class OpaqueValue(ValueError):
-    """A value that cannot be written without running code when it is read."""
-
-    def __init__(self, where: str, value: Any) -> None:
-        super().__init__(f"{where}: a {type(value).__module__}.{type(value).__qualname__} cannot be stored as plain data")
-
-
-class LostValue(ValueError):
-    """A stored value that cannot be made from what is there now."""
-
-
-def _subspaces(space: Any) -> list[Any]:
-    """The space and all spaces in it, in a fixed order."""
-    parts: Any = space.spaces if isinstance(space, (spaces.Dict, spaces.Tuple, spaces.OneOf)) else ()
-    parts = parts.values() if isinstance(space, spaces.Dict) else parts
-    return [space, *(inner for part in parts for inner in _subspaces(part))]
-
-
-def _space_state(space: Any) -> list[Any]:
-    generators = [part._np_random for part in _subspaces(space)]  # None where it has not been used
-    return [None if one is None else dict(one.bit_generator.state) for one in generators]
-
-
-def _set_space_state(space: Any, states: list[Any]) -> None:
-    for part, state in zip(_subspaces(space), states, strict=True):
-        if state is not None:
-            part.np_random.bit_generator.state = state
-
-
 # what is changed in place: the classes, how to get the state and how to put it back
 _STATES: dict[str, tuple[Any, Callable[[Any], Any], Callable[[Any, Any], None]]] = {
     "generator": (
@@ -95,188 +51,177 @@ _STATES: dict[str, tuple[Any, Callable[[Any], Any], Callable[[Any, Any], None]]]
     ),
     "random_state": (np.random.RandomState, lambda one: one.get_state(legacy=False), np.random.RandomState.set_state),
     "random": (random.Random, random.Random.getstate, random.Random.setstate),
-    "space": (spaces.Space, _space_state, _set_space_state),
     "physics": (mujoco.MjData, capture_physics, restore_physics),
-    "attributes": (
-        (RunningMeanStd, gymnasium_utils.RunningMeanStd, StackedObservations, ActionNoise),
-        vars,
-        lambda one, state: vars(one).update(state),
-    ),
 }
+# attributes of environments that the constructors make again, or the next step, and the time of the clock
+_SKIPPED = {"metadata", "_metadata", "spec", "_cached_spec", "results_writer", "t_start"}
+_SKIPPED_OF_VEC_ENVS = {"metadata", "class_attributes", "buf_infos", "reset_infos", "results_writer", "t_start"}
 
 
 def _class_name(value: Any) -> str:
     return type(value.bit_generator if isinstance(value, np.random.Generator) else value).__qualname__
 
 
+def _name_of(thing: Any) -> str:
+    """What a function, a class or a module goes by, and others by their class."""
+    thing = thing.func if isinstance(thing, functools.partial) else thing
+    if isinstance(thing, types.ModuleType):
+        return thing.__name__
+    thing = thing if hasattr(thing, "__qualname__") else type(thing)
+    line = f":{thing.__code__.co_firstlineno}" if isinstance(thing, types.FunctionType) else ""
+    return f"{thing.__module__}.{thing.__qualname__}{line}"
+
+
+def _is_plain(value: Any) -> bool:
+    """Whether an object holds nothing but its attributes, by what Python's ``copy`` would do."""
+    if not hasattr(value, "__dict__") or hasattr(value, "__setstate__"):
+        return False
+    try:
+        make, arguments, state, *items = value.__reduce_ex__(2)
+    except Exception:  # what cannot be copied, and what copies itself in another way
+        return False
+    is_new = make is copyreg.__newobj__ and arguments == (type(value),)  # type: ignore[attr-defined]
+    return is_new and isinstance(state, (dict, types.NoneType)) and items == [None, None]
+
+
 class Encoder:
-    """Collects the table of nodes and the arrays in it."""
+    """Collects the table of nodes and the arrays in it, and why some values cannot be stored (``lost``)."""
 
     def __init__(self) -> None:
         self.nodes: list[Node] = []
         self.arrays: dict[str, np.ndarray] = {}
-        self.keeps_views = False  # whether views of the same memory stay views, as an environment may need
+        self.lost: list[str] = []
         self._numbers: dict[int, tuple[int, Any]] = {}  # by id; the value is kept, so that no other one gets its id
 
-    def add(self, value: Any, node: Node) -> int:
-        """Enter a node for a value into the table; the number of the value's first node where it has one."""
+    def encode(self, value: Any) -> Any:
+        """Itself, or a reference to its node."""
+        if value is None or type(value) in (bool, int, float, str):
+            return value
         number, _ = self._numbers.setdefault(id(value), (len(self.nodes), value))
         if number == len(self.nodes):
+            node: Node = {}
             self.nodes.append(node)
-        return number
-
-    def encode(self, value: Any, where: str) -> Any:
-        """
-        :param value: what to write
-        :param where: its path, for the error
-        :return: itself or a reference, as JSON
-        :raises OpaqueValue: when it, or something in it, cannot be written; the table is as before then
-        """
-        if value is None or type(value) in (bool, int, float) or (isinstance(value, str) and not isinstance(value, Enum)):
-            return value
-        if id(value) in self._numbers:
-            return [self._numbers[id(value)][0]]
-        node: Node = {}
-        number = self.add(value, node)
-        try:
-            node.update(self._node(value, where))
-        except OpaqueValue:
-            del self.nodes[number:]
-            while self._numbers and next(reversed(self._numbers.values()))[0] >= number:
-                self._numbers.popitem()
-            raise
+            try:
+                node.update(self._node(value))
+            except RecursionError:
+                node.update(self._lost(f"a {_name_of(value)} holds others too many levels deep"))
         return [number]
 
-    def encode_some(self, values: Mapping[str, Any], where: str) -> dict[str, Any]:
-        """JSON of those values that can be stored, by name."""
-        stored = {}
-        for name, value in values.items():
-            with suppress(OpaqueValue):
-                stored[name] = self.encode(value, f"{where}.{name}")
-        return stored
+    def encode_each(self, values: Mapping[str, Any]) -> dict[str, Any]:
+        """JSON of values by name."""
+        return {name: self.encode(value) for name, value in values.items()}
 
-    def _node(self, value: Any, where: str) -> Node:
-        if isinstance(value, Enum):
-            member = value.value if isinstance(value, Flag) else value.name  # of flags together
-            return {"kind": "enum", "module": type(value).__module__, "name": type(value).__qualname__, "member": member}
+    def _node(self, value: Any) -> Node:
         if isinstance(value, th.Tensor):
             return self._stored("tensor", value.detach().cpu().numpy())
-        if isinstance(value, bytes):
-            return self._stored("bytes", np.frombuffer(value, np.uint8))
         if isinstance(value, (np.ndarray, np.generic)):
-            return self._array(value, where)
+            return self._array(value)
         if type(value) in _CONTAINERS.values():
-            return self._container(value, where)
+            return self._container(value)
         for kind, (classes, get_state, _) in _STATES.items():
             if isinstance(value, classes):
-                return {"kind": kind, "name": _class_name(value), "state": self.encode(get_state(value), where)}
-        return self._callable(value, where)
+                return {"kind": kind, "name": _class_name(value), "state": self.encode(get_state(value))}
+        return self._by_name(value)
+
+    def _by_name(self, value: Any) -> Node:
+        if isinstance(value, types.FunctionType):
+            cells = [cell.cell_contents for cell in value.__closure__ or ()]
+            return {"kind": "function", "name": _name_of(value), "cells": self.encode(cells)}
+        if isinstance(value, _METHODS) and not isinstance(value.__self__, (type, types.ModuleType, types.NoneType)):
+            return {"kind": "method", "name": value.__name__, "of": self.encode(value.__self__)}
+        if isinstance(value, Enum):
+            return {"kind": "enum", "name": _name_of(value), "value": self.encode(value.value)}
+        if isinstance(value, (*_UNCHANGED, *_METHODS, functools.partial)) or type(value).__name__ == "MujocoRenderer":
+            return {"kind": "unchanged", "name": _name_of(value)}
+        if isinstance(value, (gym.Env, gym.Space, VecEnv)) or _is_plain(value):
+            return self._object(value)
+        return self._lost(f"a {_name_of(value)} cannot be stored as plain data")
+
+    def _lost(self, reason: str) -> Node:
+        self.lost.append(reason)
+        return {"kind": "lost", "reason": reason}
 
     def _stored(self, kind: str, array: np.ndarray) -> Node:
         name = str(len(self.arrays))
         self.arrays[name] = array
         return {"kind": kind, "array": name}
 
-    def _array(self, value: Any, where: str) -> Node:
-        if value.dtype == object and value.size == 0:
-            return self._stored("empty", value.astype(bool))
+    def _array(self, value: Any) -> Node:
         if value.dtype.kind not in "biuf" or value.dtype.itemsize > 8:
-            raise OpaqueValue(where, value)
+            return self._lost(f"an array of {value.dtype} cannot be stored as plain data")
         if isinstance(value, np.generic):
             return self._stored("scalar", np.asarray(value))
         owner = value
-        while self.keeps_views and isinstance(owner.base, np.ndarray):
+        while isinstance(owner.base, np.ndarray):
             owner = owner.base
-        if self.keeps_views and type(owner.base).__name__ == "PyCapsule":
-            raise OpaqueValue(f"{where}, which shares memory with another object", value)
-        if owner is value or not owner.flags.c_contiguous or owner.dtype != value.dtype:
-            return self._stored("array", value)
-        place = {"offset": value.ctypes.data - owner.ctypes.data, "shape": value.shape, "strides": value.strides}
-        return {"kind": "view", "of": self.encode(owner, where), **place}
+        if type(owner.base).__name__ == "PyCapsule":
+            return self._lost("an array that shares memory with another object cannot be stored")
+        return self._stored("array", value)
 
-    def _container(self, value: Any, where: str) -> Node:
+    def _container(self, value: Any) -> Node:
         node: Node = {"kind": type(value).__name__}
         if isinstance(value, dict):
-            node["items"] = [[self.encode(key, where), self.encode(part, f"{where}.{key}")] for key, part in value.items()]
-        else:
-            node["items"] = [self.encode(part, f"{where}.{index}") for index, part in enumerate(value)]
-        if isinstance(value, deque):
-            node["maxlen"] = value.maxlen
-        if isinstance(value, defaultdict):
-            node["factory"] = self.encode(value.default_factory, where)
-        return node
+            return {**node, "items": [[self.encode(key), self.encode(part)] for key, part in value.items()]}
+        maxlen = {"maxlen": value.maxlen} if isinstance(value, deque) else {}
+        return {**node, **maxlen, "items": [self.encode(part) for part in value]}
 
-    def _callable(self, value: Any, where: str) -> Node:
-        if isinstance(value, types.FunctionType):
-            return {"kind": "function", "name": name_of(value), "state": self.encode(function_state(value), where)}
-        if isinstance(value, functools.partial):
-            parts = [value.func, value.args, value.keywords]
-            return {"kind": "partial", "parts": self.encode(parts, f"{where}.partial")}
-        is_method = isinstance(value, _METHODS)
-        if is_method and not isinstance(value.__self__, (type, types.ModuleType, types.NoneType)):
-            return {"kind": "method", "name": value.__name__, "of": self.encode(value.__self__, f"{where}.__self__")}
-        if is_method or isinstance(value, _UNCHANGED) or type(value).__name__ == "MujocoRenderer":
-            return {"kind": "unchanged", "class": type(value).__qualname__, "name": name_of(value)}
-        raise OpaqueValue(where, value)
+    def _object(self, value: Any) -> Node:
+        skipped = _SKIPPED if isinstance(value, gym.Env) else _SKIPPED_OF_VEC_ENVS if isinstance(value, VecEnv) else set()
+        skipped = {*skipped, *getattr(value, "checkpoint_skipped", ())}
+        kept = {name: one for name, one in vars(value).items() if name not in skipped}
+        own = self.encode(value.checkpoint_state()) if hasattr(value, "checkpoint_state") else None
+        return {"kind": "object", "name": _name_of(value), "own": own, "attributes": self.encode_each(kept)}
 
 
 class Decoder:
-    """The inverse of :class:`Encoder`, given its table and arrays."""
+    """The inverse of :class:`Encoder`, given its table and arrays; collects which attributes of objects could not be put back
+    and why (``lost``)."""
 
     def __init__(self, nodes: Sequence[Node], arrays: Mapping[str, np.ndarray]) -> None:
         self.nodes, self.arrays = nodes, arrays
+        self.lost: list[str] = []
         self._made: dict[int, Any] = {}
-        self._open: set[int] = set()
         self._used: set[int] = set()  # ids of what has been given a state
-
-    def add(self, number: int, value: Any) -> None:
-        """The value of a node that is there already."""
-        self._made[number] = value
-
-    def kind_of(self, reference: Any) -> str:
-        """What a reference refers to; empty for a plain value."""
-        return self.nodes[reference[0]]["kind"] if isinstance(reference, list) else ""
 
     def decode(self, value: Any, existing: Any = None) -> Any:
         """
         :param value: what :meth:`Encoder.encode` returned
         :param existing: the value that is there now; generators, spaces, functions and objects are changed in place
         :return: the value, the same one for the same number
-        :raises LostValue: when it cannot be made from what is there now
-        :raises ValueError: when an existing object is of another class
+        :raises ValueError: when it was not stored, or cannot be made from what is there now
         """
         if not isinstance(value, list):
             return value
         (number,) = value
-        if number in self._made:
-            return self._made[number]
-        if number in self._open:
-            raise LostValue("it holds itself")
-        self._open.add(number)
-        try:
-            self._made[number] = self._make(self.nodes[number], existing, number)
-        except LostValue:
-            self._made.pop(number, None)
-            raise
-        finally:
-            self._open.discard(number)
+        if number not in self._made:
+            node = self.nodes[number]
+            kind = node["kind"]
+            try:
+                if kind in _FROM_ARRAY:
+                    self._made[number] = _FROM_ARRAY[kind](self.arrays[node["array"]])
+                elif kind in _CONTAINERS:
+                    self._made[number] = self._container(node, existing, number)
+                elif kind in _STATES:
+                    self._put_state(node, existing, number)
+                else:
+                    self._made[number] = getattr(self, f"_{kind}")(node, existing, number)
+            except ValueError:
+                self._made.pop(number, None)  # lost for those who refer to it later, too
+                raise
         return self._made[number]
 
-    def _make(self, node: Node, existing: Any, number: int) -> Any:
-        kind = node["kind"]
-        if kind in _FROM_ARRAY:
-            return _FROM_ARRAY[kind](self.arrays[node["array"]])
-        if kind in _CONTAINERS:
-            return self._container(node, existing, number)
-        if kind in _STATES:
-            return self._put_state(node, existing, number)
-        return getattr(self, f"_{kind}")(node, existing, number)
+    def decode_into(self, owner: Any, attributes: Mapping[str, Any]) -> None:
+        """Put stored attributes of an object back; those that cannot be made stay as they are."""
+        for name, node in attributes.items():
+            try:
+                vars(owner)[name] = self.decode(node, vars(owner).get(name))
+            except ValueError as error:
+                self.lost.append(f"{type(owner).__qualname__}.{name}: {error}")
 
     def _container(self, node: Node, existing: Any, number: int) -> Any:
         kind, items = _CONTAINERS[node["kind"]], node["items"]
         if kind in _DICTS:
-            factory = [self.decode(node["factory"], getattr(existing, "default_factory", None))] if "factory" in node else []
-            self._made[number] = made = kind(*factory)
+            self._made[number] = made = kind()
             old = existing if isinstance(existing, dict) else {}
             for key_node, part in items:
                 key = self.decode(key_node)
@@ -292,62 +237,48 @@ class Decoder:
         old = list(existing) if isinstance(existing, (list, tuple, deque)) else []
         return [self.decode(part, old[index] if index < len(old) else None) for index, part in enumerate(items)]
 
-    def _put_state(self, node: Node, existing: Any, number: int) -> Any:
+    def _put_state(self, node: Node, existing: Any, number: int) -> None:
         name = node["name"]
         if _class_name(existing) != name or (name in _NEW and id(existing) in self._used):
             if name not in _NEW:
-                raise ValueError(f"expected a {name}, found a {_class_name(existing)}: make it as it was made before")
+                raise ValueError(f"it was a {name}, and is a {_class_name(existing)} when made again")
             existing = _NEW[name]()
         self._used.add(id(existing))
         self._made[number] = existing
-        old = vars(existing) if node["kind"] == "attributes" else None
-        _STATES[node["kind"]][2](existing, self.decode(node["state"], old))
+        _STATES[node["kind"]][2](existing, self.decode(node["state"]))
+
+    def _object(self, node: Node, existing: Any, number: int) -> Any:
+        self._unchanged(node, existing, number)
+        if id(existing) in self._used:
+            raise ValueError(f"it was a second {node['name']}, and is the same one when made again")
+        self._used.add(id(existing))
+        self._made[number] = existing
+        if node["own"] is not None:
+            existing.restore_checkpoint_state(self.decode(node["own"]))
+        self.decode_into(existing, node["attributes"])
         return existing
 
-    def _view(self, node: Node, existing: Any, number: int) -> np.ndarray:
-        owner = self.decode(node["of"])
-        return np.ndarray(tuple(node["shape"]), owner.dtype, owner, node["offset"], tuple(node["strides"]))
-
-    def _layer(self, node: Node, existing: Any, number: int) -> Any:
-        raise LostValue("it was an environment that is another now")
+    def _lost(self, node: Node, existing: Any, number: int) -> Any:
+        raise ValueError(node["reason"])
 
     def _unchanged(self, node: Node, existing: Any, number: int) -> Any:
-        name = node["name"]
-        if name in _PLAIN_TYPES:
-            return _PLAIN_TYPES[name]
-        if (type(existing).__qualname__, name_of(existing)) == (node["class"], name):
-            return existing
-        found = name_of(existing) or f"a {type(existing).__qualname__}"
-        raise LostValue(f"it was {name or 'a ' + node['class']}, and is {found} when made again")
+        if _name_of(existing) != node["name"]:
+            raise ValueError(f"it was {node['name']}, and is {_name_of(existing)} when made again")
+        return existing
+
+    def _enum(self, node: Node, existing: Any, number: int) -> Any:
+        return type(self._unchanged(node, existing, number))(self.decode(node["value"]))
 
     def _function(self, node: Node, existing: Any, number: int) -> Any:
-        self._made[number] = self._unchanged({"class": "function", "name": node["name"]}, existing, number)
-        state = self.decode(node["state"], function_state(existing))
-        for name, cell in zip(existing.__code__.co_freevars, existing.__closure__ or (), strict=True):
-            if name in state["variables"]:
-                cell.cell_contents = state["variables"][name]
-        if "defaults" in state:
-            existing.__defaults__, existing.__kwdefaults__ = state["defaults"], state["keywords"]
-        vars(existing).update(state["attributes"])
-        existing.__globals__.update(state["globals"])
+        self._made[number] = self._unchanged(node, existing, number)
+        cells = existing.__closure__ or ()
+        contents = self.decode(node["cells"], [cell.cell_contents for cell in cells])
+        for cell, content in zip(cells, contents, strict=True):
+            cell.cell_contents = content
         return existing
 
     def _method(self, node: Node, existing: Any, number: int) -> Any:
         method = getattr(self.decode(node["of"], getattr(existing, "__self__", None)), node["name"], None)
-        if not isinstance(method, _METHODS):
-            raise LostValue(f"it was the method {node['name']}, which is not there now")
+        if method is None:
+            raise ValueError(f"it was the method {node['name']}, which is not there now")
         return method
-
-    def _partial(self, node: Node, existing: Any, number: int) -> Any:
-        old = [existing.func, existing.args, existing.keywords] if isinstance(existing, functools.partial) else None
-        function, arguments, keywords = self.decode(node["parts"], old)
-        return functools.partial(function, *arguments, **keywords)
-
-    def _enum(self, node: Node, existing: Any, number: int) -> Any:
-        kind: Any = sys.modules.get(node["module"])
-        for part in node["name"].split("."):
-            kind = getattr(kind, "__dict__", {}).get(part)
-        with suppress(KeyError, ValueError, TypeError):
-            if issubclass(kind, Enum):
-                return kind(node["member"]) if issubclass(kind, Flag) else kind[node["member"]]
-        raise LostValue(f"it was {node['name']}.{node['member']}, which is not there now")

@@ -26,9 +26,7 @@ def restore_physics(data: mujoco.MjData, arrays: dict[str, np.ndarray]) -> None:
     """Put back what :func:`capture_physics` returned; ValueError when it is of another simulation."""
     size, own = len(arrays[""]), mujoco.mj_stateSize(data.model, _KIND)
     if size != own:
-        raise ValueError(
-            f"the checkpoint's simulator has a state of size {size}, this one of {own}: use the same task and the same MuJoCo"
-        )
+        raise ValueError(f"the simulator had {size} state variables, this one has {own}")
     mujoco.mj_setState(data.model, data, arrays[""], _KIND)
     mujoco.mj_forward(data.model, data)
     for name, value in physics_arrays(data).items():

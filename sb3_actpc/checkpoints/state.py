@@ -3,10 +3,11 @@
 import inspect
 import json
 import random
-import warnings
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import NoneType
 from typing import Any
 
 import numpy as np
@@ -15,16 +16,15 @@ import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.logger import CSVOutputFormat, TensorBoardOutputFormat, configure
-from stable_baselines3.common.noise import VectorizedActionNoise
+from stable_baselines3.common.logger import CSVOutputFormat
 from stable_baselines3.common.save_util import recursive_getattr
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_actpc.checkpoints.bundle import Bundle, Report, Write
 from sb3_actpc.checkpoints.encoding import Decoder, Encoder
-from sb3_actpc.checkpoints.simulators import capture_vec_env, env_name, restore_vec_env, set_attributes, vec_env_layers
 from sb3_actpc.utils.extras import installed_version
+from sb3_actpc.utils.tasks import task_id
 from sb3_actpc.utils.weights import check_weights
 
 STATE, ARRAYS = "state.json", "arrays.safetensors"
@@ -35,7 +35,8 @@ _COUNTERS = (
 )
 _BUFFER_CURSORS = ("pos", "full", "_current_ep_start")
 _NOISE_MATRICES = ("exploration_mat", "exploration_matrices")  # of SB3's state-dependent exploration
-_CALLBACK_SKIPPED = {"model", "locals", "globals", "parent", "callback", "callbacks", "logger"}
+# of attributes of callbacks, and of logged values
+_KEPT = (bool, int, float, str, NoneType, list, tuple, dict, set, deque, np.ndarray, np.generic, th.Tensor, VecEnv)
 _LOGGER_VALUES = ("name_to_value", "name_to_count", "name_to_excluded")
 _RECORDED_PACKAGES = ("sb3-actpc", "stable-baselines3", "torch", "gymnasium", "mujoco", "numpy", "safetensors")
 
@@ -52,28 +53,35 @@ class Restored:
 
 
 def capture_model(model: BaseAlgorithm, callbacks: Sequence[BaseCallback], write: Write) -> None:
-    """Write everything that the rest of the training depends on, between two rollouts, or between two updates before the
-    first; ValueError when a weight is not finite."""
+    """Write everything that the rest of the training depends on, between two rollouts; ValueError when a weight is not finite,
+    or the agent holds what cannot be stored."""
     check_weights(model)
     encoder = Encoder()
-    assert model.env is not None
+    buffer = getattr(model, "replay_buffer", None)
     dicts, variables = model._get_torch_save_params()
     values = {
         "counters": {name: vars(model)[name] for name in _COUNTERS if name in vars(model)},
         "dicts": {name: dict(recursive_getattr(model, name).state_dict()) for name in dicts},
         "variables": {name: recursive_getattr(model, name) for name in variables},
         "matrices": {name: getattr(_action_dist(model), name, None) for name in _NOISE_MATRICES},
-        "generators": _generators(model),
+        "generators": {
+            "python": random.getstate(),
+            "numpy": np.random.get_state(legacy=False),
+            "torch": th.get_rng_state(),
+            "cuda": th.cuda.get_rng_state(model.device) if model.device.type == "cuda" else None,
+        },
         "spaces": [model.action_space, model.observation_space],
         "noise": getattr(model, "action_noise", None),
         "own": _own_state(model),
+        "buffer": None if buffer is None else _buffer_state(buffer, write),
     }
-    state = {
-        "env": capture_vec_env(model.env, encoder, "env"),
-        **{name: encoder.encode(value, name) for name, value in values.items()},
-        "buffer": _capture_buffer(model, encoder, write),
-        "callbacks": {name: _capture_callback(one, encoder, name) for name, one in _named(callbacks).items()},
-        "logger": _capture_logger(model, encoder),
+    state = encoder.encode_each(values)
+    if encoder.lost:
+        raise ValueError(f"the agent holds what no checkpoint can: {'; '.join(encoder.lost)}")
+    state |= {
+        "env": encoder.encode(model.env),
+        "callbacks": {name: encoder.encode_each(_callback_state(one)) for name, one in _named(callbacks).items()},
+        "logger": encoder.encode(_logger_state(model)),
     }
     arrays = {name: np.ascontiguousarray(array).reshape(array.shape) for name, array in encoder.arrays.items()}
     write(ARRAYS, safetensors.numpy.save(arrays))
@@ -82,20 +90,17 @@ def capture_model(model: BaseAlgorithm, callbacks: Sequence[BaseCallback], write
 
 def describe_model(model: BaseAlgorithm) -> dict[str, Any]:
     """Plain values by which a checkpoint of another agent or task is recognised, and the versions."""
-    buffer = replay_buffer(model)
-    arrays = {} if buffer is None else buffer_arrays(buffer)
+    buffer = getattr(model, "replay_buffer", None)
+    arrays = {**model.policy.state_dict(), **({} if buffer is None else buffer_arrays(buffer))}
     assert model.env is not None
     return {
         "agent": {
             "algorithm": type(model).__name__,
-            "env": env_name(model.env),
+            "env": task_id(model.env),
             "n_envs": model.n_envs,
             "observation_space": str(model.observation_space),
             "action_space": str(model.action_space),
-            "replay_buffer": None if buffer is None else type(buffer).__name__,
-            "buffer_size": None if buffer is None else buffer.buffer_size,
-            **{f"replay buffer's {name}": f"{array.dtype} {array.shape}" for name, array in arrays.items()},
-            **{f"shape of {name}": list(tensor.shape) for name, tensor in model.policy.state_dict().items()},
+            **{f"shape of {name}": f"{array.dtype} {tuple(array.shape)}" for name, array in arrays.items()},
         },
         "versions": {name: installed_version(name) for name in _RECORDED_PACKAGES},
     }
@@ -106,23 +111,29 @@ def restore_model(model: BaseAlgorithm, bundle: Bundle, report: Report) -> Resto
     once ``learn(..., reset_num_timesteps=False)`` has begun. ValueError, and nothing is changed, when the checkpoint is of
     another algorithm, task, network or buffer."""
     assert model.env is not None
-    _check_fit(describe_model(model)["agent"], bundle)
-    state, arrays = json.loads(bundle.read_bytes(STATE)), safetensors.numpy.load(bundle.read_bytes(ARRAYS))
+    mine, stored = describe_model(model)["agent"], bundle.manifest["agent"]
+    for name in {**mine, **stored}:
+        if stored.get(name) != mine.get(name):
+            raise ValueError(
+                f"{bundle.path} is a checkpoint with {name}={stored.get(name)!r}, the agent has {name}={mine.get(name)!r}: "
+                "resume with the settings and the task of the stopped run"
+            )
+    state, arrays = json.loads((bundle.path / STATE).read_bytes()), safetensors.numpy.load_file(bundle.path / ARRAYS)
     decoder = Decoder(state["nodes"], arrays)
-    lost = restore_vec_env(model.env, state["env"], decoder)
+    decoder.decode(state["env"], model.env)
+    lost = list(decoder.lost)
     for name, values in decoder.decode(state["dicts"]).items():
         recursive_getattr(model, name).load_state_dict(values)
     for name, value in decoder.decode(state["variables"]).items():
         recursive_getattr(model, name).data = value.to(model.device)
-    _restore_buffer(model, state["buffer"], bundle, decoder)
+    if (buffer := decoder.decode(state["buffer"])) is not None:
+        _restore_buffer(getattr(model, "replay_buffer", None), buffer, bundle)
     vars(model).update(decoder.decode(state["counters"]))
     _restore_own_state(model, decoder.decode(state["own"]))
-    restored = Restored(model, state, Decoder(state["nodes"], arrays), bool(lost))
-    _restore_noise(model, state["noise"], decoder)
-    _restore_random(model, state, decoder)
     if lost:
-        _start_episodes_again(model, lost, report)
-    return restored
+        report(f"environments cannot be restored within their episodes, all episodes start again: {'; '.join(lost)}")
+        _start_episodes_again(model)
+    return Restored(model, state, Decoder(state["nodes"], arrays), bool(lost))
 
 
 def restore_learning(restored: Restored, callbacks: Sequence[BaseCallback]) -> None:
@@ -131,26 +142,26 @@ def restore_learning(restored: Restored, callbacks: Sequence[BaseCallback]) -> N
     model, state, decoder = restored.model, restored.state, restored.decoder
     for name, callback in _named(callbacks).items():
         if name in state["callbacks"]:
-            _restore_callback(callback, state["callbacks"][name], decoder)
+            kept = state["callbacks"][name]
+            if hasattr(callback, "restore_checkpoint_state"):
+                callback.restore_checkpoint_state({key: decoder.decode(node) for key, node in kept.items()})
+            else:
+                decoder.decode_into(callback, kept)
             if restored.starts_again and hasattr(callback, "cut_running_episodes"):
                 callback.cut_running_episodes()
-    if state["logger"] is not None:
-        _restore_logger(model, state["logger"], decoder)
-    _restore_noise(model, state["noise"], decoder)
+    if (logger := decoder.decode(state["logger"])) is not None:
+        _restore_logger(model, logger)
+    decoder.decode(state["noise"], getattr(model, "action_noise", None))
     for name, value in decoder.decode(state["matrices"]).items():
         if value is not None:
             setattr(_action_dist(model), name, value.to(model.device))
-    _restore_random(model, state, decoder)
-
-
-def _check_fit(mine: dict[str, Any], bundle: Bundle) -> None:
-    stored = bundle.manifest["agent"]
-    for name in {**mine, **stored}:
-        if stored.get(name) != mine.get(name):
-            raise ValueError(
-                f"{bundle.path} is a checkpoint with {name}={stored.get(name)!r}, the agent has {name}={mine.get(name)!r}: "
-                "resume with the settings and the task of the stopped run"
-            )
+    decoder.decode(state["spaces"], [model.action_space, model.observation_space])
+    states = decoder.decode(state["generators"])
+    random.setstate(states["python"])
+    np.random.set_state(states["numpy"])
+    th.set_rng_state(states["torch"])
+    if states["cuda"] is not None and model.device.type == "cuda":
+        th.cuda.set_rng_state(states["cuda"], model.device)
 
 
 # ------------------------------------------------------------------ the agent
@@ -177,40 +188,7 @@ def _action_dist(model: BaseAlgorithm) -> Any:
     return getattr(getattr(model, "actor", model.policy), "action_dist", None) if model.use_sde else None
 
 
-def _restore_noise(model: BaseAlgorithm, node: Any, decoder: Decoder) -> None:
-    if node is None:
-        return
-    noise, kind = getattr(model, "action_noise", None), decoder.nodes[node[0]]["name"]
-    if noise is None:
-        raise ValueError(f"the checkpoint's agent has the action noise {kind}, this one none: pass action_noise=")
-    if kind == VectorizedActionNoise.__name__ and not isinstance(noise, VectorizedActionNoise):
-        noise = model.action_noise = VectorizedActionNoise(noise, model.n_envs)
-    decoder.decode(node, noise)
-
-
-def _generators(model: BaseAlgorithm) -> dict[str, Any]:
-    states = {"python": random.getstate(), "numpy": np.random.get_state(legacy=False), "torch": th.get_rng_state()}
-    if model.device.type == "cuda":
-        states["cuda"] = th.cuda.get_rng_state(model.device)
-    return states
-
-
-def _restore_random(model: BaseAlgorithm, state: dict[str, Any], decoder: Decoder) -> None:
-    decoder.decode(state["spaces"], [model.action_space, model.observation_space])
-    states = decoder.decode(state["generators"])
-    random.setstate(states["python"])
-    np.random.set_state(states["numpy"])
-    th.set_rng_state(states["torch"])
-    if "cuda" in states and model.device.type == "cuda":
-        th.cuda.set_rng_state(states["cuda"], model.device)
-
-
 # ------------------------------------------------------------------ the buffer
-
-
-def replay_buffer(model: BaseAlgorithm) -> ReplayBuffer | None:
-    """An algorithm that learns on policy has none: its rollouts begin empty."""
-    return getattr(model, "replay_buffer", None)
 
 
 def buffer_arrays(buffer: ReplayBuffer) -> dict[str, np.ndarray]:
@@ -222,124 +200,72 @@ def buffer_arrays(buffer: ReplayBuffer) -> dict[str, np.ndarray]:
     return {name: array for name, array in arrays.items() if array.shape[:1] == (buffer.buffer_size,)}
 
 
-def _capture_buffer(model: BaseAlgorithm, encoder: Encoder, write: Write) -> dict[str, Any] | None:
-    buffer = replay_buffer(model)
-    if buffer is None:
-        return None
+def _buffer_state(buffer: ReplayBuffer, write: Write) -> dict[str, Any]:
     # with ``optimize_memory_usage`` the row after the last holds an observation
     rows = buffer.buffer_size if buffer.full else min(buffer.pos + 1, buffer.buffer_size)
     for index, array in enumerate(buffer_arrays(buffer).values()):
         write(f"buffer_{index:02d}.npy", array[:rows])
     infos = buffer.infos[:rows].tolist() if isinstance(buffer, HerReplayBuffer) and buffer.copy_info_dict else []
-    return {
-        "rows": rows,
-        "cursors": encoder.encode({name: vars(buffer)[name] for name in _BUFFER_CURSORS if name in vars(buffer)}, "cursors"),
-        "own": encoder.encode(_own_state(buffer), "buffer"),
-        "infos": encoder.encode(infos, "infos"),
-    }
+    cursors = {name: vars(buffer)[name] for name in _BUFFER_CURSORS if name in vars(buffer)}
+    return {"rows": rows, "cursors": cursors, "own": _own_state(buffer), "infos": infos}
 
 
-def _restore_buffer(model: BaseAlgorithm, record: dict[str, Any] | None, bundle: Bundle, decoder: Decoder) -> None:
-    buffer = replay_buffer(model)
-    if buffer is None or record is None:
-        return
-    rows, was_used = record["rows"], buffer.full or buffer.pos > 0
+def _restore_buffer(buffer: Any, state: dict[str, Any], bundle: Bundle) -> None:
     for index, array in enumerate(buffer_arrays(buffer).values()):
-        array[:rows] = bundle.read_array(f"buffer_{index:02d}.npy")
-        if was_used:  # a new one's pages need not be touched
-            array[rows:] = 0
-    vars(buffer).update(decoder.decode(record["cursors"]))
-    _restore_own_state(buffer, decoder.decode(record["own"]))
-    for row, entries in enumerate(decoder.decode(record["infos"])):
-        buffer.infos[row] = entries  # type: ignore[attr-defined]
+        array[: state["rows"]] = np.load(bundle.path / f"buffer_{index:02d}.npy", mmap_mode="r", allow_pickle=False)
+    vars(buffer).update(state["cursors"])
+    _restore_own_state(buffer, state["own"])
+    for row, entries in enumerate(state["infos"]):
+        buffer.infos[row] = entries
 
 
-def _start_episodes_again(model: BaseAlgorithm, lost: list[tuple[int, str]], report: Report) -> None:
+def _start_episodes_again(model: BaseAlgorithm) -> None:
     """``learn`` resets the environments when there is no last observation."""
-    buffer = replay_buffer(model)
     assert model.env is not None
-    if model.seed is not None and not isinstance(vec_env_layers(model.env)[-1], DummyVecEnv):
+    if model.seed is not None and not isinstance(model.env.unwrapped, DummyVecEnv):
         model.env.seed((model.seed + model.num_timesteps) % 2**31)  # their generators are out of reach
-    for index, reason in lost:
-        report(f"environment {index} cannot be restored within its episode, all episodes start again: {reason}")
-    if buffer is not None:
-        _cut_running_episodes(buffer)
+    for name in ("cut_running_episodes", "truncate_last_trajectory"):  # of this package's buffers, and SB3's for hindsight
+        if cut := getattr(getattr(model, "replay_buffer", None), name, None):
+            cut()
+            break
     model._last_obs = None
-
-
-def _cut_running_episodes(buffer: ReplayBuffer) -> None:
-    """The episodes begun will not be finished: as ``cut_running_episodes`` of this package's buffers does it."""
-    if hasattr(buffer, "cut_running_episodes"):
-        buffer.cut_running_episodes()
-    elif isinstance(buffer, HerReplayBuffer):
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            buffer.truncate_last_trajectory()
-    elif buffer.full or buffer.pos > 0:
-        newest = (buffer.pos - 1) % buffer.buffer_size
-        open_ends = buffer.dones[newest] == 0
-        buffer.dones[newest][open_ends] = 1.0
-        buffer.timeouts[newest][open_ends] = 1.0
 
 
 # ------------------------------------------------------------------ callbacks and logger
 
 
-def _capture_callback(callback: BaseCallback, encoder: Encoder, where: str) -> dict[str, Any]:
+def _callback_state(callback: Any) -> dict[str, Any]:
+    """What it says itself, or its attributes but arguments of its constructor, bars, figures and open files: of these the new
+    callback has its own."""
     if hasattr(callback, "checkpoint_state"):
-        return {"own": encoder.encode(_own_state(callback), where)}
-    envs = {name: value for name, value in vars(callback).items() if isinstance(value, VecEnv)}
-    left_out = {*inspect.signature(type(callback).__init__).parameters, *_CALLBACK_SKIPPED, *envs}
-    kept = {name: value for name, value in vars(callback).items() if name not in left_out}
-    return {
-        "attributes": encoder.encode_some(kept, where),  # of bars, figures and open files the new callback has its own
-        "envs": {name: capture_vec_env(env, encoder, f"{where}.{name}") for name, env in envs.items()},
-    }
-
-
-def _restore_callback(callback: BaseCallback, record: dict[str, Any], decoder: Decoder) -> None:
-    if "own" in record:
-        _restore_own_state(callback, decoder.decode(record["own"]))
-        return
-    set_attributes(callback, record["attributes"], decoder)
-    for name, env_record in record["envs"].items():
-        restore_vec_env(vars(callback)[name], env_record, decoder)
+        return dict(callback.checkpoint_state())
+    left_out = {*inspect.signature(type(callback).__init__).parameters, "locals", "globals"}
+    held = {name: value for name, value in vars(callback).items() if name not in left_out or isinstance(value, VecEnv)}
+    return {name: value for name, value in held.items() if isinstance(value, _KEPT)}
 
 
 def _csv_formats(model: BaseAlgorithm) -> list[CSVOutputFormat]:
     return [output for output in model.logger.output_formats if isinstance(output, CSVOutputFormat)]
 
 
-def _capture_logger(model: BaseAlgorithm, encoder: Encoder) -> dict[str, Any] | None:
+def _logger_state(model: BaseAlgorithm) -> dict[str, Any] | None:
     if not hasattr(model, "_logger"):
         return None
     texts = []
     for output in _csv_formats(model):
         output.file.flush()
         texts.append(Path(output.file.name).read_text(encoding="utf-8"))
-    boards = [one.writer.log_dir for one in model.logger.output_formats if isinstance(one, TensorBoardOutputFormat)]
-    return {
-        # figures and videos, which cannot be stored, belong to the next dump only
-        "values": {name: encoder.encode_some(getattr(model.logger, name), "logger") for name in _LOGGER_VALUES},
-        "csv": texts,
-        "tensorboard": Path(boards[0]).name if boards else None,
-    }
+    values = {name: getattr(model.logger, name) for name in _LOGGER_VALUES}
+    # figures and videos belong to the next dump only
+    return {**{name: {k: v for k, v in one.items() if isinstance(v, _KEPT)} for name, one in values.items()}, "csv": texts}
 
 
-def restore_tensorboard(restored: Restored) -> None:
-    """Let the curves go on in the folder of the stopped run, unless the agent has its own logger or no folder for them."""
-    model, name = restored.model, (restored.state["logger"] or {}).get("tensorboard")
-    if name is not None and model.tensorboard_log is not None and not model._custom_logger:
-        shown = ["stdout"] if model.verbose else []
-        model.set_logger(configure(str(Path(model.tensorboard_log) / name), [*shown, "tensorboard"]))
-
-
-def _restore_logger(model: BaseAlgorithm, record: dict[str, Any], decoder: Decoder) -> None:
-    for name, values in record["values"].items():
+def _restore_logger(model: BaseAlgorithm, state: dict[str, Any]) -> None:
+    for name in _LOGGER_VALUES:
         target = getattr(model.logger, name)
         target.clear()
-        target.update({key: decoder.decode(node) for key, node in values.items()})
-    for output, text in zip(_csv_formats(model), record["csv"], strict=False):
+        target.update(state[name])
+    for output, text in zip(_csv_formats(model), state["csv"], strict=False):
         output.file.seek(0)
         output.file.truncate()
         output.file.write(text)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import multiprocessing
-import shutil
 from collections.abc import Callable
 from copy import deepcopy
 from pathlib import Path
@@ -81,7 +80,6 @@ def learn_in_two(
         assert stopped.num_timesteps >= stop_at
     else:
         raise AssertionError("the run was not stopped")
-    shutil.copy(folder / "progress.csv", folder / "progress_of_the_stopped_run.csv")
     second = make()
     np.random.random(13)
     th.randn(7)

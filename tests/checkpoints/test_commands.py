@@ -9,18 +9,15 @@ import threading
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import yaml
-from stable_baselines3 import SAC, TD3
+from stable_baselines3 import TD3
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_actpc import ActPC
-from sb3_actpc.actpc.reward_signals import PriorError
 from sb3_actpc.checkpoints import EXIT_STOPPED, CheckpointCallback, TrainingStopped, continue_learning, list_bundles, restore
 from sb3_actpc.cli import main
-from sb3_actpc.demonstrations.dataset import Demonstrations
 from tests.actpc.envs import CountingEnv
 from tests.checkpoints.runs import assert_equal, log_rows, make_actpc
 
@@ -28,71 +25,32 @@ TRAIN = ["train", "--env", "SparseReacher-v5", "--preset", "small.yml", "--demon
 TRAIN += ["--eval-freq", "60", "--eval-episodes", "1", "--checkpoint-freq", "40"]
 
 
-@pytest.fixture(autouse=True)
-def small_preset(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture
+def straight(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Folder of the run that is never stopped, of seconds."""
     monkeypatch.chdir(tmp_path)
-    write_preset()
-
-
-@pytest.fixture(scope="module")
-def straight(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folder of the run that is never stopped."""
-    folder = tmp_path_factory.mktemp("straight")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(folder)
-        write_preset()
-        assert main([*TRAIN, "--output", "run"]) == 0
-    return folder / "run"
-
-
-def write_preset(**more: Any) -> None:
-    """``small.yml``, a run of seconds."""
-    settings = {
-        "n_timesteps": 180,
-        "settling": "scheduled",
-        "learning_starts": 20,
-        "batch_size": 16,
-        "buffer_size": 100,
-        "policy_kwargs": {"net_arch": [16, 16]},
-        "train_freq": [2, "step"],
-        "gradient_steps": 3,
-        "learning_rate": "lin_1e-3",
-        "noise_type": "ornstein-uhlenbeck",
-        "noise_std": 0.1,
-        **more,
-    }
+    settings = {"n_timesteps": 180, "settling": "scheduled", "learning_starts": 20, "batch_size": 16, "buffer_size": 100}
+    settings |= {"policy_kwargs": {"net_arch": [16, 16]}, "train_freq": [2, "step"], "gradient_steps": 3}
+    settings |= {"learning_rate": "lin_1e-3", "noise_type": "ornstein-uhlenbeck", "noise_std": 0.1}
     Path("small.yml").write_text(yaml.safe_dump({"default": settings}), encoding="utf-8")
+    assert main([*TRAIN, "--output", "straight"]) == 0
+    return Path("straight")
 
 
-def assert_same_run(straight: Path, stopped: Path) -> None:
-    """Evaluations, logs and agents are equal."""
-    for name in ("progress.csv", "episodes.csv", "diagnostics.csv"):
-        assert log_rows(straight / name) == log_rows(stopped / name) != []
-    one, two = (ActPC.load(folder / "model.zip") for folder in (straight, stopped))
-    assert_equal(one.policy.state_dict(), two.policy.state_dict(), "policy")
-
-
-def signal_at(step: int, number: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Send this process a real signal once, as a transition is stored, from an environment step on."""
-    sent = []
-    original = ActPC._store_transition
-
-    def send(self: ActPC, *arguments: Any) -> Any:
-        if self.num_timesteps >= step and not sent:
-            sent.append(step)
-            os.kill(os.getpid(), number)
-        return original(self, *arguments)
-
-    monkeypatch.setattr(ActPC, "_store_transition", send)
-
-
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_a_stopped_run_goes_on_as_if_it_never_was(
-    number: int, straight: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    straight: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     handlers = [signal.getsignal(one) for one in (signal.SIGTERM, signal.SIGINT)]
+    original, sent = ActPC._store_transition, []
+
+    def send(self: ActPC, *arguments: Any) -> Any:
+        if self.num_timesteps >= 97 and not sent:
+            sent.append(True)
+            os.kill(os.getpid(), signal.SIGINT)
+        return original(self, *arguments)
+
     with monkeypatch.context() as patch:
-        signal_at(97, number, patch)
+        patch.setattr(ActPC, "_store_transition", send)
         assert main([*TRAIN, "--output", "stopped"]) == EXIT_STOPPED
     assert "saved in stopped/checkpoints/" in (message := capsys.readouterr().err)
     assert "sb3-actpc train --resume stopped" in message
@@ -100,74 +58,16 @@ def test_a_stopped_run_goes_on_as_if_it_never_was(
     assert not Path("stopped/result.json").exists()
     assert main([*TRAIN, "--output", "stopped"]) == 2  # it is not overwritten
     assert main(["train", "--resume", "stopped", "--no-progress"]) == 0
-    assert_same_run(straight, Path("stopped"))
+    for name in ("progress.csv", "episodes.csv", "diagnostics.csv"):
+        assert log_rows(straight / name) == log_rows(Path("stopped") / name) != []
+    one, two = (ActPC.load(folder / "model.zip") for folder in (straight, Path("stopped")))
+    assert_equal(one.policy.state_dict(), two.policy.state_dict(), "policy")
     with open("stopped/progress.csv", encoding="utf-8") as file:
         seconds = [float(row["seconds"]) for row in csv.DictReader(file)]
     assert seconds == sorted(seconds)
     assert len(list_bundles("stopped/checkpoints")) == 1  # of the end
     assert main(["train", "--resume", "stopped"]) == 2
     assert "is finished: say with --steps how many more" in capsys.readouterr().err
-
-
-def test_a_run_stopped_in_its_pretraining_goes_on_as_if_it_never_was(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    write_preset(n_timesteps=90, alpha_in=0.5, prior_updates=6, guidance_kwargs={"bc_updates": 4, "critic_warmup": 9})
-    rows = np.random.default_rng(0).uniform(-1.0, 1.0, (30, 10))
-    nothing = np.zeros(30)
-    Demonstrations(rows, rows[:, :2], rows, nothing, nothing, np.array([0]), "SparseReacher-v5").save("demonstrations.npz")
-    train = ["demonstrations.npz" if word == "none" else word for word in TRAIN]
-    assert main([*train, "--output", "straight"]) == 0
-    with monkeypatch.context() as patch:
-        original, sent = PriorError.update, []
-
-        def send(self: PriorError, *arguments: Any) -> None:
-            if not sent:
-                sent.append(True)
-                os.kill(os.getpid(), signal.SIGINT)
-            original(self, *arguments)
-
-        patch.setattr(PriorError, "update", send)
-        assert main([*train, "--output", "stopped"]) == EXIT_STOPPED
-    assert "stopped by SIGINT at step 0" in capsys.readouterr().err
-    assert main(["train", "--resume", "stopped", "--no-progress"]) == 0
-    assert_same_run(Path("straight"), Path("stopped"))
-
-
-def test_a_damaged_checkpoint_is_named_and_the_one_before_used(
-    straight: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with monkeypatch.context() as patch:
-        signal_at(97, signal.SIGTERM, patch)
-        assert main([*TRAIN, "--output", "stopped"]) == EXIT_STOPPED
-    (list_bundles("stopped/checkpoints")[-1] / "state.json").write_bytes(b"{")
-    assert main(["train", "--resume", "stopped", "--no-progress"]) == 0
-    assert "damaged checkpoint skipped: stopped/checkpoints/000003_step_98: state.json" in capsys.readouterr().out
-    assert_same_run(straight, Path("stopped"))
-
-
-def test_a_run_with_checkpoints_is_left_alone_and_the_next_gets_another_folder(monkeypatch: pytest.MonkeyPatch) -> None:
-    with monkeypatch.context() as patch:
-        signal_at(97, signal.SIGTERM, patch)
-        assert main(TRAIN) == EXIT_STOPPED
-    assert main(TRAIN) == 0
-    assert sorted(path.name for path in Path("runs/SparseReacher-v5").iterdir()) == [
-        "actpc_small_seed0",
-        "actpc_small_seed0_2",
-    ]
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["--resume", "nowhere"], "no run in nowhere"),
-        (["--resume", "nowhere", "--seed", "9"], "--seed cannot be given with --resume"),
-        (["--env", "SparseReacher-v5", "--checkpoint-freq", "-1"], "checkpoint_freq='-1' must be at least 0"),
-    ],
-)
-def test_mistakes_are_named(arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["train", *arguments]) == 2
-    assert message in capsys.readouterr().err
 
 
 def test_a_second_signal_goes_to_the_old_handler(tmp_path: Path) -> None:
@@ -197,7 +97,7 @@ def test_outside_the_main_thread_there_are_checkpoints_but_no_handlers(tmp_path:
     assert len(list_bundles(tmp_path)) == 1 and signal.getsignal(signal.SIGTERM) is before
 
 
-@pytest.mark.parametrize("algorithm", [ActPC, TD3, SAC])
+@pytest.mark.parametrize("algorithm", [ActPC, TD3])
 def test_a_script_that_is_stopped_exits_with_the_code(tmp_path: Path, algorithm: Any) -> None:
     """Nobody has to catch anything: TrainingStopped is a SystemExit."""
     model = algorithm("MlpPolicy", make_vec_env(CountingEnv), policy_kwargs={"net_arch": [8]}, buffer_size=99, seed=0)
