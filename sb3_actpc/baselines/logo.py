@@ -17,7 +17,6 @@ from torch import nn
 
 from sb3_actpc.demonstrations.mixin import LearnsFromDemonstrations
 from sb3_actpc.utils.arguments import Count, Positive, Share, Weight, checked
-from sb3_actpc.utils.rollouts import KeepsEpisodesApart
 
 ZERO_DELTA = 6e-7  # at or below this the guidance step is left out (the authors' code)
 _NETS = ("discriminator", "guidance_value", "discriminator_optimizer", "guidance_value_optimizer")
@@ -33,7 +32,7 @@ class Guidance(NamedTuple):
     returns: th.Tensor  # (N,), targets of the guidance value net
 
 
-class LOGO(LearnsFromDemonstrations, KeepsEpisodesApart, TRPO):
+class LOGO(LearnsFromDemonstrations, TRPO):
     """Learning online with guidance offline (Rengarajan et al., arXiv 2202.04628), on sb3-contrib's TRPO.
 
     Each iteration is TRPO's on the task's reward (policy improvement), then a trust-region step of size δ on the reward

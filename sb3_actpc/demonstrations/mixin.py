@@ -43,7 +43,7 @@ class LearnsFromDemonstrations(BaseAlgorithm):
     def _check_actions(self) -> None:
         """:raises ValueError: for actions that cannot be scaled to [-1, 1], or that are whole numbers"""
         if isinstance(self.action_space, spaces.Box):
-            check_actions(self.action_space, getattr(self, "action_noise", None))
+            check_actions(self.action_space)
 
     def _fitted_demonstrations(self) -> Demonstrations:
         """The demonstrations as the environment would have recorded them.

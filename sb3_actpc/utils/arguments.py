@@ -151,22 +151,15 @@ def check_computes(name: str, device: Any) -> None:
     check_device(device)
 
 
-def check_actions(space: gym.spaces.Box, noise: ActionNoise | None) -> None:
-    """:param space: of the environment's actions
-    :param noise: of exploration; its shape is known for SB3's kinds
-    :raises ValueError: when a dimension has no finite extent, or the noise another shape
-    """
+def check_actions(space: gym.spaces.Box) -> None:
+    """:raises ValueError: when a dimension of the actions has no finite extent, or they are whole numbers"""
     with np.errstate(over="ignore", invalid="ignore"):
         is_finite = np.all(np.isfinite(space.high - space.low))  # the largest numbers that there are stand for no bound too
     if not is_finite:
-        raise ValueError(
-            f"action_space={space} must have finite bounds: give its actions those that they have, by "
-            "gymnasium.wrappers.TransformAction(env, lambda action: action, gymnasium.spaces.Box(low, high))"
-        )
+        raise ValueError(f"action_space={space} must have finite bounds: set them with gymnasium's TransformAction")
     if not np.issubdtype(space.dtype, np.floating):  # SB3's buffer would cut scaled actions off to whole numbers
         raise ValueError(
-            f"action_space={space} must have a floating dtype: wrap the environment in a gymnasium.ActionWrapper whose "
-            "action_space is Box(..., dtype=np.float32), which rounds"
+            f"action_space={space} must have a floating dtype: wrap the environment, so that it rounds its actions"
         )
     fixed = np.argwhere(space.low >= space.high)
     if len(fixed):
@@ -174,17 +167,6 @@ def check_actions(space: gym.spaces.Box, noise: ActionNoise | None) -> None:
         raise ValueError(
             f"action_space={space}: dimension {where[0] if len(where) == 1 else where} has low == high == {space.low[where]}; "
             "wrap the environment to leave it out of the action"
-        )
-    noise = getattr(noise, "base_noise", noise)
-    shapes = [np.shape(getattr(noise, part, 0.0)) for part in ("_mu", "_sigma")]
-    try:
-        fits = np.broadcast_shapes(*shapes, space.shape) == space.shape
-    except ValueError:
-        fits = False
-    if not fits:
-        raise ValueError(
-            f"action_noise has a mean and a sigma of shapes {shapes[0]} and {shapes[1]}, an action has {space.shape}: use "
-            f"NormalActionNoise(np.zeros({space.shape}), 0.1 * np.ones({space.shape}))"
         )
 
 

@@ -1,31 +1,21 @@
 """Rollouts that store their last transition and join no two episodes, also where callbacks stop or others interfere."""
 
+from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
-from stable_baselines3.common.buffers import ReplayBuffer, RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.type_aliases import MaybeCallback, RolloutReturn, TrainFreq
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_actpc.utils.env_hooks import WatchedVecEnv, copied
 
 
-class _Frequency:
-    """SB3's ``TrainFreq``, whose frequency can fall to 0: then SB3 finishes the present step and collects no more."""
-
-    def __init__(self, train_freq: TrainFreq) -> None:
-        self.frequency = train_freq.frequency
-        self.unit = train_freq.unit
-
-
 class _Deferred:
     """A callback whose wish to stop, or whose error, takes effect after the present transition is stored."""
 
-    def __init__(self, callback: BaseCallback, frequency: _Frequency, env: WatchedVecEnv) -> None:
+    def __init__(self, callback: BaseCallback, frequency: SimpleNamespace, env: WatchedVecEnv) -> None:
         self.callback = callback
         self.frequency = frequency
         self.env = env
@@ -47,14 +37,6 @@ class _Deferred:
         return getattr(self.callback, name)
 
 
-def watch(algorithm: Any) -> WatchedVecEnv:
-    """The training environment of an algorithm, watched; the same object until the algorithm is given another one."""
-    assert algorithm.env is not None
-    if algorithm._watched is None or algorithm._watched.venv is not algorithm.env:
-        algorithm._watched = WatchedVecEnv(algorithm.env)
-    return cast(WatchedVecEnv, algorithm._watched)
-
-
 class StoresLastTransition(OffPolicyAlgorithm):
     """
     Every transition is stored, as it was when it arrived, and none joins two episodes.
@@ -70,8 +52,11 @@ class StoresLastTransition(OffPolicyAlgorithm):
     _watched: WatchedVecEnv | None = None
 
     def _watch(self) -> WatchedVecEnv:
-        """The training environment, watched."""
-        return watch(self)
+        """The training environment, watched; the same object until the algorithm is given another one."""
+        assert self.env is not None
+        if self._watched is None or self._watched.venv is not self.env:
+            self._watched = WatchedVecEnv(self.env)
+        return self._watched
 
     @property
     def is_disturbed(self) -> bool:
@@ -89,7 +74,6 @@ class StoresLastTransition(OffPolicyAlgorithm):
         *args: Any,
         **options: Any,
     ) -> tuple[int, BaseCallback]:
-        self._watch().finish_step()
         self._is_reset = reset_num_timesteps or self._last_obs is None  # by SB3, before it prepares the callbacks
         result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, *args, **options)
         self._last_obs = copied(self._last_obs)
@@ -118,91 +102,16 @@ class StoresLastTransition(OffPolicyAlgorithm):
         return super()._sample_action(*args, **options)
 
     def collect_rollouts(
-        self,
-        env: VecEnv,
-        callback: BaseCallback,
-        train_freq: TrainFreq,
-        replay_buffer: ReplayBuffer,
-        action_noise: ActionNoise | None = None,
-        learning_starts: int = 0,
-        log_interval: int | None = None,
+        self, env: VecEnv, callback: BaseCallback, train_freq: TrainFreq, *args: Any, **options: Any
     ) -> RolloutReturn:
         """As SB3's."""
-        frequency = _Frequency(train_freq)
-        watched = self._watch()
-        deferred = _Deferred(callback, frequency, watched)
-        rollout = super().collect_rollouts(
-            watched,
-            cast(BaseCallback, deferred),
-            cast(TrainFreq, frequency),
-            replay_buffer,
-            action_noise,
-            learning_starts,
-            log_interval,
-        )
+        # SB3's, but the frequency can fall to 0: then SB3 finishes the present step and collects no more
+        frequency: Any = SimpleNamespace(frequency=train_freq.frequency, unit=train_freq.unit)
+        deferred = _Deferred(callback, frequency, self._watch())
+        rollout = super().collect_rollouts(self._watch(), cast(BaseCallback, deferred), frequency, *args, **options)
         if deferred.error is not None:
             raise deferred.error
         return RolloutReturn(rollout.episode_timesteps, rollout.n_episodes, not deferred.stops)
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_watched", "_is_reset"]
-
-
-class _CutsEpisodes:
-    """A callback after which the running episodes end, as by a time limit, where it has moved the training environment."""
-
-    def __init__(self, callback: BaseCallback, algorithm: OnPolicyAlgorithm, env: WatchedVecEnv) -> None:
-        self.callback = callback
-        self.algorithm = algorithm
-        self.env = env
-
-    def on_rollout_start(self) -> None:
-        self.callback.on_rollout_start()
-        if self.env.is_disturbed:
-            self.algorithm._last_obs = self.env.reset()
-            self.algorithm._last_episode_starts = np.ones(self.env.num_envs, dtype=bool)
-
-    def on_step(self) -> bool:
-        goes_on = self.callback.on_step()
-        if self.env.is_disturbed:
-            step = self.callback.locals
-            for env in np.flatnonzero(~step["dones"]):
-                step["infos"][env] |= {"terminal_observation": step["new_obs"][env].copy(), "TimeLimit.truncated": True}
-            step["dones"][:] = True
-            step["new_obs"][:] = self.env.reset()
-        return goes_on
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self.callback, name)
-
-
-class KeepsEpisodesApart(OnPolicyAlgorithm):
-    """
-    On-policy rollouts with array observations in which no transition joins two episodes.
-
-    Someone else can step or reset the training environment, as ``evaluate_policy`` does. Then the running episodes end as by a
-    time limit, and the environment is reset before the next action. See SB3 issue 1684. Observations are copied.
-    """
-
-    _watched: WatchedVecEnv | None = None
-
-    def _setup_learn(self, *args: Any, **options: Any) -> tuple[int, BaseCallback]:
-        watched = watch(self)
-        watched.finish_step()
-        before = self._last_obs
-        result = super()._setup_learn(*args, **options)
-        if self._last_obs is not before:  # SB3 has reset the environment
-            watched.mark()
-        self._last_obs = copied(self._last_obs)
-        return result
-
-    def collect_rollouts(
-        self, env: VecEnv, callback: BaseCallback, rollout_buffer: RolloutBuffer, n_rollout_steps: int
-    ) -> bool:
-        """As SB3's."""
-        watched = watch(self)
-        apart = cast(BaseCallback, _CutsEpisodes(callback, self, watched))
-        return super().collect_rollouts(watched, apart, rollout_buffer, n_rollout_steps)
-
-    def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_watched"]

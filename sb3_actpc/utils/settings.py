@@ -72,9 +72,7 @@ def _name_value(value: Any) -> Any:
         return os.fspath(value)
     if isinstance(value, TrainFreq):
         return {"tuple": [value.frequency, value.unit.value]}
-    if isinstance(value, dict):
-        if not all(isinstance(key, str) for key in value):
-            raise ValueError(f"{value!r} has keys that are not texts")
+    if isinstance(value, dict) and all(isinstance(key, str) for key in value):
         return {"dict": {key: _name_value(part) for key, part in value.items()}}
     if isinstance(value, (list, tuple)):
         parts = [_name_value(part) for part in value]
@@ -103,18 +101,16 @@ def _read_value(node: Any) -> Any:
         return [_read_value(part) for part in node]
     if not isinstance(node, dict):
         return node
-    (kind, content), *others = node.items()
-    if others or kind not in ("tuple", "dict", "class", "object"):
-        raise ValueError(f"a setting is stored as {sorted(node)}, which this version does not know")
+    [(kind, content)] = node.items()
     if kind == "tuple":
         return tuple(_read_value(part) for part in content)
     if kind == "dict":
         return {key: _read_value(part) for key, part in content.items()}
     if kind == "object":
         return _make_object(*content)
-    found = _find_class(str(content))
+    found = _find_class(str(content)) if kind == "class" else None
     if found is None:
-        raise ValueError(f"the class {content!r} is not one of those of {', '.join(_PACKAGES)}: it is not loaded")
+        raise ValueError(f"the {kind} {content!r} is not one of those of {', '.join(_PACKAGES)}: it is not loaded")
     return found
 
 

@@ -2,7 +2,7 @@
 
 import re
 
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
+from stable_baselines3.common.vec_env import VecEnv
 
 # as Gymnasium writes an environment: <TimeLimit<OrderEnforcing<HopperEnv<Hopper-v5>>>>
 _WRITTEN_ID = re.compile(r"<([^<>\s]+)>+$")
@@ -12,12 +12,9 @@ def task_id(env: VecEnv) -> str | None:
     """
     The Gymnasium id of its first environment; None where it has none.
 
-    Environments in other processes are asked for what they are written as: a spec holds the keywords that the environment was
-    made with, and not all of these can be sent (a function without a name, say).
+    It is asked for what it is written as: a spec holds the keywords that the environment was made with, and not all of these
+    can be sent from another process (a function without a name, say).
     """
-    if isinstance(env.unwrapped, DummyVecEnv):
-        spec = env.get_attr("spec", indices=0)[0] if env.has_attr("spec") else None
-        return None if spec is None else str(spec.id)
     try:
         written = str(env.env_method("__str__", indices=0)[0])
     except (AttributeError, NotImplementedError):  # not every kind of vectorised environment can be asked

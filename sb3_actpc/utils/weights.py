@@ -18,7 +18,6 @@ from sb3_actpc.utils.settings import constructor_settings, read_settings
 
 SelfAlgorithm = TypeVar("SelfAlgorithm", bound=OffPolicyAlgorithm)
 
-FORMAT = "sb3_actpc weights"
 VERSION = 7
 _SUFFIX = ".safetensors"
 _STATISTICS = ("mean", "var", "count")
@@ -57,7 +56,6 @@ def save_weights(model: OffPolicyAlgorithm, path: str | os.PathLike[str]) -> Pat
     settings["unnamed"] = []
     settings["keywords"].pop("demonstrations", None)
     header = {
-        "format": FORMAT,
         "version": VERSION,
         "algorithm": type(model).__name__,
         "observation_space": str(model.observation_space),
@@ -120,15 +118,11 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, th.Tensor]]:
             text = (file.metadata() or {}).get("sb3_actpc", "")
             tensors = {name: file.get_tensor(name) for name in file.keys()}
         header = json.loads(text)
-    except (safetensors.SafetensorError, ValueError) as error:
+        version = header["version"]
+    except (safetensors.SafetensorError, ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{path}: not a file of save_weights ({' '.join(str(error).split())})") from error
-    if not isinstance(header, dict) or header.get("format") != FORMAT:
-        raise ValueError(f"{path}: not a file of save_weights")
-    if header["version"] != VERSION:
-        raise ValueError(
-            f"{path} has format version {header['version']}, this sb3_actpc reads {VERSION}: load it with the version that "
-            "wrote it"
-        )
+    if version != VERSION:
+        raise ValueError(f"{path} has format version {version}, this sb3_actpc reads {VERSION}")
     return header, tensors
 
 
