@@ -6,12 +6,117 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.torch_layers import create_mlp
+from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
-from sb3_actpc.baselines.bc_policies import BCPolicy, BCRNNPolicy, CloningPolicy
-from sb3_actpc.baselines.offline_algorithm import OfflineAlgorithm
+from sb3_actpc.baselines.offline import NormalizingPolicy, OfflineAlgorithm
 from sb3_actpc.demonstrations import Demonstrations, scaled_actions
 from sb3_actpc.utils.arguments import Positive, Share, Weight, checked
+
+VALIDATION_INTERVAL = 100  # steps; ``learn`` ends with one too
+State = tuple[np.ndarray, np.ndarray]  # of a GRU, (n_layers, n, hidden_size), and the steps since it began, (n,)
+
+
+class BCPolicy(NormalizingPolicy):
+    """A multilayer perceptron.
+
+    :param observation_space: a Box
+    :param action_space: of the environment
+    :param lr_schedule: of the optimiser, AdamW
+    :param net_arch: hidden sizes, by default two of 256
+    :param optimizer_kwargs: of AdamW
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Space,
+        action_space: spaces.Box,
+        lr_schedule: Schedule,
+        net_arch: list[int] | None = None,
+        optimizer_kwargs: dict[str, Any] | None = None,
+    ) -> None:
+        super().__init__(observation_space, action_space)
+        self._build([256, 256] if net_arch is None else net_arch)
+        self.optimizer = th.optim.AdamW(self.parameters(), lr=lr_schedule(1), **(optimizer_kwargs or {}))
+
+    def _build(self, net_arch: list[int]) -> None:
+        self.network = nn.Sequential(*create_mlp(self.n_inputs, self.n_outputs, net_arch, nn.ReLU))
+
+    def forward(self, inputs: th.Tensor) -> th.Tensor:
+        """Actions (B, A), not cut to [-1, 1], from normalized observations (B, obs_dim)."""
+        return self.network(inputs)
+
+    def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        assert isinstance(observation, th.Tensor)
+        return self(self.normalized(observation)).clamp(-1, 1)
+
+
+class BCRNNPolicy(BCPolicy):
+    """A recurrent network, whose state begins anew after as many steps as the sequences that it learned from have.
+
+    :param args: spaces and schedule, as :class:`BCPolicy`'s
+    :param hidden_size: units of each GRU layer
+    :param n_layers: GRU layers
+    :param restart_every: steps after which the state begins anew
+    :param options: ``optimizer_kwargs``
+    :raises ValueError: for a keyword with a value that is not allowed
+    """
+
+    @checked
+    def __init__(
+        self,
+        *args: Any,
+        hidden_size: Positive = 256,
+        n_layers: Positive = 1,
+        restart_every: Positive = 10,
+        **options: Any,
+    ) -> None:
+        self.hidden_size, self.n_layers, self.restart_every = hidden_size, n_layers, restart_every
+        super().__init__(*args, **options)
+
+    def _build(self, net_arch: list[int]) -> None:
+        self.memory = nn.GRU(self.n_inputs, self.hidden_size, self.n_layers, batch_first=True)
+        self.head = nn.Linear(self.hidden_size, self.n_outputs)
+
+    def forward(self, inputs: th.Tensor) -> th.Tensor:
+        """Actions (B, T, A), not cut to [-1, 1], from sequences of normalized observations (B, T, obs_dim)."""
+        return self.head(self.memory(inputs)[0])
+
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: Any = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, State]:
+        """As SB3's: actions in the environment's units, and the next state; ``deterministic`` has no effect.
+
+        :param observation: of n environments, or of one
+        :param state: what the last call returned; None begins n episodes
+        :param episode_start: (n,), true where the state begins anew
+        """
+        self.set_training_mode(False)
+        rows, is_batch = self.obs_to_tensor(observation)
+        assert isinstance(rows, th.Tensor)
+        n = len(rows)
+        if state is None:
+            state = np.zeros((self.n_layers, n, self.hidden_size), dtype=np.float32), np.zeros(n, dtype=np.int64)
+        hidden, steps = state
+        begins = steps >= self.restart_every
+        if episode_start is not None:
+            begins = begins | np.ravel(episode_start).astype(bool)
+        kept = th.as_tensor(np.where(begins[None, :, None], np.float32(0.0), hidden), device=self.device)
+        with th.no_grad():
+            outputs, after = self.memory(self.normalized(rows)[:, None], kept)
+            scaled = self.head(outputs)[:, 0].clamp(-1, 1).cpu().numpy().reshape(-1, *(self.action_space.shape or ()))
+        actions = np.asarray(self.unscale_action(scaled))
+        return actions if is_batch else actions[0], (after.cpu().numpy(), np.where(begins, 0, steps) + 1)
+
+    def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        """The first step of an episode; :meth:`predict` carries the state."""
+        assert isinstance(observation, th.Tensor)
+        return self(self.normalized(observation)[:, None])[:, 0].clamp(-1, 1)
 
 
 class BC(OfflineAlgorithm):
@@ -21,17 +126,16 @@ class BC(OfflineAlgorithm):
     standard deviation. Some episodes are held out: the policy is the network, of all seeds and all validations, with the
     smallest error on them (early stopping). Without held-out episodes there is one seed, and the policy is its last network.
 
-    :param args: policy and env of :class:`~sb3_actpc.baselines.offline_algorithm.OfflineAlgorithm`
+    :param args: policy and env of :class:`~sb3_actpc.baselines.offline.OfflineAlgorithm`
     :param n_seeds: networks trained side by side
     :param held_out_fraction: share of the episodes to hold out, at least one of several; 0 for none
-    :param validation_interval: steps between two validations; ``learn`` ends with one too
     :param weight_decay: decoupled from the gradient (AdamW)
     :param input_noise: standard deviation of Gaussian noise on the normalized observations of each batch
     :param options: further keywords as there; ``policy_kwargs`` takes ``net_arch``
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": BCPolicy}
-    policy: CloningPolicy
+    policy: BCPolicy
 
     @checked
     def __init__(
@@ -39,27 +143,27 @@ class BC(OfflineAlgorithm):
         *args: Any,
         n_seeds: Positive = 4,
         held_out_fraction: Share = 0.1,
-        validation_interval: Positive = 100,
         weight_decay: Weight = 0.0,
         input_noise: Weight = 0.0,
         **options: Any,
     ) -> None:
         self.n_seeds = n_seeds
         self.held_out_fraction = held_out_fraction
-        self.validation_interval = validation_interval
         self.weight_decay = weight_decay
         self.input_noise = input_noise
         super().__init__(*args, **options)
 
-    def _network_kwargs(self) -> dict[str, Any]:
-        return {"optimizer_kwargs": {"weight_decay": self.weight_decay}}
+    def _new_policy(self, **options: Any) -> BCPolicy:
+        kwargs = {"optimizer_kwargs": {"weight_decay": self.weight_decay}, **options, **self.policy_kwargs}
+        policy: Any = self.policy_class(self.observation_space, self.action_space, self.lr_schedule, **kwargs)
+        return policy.to(self.device)
 
     def _take(self, demonstrations: Demonstrations) -> None:
         assert isinstance(self.action_space, spaces.Box)
-        actions = scaled_actions(demonstrations, self.action_space)
         rows = th.as_tensor(demonstrations.observations, device=self.device)
         self.policy.fit_normalization(rows)
-        self._observations, self._actions = self.policy.normalized(rows), th.as_tensor(actions, device=self.device)
+        self._observations = self.policy.normalized(rows)
+        self._actions = th.as_tensor(scaled_actions(demonstrations, self.action_space), device=self.device)
         bounds = demonstrations.episode_bounds
         lengths = bounds[:, 1] - bounds[:, 0]
         self._episode_ends = th.as_tensor(np.repeat(bounds[:, 1], lengths), device=self.device)
@@ -71,18 +175,13 @@ class BC(OfflineAlgorithm):
         self._validation_rows = is_held_out.nonzero()[:, 0]
         self._training_rows = (~is_held_out).nonzero()[:, 0]
         self._smallest_error = np.inf
-        self._networks = [self.policy]
-        if len(self._validation_rows):
-            self._networks = [self._new_network() for _ in range(self.n_seeds)]
+        self._networks = [self._copy() for _ in range(self.n_seeds)] if held_out.any() else [self.policy]
 
-    def _new_network(self) -> CloningPolicy:
-        kwargs = {**self._network_kwargs(), **self.policy_kwargs}
-        network = self.policy_class(self.observation_space, self.action_space, self.lr_schedule, **kwargs).to(self.device)
-        assert isinstance(network, CloningPolicy)
-        if self._n_updates:  # of an agent that was loaded, and goes on learning
-            network.load_state_dict(self.policy.state_dict())
-        network.mean.copy_(self.policy.mean)
-        network.spread.copy_(self.policy.spread)
+    def _copy(self) -> BCPolicy:
+        """A network of its own with the policy's normalization; of an agent that was loaded, with all of the policy."""
+        network = self._new_policy()
+        state = network.state_dict() | {"mean": self.policy.mean, "spread": self.policy.spread}
+        network.load_state_dict(self.policy.state_dict() if self._n_updates else state)
         return network
 
     def _gradient_step(self) -> dict[str, th.Tensor]:
@@ -96,7 +195,7 @@ class BC(OfflineAlgorithm):
             loss.backward()
             network.optimizer.step()
             losses.append(loss.detach())
-        if (self._n_updates + 1) % self.validation_interval == 0:
+        if (self._n_updates + 1) % VALIDATION_INTERVAL == 0:
             self._validate()
         return {"loss": th.stack(losses).mean()}
 
@@ -112,7 +211,7 @@ class BC(OfflineAlgorithm):
                 self.policy.load_state_dict(network.state_dict())
         self.logger.record("train/held_out_error", self._smallest_error)
 
-    def _loss(self, network: CloningPolicy, rows: th.Tensor, noise: float = 0.0) -> th.Tensor:
+    def _loss(self, network: BCPolicy, rows: th.Tensor, noise: float = 0.0) -> th.Tensor:
         """Mean squared error of a network's actions in (B,) demonstrated rows."""
         return nn.functional.mse_loss(network(self._inputs(rows, noise)), self._actions[rows])
 
@@ -139,29 +238,27 @@ class BCRNN(BC):
 
     1. Mean squared error of the actions, not the likelihood of a Gaussian mixture.
     2. What would lie behind an episode's end is left out of the error, not filled up with its last transition.
+    3. A GRU, not an LSTM.
 
     :param args: as :class:`BC`'s
     :param sequence_length: L
-    :param carry_state: when it plays, keep the state beyond L steps, through the whole episode
-    :param options: further keywords of :class:`BC`; ``policy_kwargs`` are those of
-        :class:`~sb3_actpc.baselines.bc_policies.BCRNNPolicy`
+    :param options: further keywords of :class:`BC`; ``policy_kwargs`` are those of :class:`BCRNNPolicy`
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": BCRNNPolicy}
 
     @checked
-    def __init__(self, *args: Any, sequence_length: Positive = 10, carry_state: bool = False, **options: Any) -> None:
-        self.sequence_length, self.carry_state = sequence_length, carry_state
+    def __init__(self, *args: Any, sequence_length: Positive = 10, **options: Any) -> None:
+        self.sequence_length = sequence_length
         super().__init__(*args, **options)
 
-    def _network_kwargs(self) -> dict[str, Any]:
-        return {**super()._network_kwargs(), "restart_every": None if self.carry_state else self.sequence_length}
+    def _new_policy(self, **options: Any) -> BCPolicy:
+        return super()._new_policy(restart_every=self.sequence_length)
 
-    def _loss(self, network: CloningPolicy, rows: th.Tensor, noise: float = 0.0) -> th.Tensor:
+    def _loss(self, network: BCPolicy, rows: th.Tensor, noise: float = 0.0) -> th.Tensor:
         """Mean squared error of the actions over the steps, from (B,) rows on, that lie within an episode."""
         steps = rows[:, None] + th.arange(self.sequence_length, device=self.device)
         within = (steps < self._episode_ends[rows][:, None]).float()
         steps = steps.clamp(max=len(self._actions) - 1)
-        outputs, _ = network(self._inputs(steps, noise))
-        errors = (outputs - self._actions[steps]).square().mean(dim=-1)
+        errors = (network(self._inputs(steps, noise)) - self._actions[steps]).square().mean(dim=-1)
         return (errors * within).sum() / within.sum()

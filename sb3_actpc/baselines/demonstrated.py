@@ -1,22 +1,125 @@
-"""What baselines share: demonstrations that fit the task, and, off policy, a share of them in every batch."""
+"""SB3's replay buffers and off-policy algorithms with a share of demonstrations in every batch."""
 
 import warnings
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
-from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import GymEnv, RolloutReturn
+from stable_baselines3.common.vec_env import VecNormalize
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
-from sb3_actpc.baselines.demonstration_buffers import WithDemonstrations, demonstration_buffer_class
+from sb3_actpc.demonstrations import Demonstrations, scaled_actions
 from sb3_actpc.demonstrations.mixin import LearnsFromDemonstrations
+from sb3_actpc.demonstrations.rows import split_observations
 from sb3_actpc.utils.arguments import Share, checked
+from sb3_actpc.utils.nested import map_observations
 from sb3_actpc.utils.rollouts import StoresLastTransition
 
 
+class WithDemonstrations(ReplayBuffer):
+    """What the buffers of this module add to SB3's; combine it with one of them.
+
+    The demonstrations stay in a buffer of their own, of the SB3 class, so that whatever that class does to its transitions
+    (n-step returns, hindsight relabelling, normalisation) is done to them too. They come last in the batch.
+
+    :param demonstrations: transitions that fit the environment, or None for none
+    :param demonstration_fraction: share of each batch
+    :raises ValueError: for a share out of range
+    """
+
+    @checked
+    def __init__(
+        self, *args: Any, demonstrations: Demonstrations | None = None, demonstration_fraction: Share = 0.5, **kwargs: Any
+    ) -> None:
+        super().__init__(*args, **kwargs)
+        self.demonstration_fraction = demonstration_fraction
+        self.demonstrated: ReplayBuffer | None = None
+        if demonstrations is not None:
+            kind: Any = next(base for base in type(self).__mro__ if base.__module__.startswith("stable_baselines3."))
+            single = {**kwargs, "n_envs": 1, "optimize_memory_usage": False}
+            self.demonstrated = kind(len(demonstrations), *args[1:], **single)
+            self._show(self.demonstrated, demonstrations)
+
+    def _show(self, buffer: ReplayBuffer, shown: Demonstrations) -> None:
+        """Add every transition; an episode that did not terminate ends as by a time limit."""
+        assert isinstance(self.action_space, spaces.Box)
+        seen, following = (
+            split_observations(self.observation_space, rows) for rows in (shown.observations, shown.next_observations)
+        )
+        actions = scaled_actions(shown, self.action_space)
+        ends = np.zeros(len(shown), dtype=bool)
+        ends[shown.episode_bounds[:, 1] - 1] = True
+        for row in range(len(shown)):
+            one = itemgetter(slice(row, row + 1))
+            infos = [{"TimeLimit.truncated": bool(ends[row] and not shown.terminations[row])}]
+            observations = map_observations(one, seen), map_observations(one, following)
+            buffer.add(*observations, one(actions), one(shown.rewards), one(ends), infos)
+
+    def n_demonstrated(self, batch_size: int) -> int:
+        """How many of B transitions are demonstrated ones; they are the last rows."""
+        return 0 if self.demonstrated is None else round(self.demonstration_fraction * batch_size)
+
+    def sample(self, batch_size: int, env: VecNormalize | None = None) -> Any:
+        """B transitions: those of the agent, then those of the demonstrations; ``env`` as SB3's."""
+        n_demonstrated = self.n_demonstrated(batch_size)
+        if self.demonstrated is None or not n_demonstrated:
+            return self._sample_own(batch_size, env)
+        demonstrated = self.demonstrated.sample(n_demonstrated, env)
+        if n_demonstrated == batch_size:
+            return demonstrated
+        return join_batches(self._sample_own(batch_size - n_demonstrated, env), demonstrated)
+
+    def _sample_own(self, batch_size: int, env: VecNormalize | None) -> Any:
+        return super().sample(batch_size, env)
+
+    def cut_running_episodes(self) -> None:
+        """The environments are reset in mid-episode: what is stored of these episodes ends as by a time limit."""
+        if self.full or self.pos:
+            newest = self.pos - 1
+            self.timeouts[newest] = np.logical_or(self.timeouts[newest], np.logical_not(self.dones[newest]))
+
+
+class DemonstrationReplayBuffer(WithDemonstrations):
+    """SB3's replay buffer with demonstrations; see :class:`WithDemonstrations`."""
+
+
+class DemonstrationNStepReplayBuffer(WithDemonstrations, NStepReplayBuffer):
+    """SB3's n-step replay buffer with demonstrations, whose returns are n-step too."""
+
+
+class DemonstrationDictReplayBuffer(WithDemonstrations, DictReplayBuffer):
+    """SB3's replay buffer for Dict observations with demonstrations."""
+
+
+class DemonstrationHerReplayBuffer(WithDemonstrations, HerReplayBuffer):
+    """SB3's hindsight replay buffer with demonstrations, which are relabelled as the agent's own transitions are."""
+
+    def cut_running_episodes(self) -> None:
+        """As :meth:`WithDemonstrations.cut_running_episodes`."""
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # SB3 warns that it does what is asked for
+            self.truncate_last_trajectory()
+
+
+def join_batches(own: Any, demonstrated: Any) -> Any:
+    """Two batches of SB3's, named tuples of tensors (B, ...) and (C, ...), as one, (B + C, ...); fields that SB3 leaves at
+    None stay None."""
+
+    def join(mine: Any, theirs: Any) -> Any:
+        if isinstance(mine, dict):
+            return {key: th.cat([part, theirs[key]]) for key, part in mine.items()}
+        return None if mine is None else th.cat([mine, theirs])
+
+    return type(own)(*map(join, own, demonstrated))
+
+
 class DemonstratedAlgorithm(LearnsFromDemonstrations, StoresLastTransition):
-    """An off-policy algorithm whose replay buffer is one of :mod:`sb3_actpc.baselines.demonstration_buffers`.
+    """An off-policy algorithm whose replay buffer, which the observations and ``n_steps`` decide, holds demonstrations.
 
     An agent that is loaded without an environment, to be played, gets a buffer of one transition and does not look for its
     demonstrations; :meth:`set_env` makes the whole buffer.
@@ -24,7 +127,7 @@ class DemonstratedAlgorithm(LearnsFromDemonstrations, StoresLastTransition):
     :param args: policy and env, as SB3's
     :param demonstration_fraction: share of each batch that comes from the demonstrations; without them it has no effect
     :param options: keywords of :class:`LearnsFromDemonstrations` and of the algorithm
-    :raises ValueError: as there, and for a share out of range
+    :raises ValueError: as there, for a share out of range, and for a ``replay_buffer_class``
     """
 
     @checked
@@ -34,39 +137,35 @@ class DemonstratedAlgorithm(LearnsFromDemonstrations, StoresLastTransition):
 
     def _setup_model(self) -> None:
         self._check_actions()
-        asked = self.replay_buffer_class
+        if self.replay_buffer_class is not None:
+            raise ValueError(f"replay_buffer_class={self.replay_buffer_class!r} must be None; for hindsight replay use HER")
         buffer = self._make_replay_buffer() if self.replay_buffer is None else self.replay_buffer
         self.replay_buffer = buffer
         super()._setup_model()
         # SB3 replaces None by its own default, and SBX makes a buffer of its own
-        self.replay_buffer_class = asked
+        self.replay_buffer_class = None
         self.replay_buffer = buffer
 
     def _replay_class(self) -> type[WithDemonstrations]:
-        return demonstration_buffer_class(self.replay_buffer_class, self.observation_space, self.n_steps)
+        if isinstance(self.observation_space, spaces.Dict):
+            return DemonstrationDictReplayBuffer
+        return DemonstrationReplayBuffer if self.n_steps == 1 else DemonstrationNStepReplayBuffer
 
-    def _make_replay_buffer(self) -> ReplayBuffer:
-        kind, kwargs = self._replay_class(), dict(self.replay_buffer_kwargs)
-        size = self.buffer_size
-        demonstrations = None
-        if self.env is None:
-            kind = demonstration_buffer_class(None, self.observation_space)  # which needs none
-            kwargs, size = {}, self.n_envs
-        else:
-            if self.demonstrations is not None:
-                demonstrations = self._fitted_demonstrations()
-            if self.n_steps > 1:
-                kwargs = {"n_steps": self.n_steps, "gamma": self.gamma, **kwargs}
-            if issubclass(kind, HerReplayBuffer):
-                kwargs["env"] = self.env
+    def _make_replay_buffer(self) -> WithDemonstrations:
+        kind, is_played = self._replay_class(), self.env is None
+        kwargs = dict(self.replay_buffer_kwargs)
+        if issubclass(kind, NStepReplayBuffer):
+            kwargs = {"n_steps": self.n_steps, "gamma": self.gamma, **kwargs}
+        if issubclass(kind, HerReplayBuffer):
+            kwargs["env"] = self.env
         return kind(
-            size,
+            1 if is_played else self.buffer_size,
             self.observation_space,
             self.action_space,
             device=self.device,
             n_envs=self.n_envs,
-            optimize_memory_usage=self.optimize_memory_usage and self.env is not None,
-            demonstrations=demonstrations,
+            optimize_memory_usage=self.optimize_memory_usage,
+            demonstrations=None if is_played or self.demonstrations is None else self._fitted_demonstrations(),
             demonstration_fraction=self.demonstration_fraction,
             **kwargs,
         )
@@ -76,46 +175,23 @@ class DemonstratedAlgorithm(LearnsFromDemonstrations, StoresLastTransition):
         try:
             return super().collect_rollouts(*args, **options)
         except BaseException:
-            self._cut_running_episodes()
             self._last_obs = None
             raise
 
     def _setup_learn(
         self, total_timesteps: int, callback: Any = None, reset_num_timesteps: bool = True, *args: Any, **options: Any
     ) -> tuple[int, BaseCallback]:
-        if reset_num_timesteps:  # SB3 resets the environment
+        if reset_num_timesteps or self._last_obs is None:  # SB3 resets the environment
             self._cut_running_episodes()
         return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, *args, **options)
 
     def _cut_running_episodes(self) -> None:
-        buffer = self.replay_buffer
-        if isinstance(buffer, HerReplayBuffer):
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", UserWarning)  # SB3 warns that it does what is asked for
-                buffer.truncate_last_trajectory()
-        elif isinstance(buffer, NStepReplayBuffer):
-            last = buffer.pos - 1
-            buffer.timeouts[last] = np.logical_or(buffer.timeouts[last], np.logical_not(buffer.dones[last]))
+        assert isinstance(self.replay_buffer, WithDemonstrations)
+        self.replay_buffer.cut_running_episodes()
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         """As SB3's; an agent that was loaded without an environment gets its replay buffer and its demonstrations now."""
-        was_without = self.env is None
+        was_played = self.env is None
         super().set_env(env, force_reset)
-        if was_without:
+        if was_played:
             self.replay_buffer = self._make_replay_buffer()
-
-    def checkpoint_state(self) -> dict[str, Any]:
-        """What a checkpoint (:mod:`sb3_actpc.checkpoints`) keeps beside SB3's state: how many demonstrations there were."""
-        return {"n_demonstrated": self._n_demonstrated()}
-
-    def restore_checkpoint_state(self, state: dict[str, Any]) -> None:
-        """ValueError when it was taken with other demonstrations."""
-        if state["n_demonstrated"] != self._n_demonstrated():
-            raise ValueError(
-                f"the checkpoint's agent has {state['n_demonstrated']} demonstrated transitions, this one "
-                f"{self._n_demonstrated()}: pass the same demonstrations="
-            )
-
-    def _n_demonstrated(self) -> int:
-        demonstrated = getattr(self.replay_buffer, "demonstrated", None)
-        return 0 if demonstrated is None else demonstrated.buffer_size

@@ -1,16 +1,87 @@
-"""Hindsight experience replay with demonstrations, as the paper's baseline has it."""
+"""Hindsight experience replay with demonstrations and priorities, as the paper's baseline has it."""
 
 from typing import Any
 
 import numpy as np
 import torch as th
 from stable_baselines3.common.noise import ActionNoise
-from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
+from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_actpc.baselines.demonstration_buffers import DemonstrationHerReplayBuffer, WithDemonstrations
-from sb3_actpc.baselines.prioritized import DemonstrationPrioritizedHerReplayBuffer
+from sb3_actpc.baselines.demonstrated import DemonstrationHerReplayBuffer, WithDemonstrations, join_batches
 from sb3_actpc.baselines.td3 import DDPGDemo
-from sb3_actpc.utils.arguments import Share, checked
+from sb3_actpc.utils.arguments import Share, Weight, checked
+
+
+class PrioritizedHerReplayBuffer(DemonstrationHerReplayBuffer):
+    """Prioritized replay (Schaul et al., arXiv 1511.05952) of hindsight: every transition is there twice, with its own goal
+    and with one of its episode's, and each of the two has a priority. ``n_sampled_goal`` has no meaning here.
+
+    The agent's transitions are drawn with probability P ∝ (absolute TD error + ε)^α, and their loss is weighed by (n P)^-β,
+    divided by the batch's largest weight. New ones get the largest priority so far. Demonstrations are drawn uniformly, with
+    weight 1.
+
+    :param alpha: α
+    :param beta: β at the start
+    :param beta_increment: added to β at each sampling, up to 1
+    :param epsilon: ε
+    :raises ValueError: for a value out of range
+    """
+
+    @checked
+    def __init__(
+        self,
+        *args: Any,
+        alpha: Share = 0.6,
+        beta: Share = 0.4,
+        beta_increment: Weight = 0.001,
+        epsilon: Weight = 0.01,
+        **kwargs: Any,
+    ) -> None:
+        super().__init__(*args, **kwargs)
+        self.alpha, self.beta, self.beta_increment, self.epsilon = alpha, beta, beta_increment, epsilon
+        self.priorities = np.zeros((self.buffer_size, self.n_envs, 2))
+        self.largest_priority = 1.0
+        self.importance_weights: th.Tensor | None = None
+        self._drawn = np.zeros(0, dtype=np.int64)
+
+    def _compute_episode_length(self, env_idx: int) -> None:
+        start = int(self._current_ep_start[env_idx])
+        super()._compute_episode_length(env_idx)
+        rows = (start + np.arange(int(self.ep_length[start, env_idx]))) % self.buffer_size
+        self.priorities[rows, env_idx] = self.largest_priority
+
+    def _sample_own(self, batch_size: int, env: VecNormalize | None) -> Any:
+        """Those with their own goals come first; ``importance_weights`` then holds the weights, (B, 1)."""
+        n_rows = self.size()
+        is_whole = self.ep_length[:n_rows, :, None] > 0  # not of an episode that runs or is partly overwritten
+        priorities = (self.priorities[:n_rows] * is_whole).ravel()
+        sums = priorities.cumsum()
+        # one from each B-th part of the total
+        masses = (np.arange(batch_size) + np.random.random(batch_size)) / batch_size * sums[-1]
+        drawn = np.searchsorted(sums, np.minimum(masses, np.nextafter(sums[-1], 0.0)), side="right")
+        drawn = drawn[np.argsort(drawn % 2, kind="stable")]
+        n_own = int((drawn % 2 == 0).sum())
+        rows, envs = np.divmod(drawn // 2, self.n_envs)
+        weights = priorities[drawn] ** -self.beta  # the number stored and the total cancel below
+        self.importance_weights = self.to_torch((weights / weights.max()).astype(np.float32)[:, None])
+        self.beta = min(1.0, self.beta + self.beta_increment)
+        self._drawn = drawn
+        real = self._get_real_samples(rows[:n_own], envs[:n_own], env)
+        return join_batches(real, self._get_virtual_samples(rows[n_own:], envs[n_own:], env))
+
+    def update_priorities(self, errors: np.ndarray) -> None:
+        """:param errors: (B,) TD errors of the agent's transitions sampled last, in their order"""
+        priorities = (np.abs(errors) + self.epsilon) ** self.alpha
+        self.largest_priority = max(self.largest_priority, float(priorities.max(initial=0.0)))
+        self.priorities.reshape(-1)[self._drawn] = priorities
+
+    def checkpoint_state(self) -> dict[str, Any]:
+        """What a checkpoint keeps beside the arrays with a row per step."""
+        return {"beta": self.beta, "largest_priority": self.largest_priority}
+
+    def restore_checkpoint_state(self, state: dict[str, Any]) -> None:
+        """:param state: what :meth:`checkpoint_state` returned"""
+        self.beta, self.largest_priority = state["beta"], state["largest_priority"]
 
 
 class HER(DDPGDemo):
@@ -31,7 +102,7 @@ class HER(DDPGDemo):
     :param args: policy, "MultiInputPolicy", and env, a goal task: Dict observations with ``observation``, ``achieved_goal``
         and ``desired_goal``
     :param prioritized: draw the agent's transitions by priority; ``replay_buffer_kwargs`` then takes ``alpha``, ``beta``,
-        ``beta_increment`` and ``epsilon`` (see :class:`~sb3_actpc.baselines.prioritized.PrioritizedHerReplayBuffer`)
+        ``beta_increment`` and ``epsilon`` (see :class:`PrioritizedHerReplayBuffer`)
     :param random_action_start: ε at the start
     :param random_action_decay: factor of ε per environment step
     :param random_action_end: smallest ε
@@ -55,19 +126,14 @@ class HER(DDPGDemo):
         self.prioritized = prioritized
         self.random_action_start, self.random_action_decay = random_action_start, random_action_decay
         self.random_action_end = random_action_end
-        self._has_episode = False
         buffer = {"n_sampled_goal": 1, "goal_selection_strategy": "final", **(replay_buffer_kwargs or {})}
         options = {"cloning_weight": 0.0, "demonstration_fraction": 0.5, **options, "replay_buffer_kwargs": buffer}
         super().__init__(*args, **options)
 
     def _replay_class(self) -> type[WithDemonstrations]:
-        keys = set(getattr(self.observation_space, "spaces", {}))
-        if not {"observation", "achieved_goal", "desired_goal"} <= keys:
-            raise ValueError(
-                f"HER needs a goal task (Dict observations with observation, achieved_goal and desired_goal), found "
-                f"{self.observation_space}: use a Goal... task such as GoalReacher-v5"
-            )
-        return DemonstrationPrioritizedHerReplayBuffer if self.prioritized else DemonstrationHerReplayBuffer
+        if "desired_goal" not in getattr(self.observation_space, "spaces", {}):
+            raise ValueError(f"HER needs a goal task such as GoalReacher-v5, found observations of {self.observation_space}")
+        return PrioritizedHerReplayBuffer if self.prioritized else DemonstrationHerReplayBuffer
 
     @property
     def random_action_probability(self) -> float:
@@ -87,25 +153,17 @@ class HER(DDPGDemo):
 
     def train(self, gradient_steps: int, batch_size: int = 100) -> None:
         """DDPG's updates; none before the first episode has ended, since hindsight needs one."""
-        buffer = self.replay_buffer
-        if isinstance(buffer, HerReplayBuffer) and not self._has_episode and buffer.n_demonstrated(batch_size) < batch_size:  # type: ignore[attr-defined]
-            self._has_episode = bool((buffer.ep_length > 0).any())
-            if not self._has_episode:
-                return
-        super().train(gradient_steps, batch_size)
+        if self.replay_buffer.ep_length.any():  # type: ignore[union-attr]
+            self.logger.record("rollout/random_action_probability", self.random_action_probability)
+            super().train(gradient_steps, batch_size)
 
     def _critic_loss(self, values: th.Tensor, targets: th.Tensor) -> th.Tensor:
         """The squared errors by importance weight; the priorities follow the errors of the first critic."""
-        buffer: Any = self.replay_buffer
-        n_own = len(targets) - buffer.n_demonstrated(len(targets))
-        if not n_own or getattr(buffer, "importance_weights", None) is None:
+        buffer = self.replay_buffer
+        if not isinstance(buffer, PrioritizedHerReplayBuffer) or buffer.importance_weights is None:
             return super()._critic_loss(values, targets)
+        n_own = len(buffer.importance_weights)
         weights = th.ones_like(targets)
         weights[:n_own] = buffer.importance_weights
-        errors = (values[0] - targets).detach()[:n_own, 0]
-        buffer.update_priorities(errors.cpu().numpy())
+        buffer.update_priorities((values[0] - targets).detach()[:n_own, 0].cpu().numpy())
         return (weights * (values - targets).square()).mean(dim=(1, 2)).sum()
-
-    def _log_training(self) -> None:
-        self.logger.record("rollout/random_action_probability", self.random_action_probability)
-        super()._log_training()

@@ -8,14 +8,12 @@ from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy, ContinuousCritic
 from stable_baselines3.common.torch_layers import create_mlp
 from stable_baselines3.common.type_aliases import PyTorchObs
-from stable_baselines3.common.utils import polyak_update
 from stable_baselines3.td3.policies import TD3Policy
 from torch import nn
 
-from sb3_actpc.baselines.bc import BC
-from sb3_actpc.baselines.bc_policies import BCPolicy
+from sb3_actpc.baselines.bc import BC, BCPolicy
 from sb3_actpc.baselines.td3 import TD3Demo
-from sb3_actpc.utils.arguments import Count, Positive, Weight, checked
+from sb3_actpc.utils.arguments import Positive, checked
 
 N_TARGET_CRITICS = 2  # drawn to bootstrap (REDQ, arXiv 2101.05982)
 
@@ -27,12 +25,9 @@ class IBRLPolicy(TD3Policy):
     :param n_critics: number of critics
     :param exploration_noise: standard deviation of Gaussian noise on the actor's proposal, in units of [-1, 1], while learning
     :param options: further keywords, as SB3's
-    :raises ValueError: for fewer than two critics, and for observations that are no Box
     """
 
     def __init__(self, *args: Any, n_critics: int = 5, exploration_noise: float = 0.1, **options: Any) -> None:
-        if n_critics < N_TARGET_CRITICS:
-            raise ValueError(f"n_critics={n_critics!r} must be at least {N_TARGET_CRITICS}: two of them bootstrap")
         self.exploration_noise = exploration_noise
         self.follows_bc = False  # the actor proposes nothing yet
         super().__init__(*args, **{**options, "n_critics": n_critics})
@@ -53,12 +48,6 @@ class IBRLPolicy(TD3Policy):
     def bc_actions(self, observations: th.Tensor) -> th.Tensor:
         """Proposals of the BC policy in [-1, 1], (B, A)."""
         return self.bc._predict(observations, deterministic=True)
-
-    def target_values(self, observations: PyTorchObs, actions: th.Tensor) -> th.Tensor:
-        """The smaller value of two target critics, drawn anew at each call, (B, 1)."""
-        values = th.stack(self.critic_target(observations, actions))
-        drawn = th.randperm(len(values), device=values.device)[:N_TARGET_CRITICS]
-        return values[drawn].amin(dim=0)
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         assert isinstance(observation, th.Tensor)
@@ -90,37 +79,20 @@ class IBRL(TD3Demo):
     4. The choice when acting uses the smallest value of all target critics, not of two drawn ones.
 
     :param args: policy, "MlpPolicy", and env; ``policy_kwargs`` are those of :class:`IBRLPolicy`
-    :param bc_steps: steps of :class:`~sb3_actpc.baselines.BC`
-    :param gradient_steps: critic updates per environment step
-    :param policy_delay: critic updates per actor update; None for ``gradient_steps``
-    :param target_policy_noise: as SB3's; the paper smooths the actor's proposal for the next state
-    :param options: keywords of :class:`~sb3_actpc.baselines.TD3Demo`; exploration noise is ``policy_kwargs``' own
-    :raises ValueError: without demonstrations, with ``action_noise``, and as there
+    :param gradient_steps: critic updates per environment step, and per actor update unless ``policy_delay`` is given
+    :param options: keywords of :class:`~sb3_actpc.baselines.TD3Demo`, of which ``bc_steps`` (of
+        :class:`~sb3_actpc.baselines.BC`) is 2500 and ``target_policy_noise``, on the actor's proposal for the next state, 0.1
+        unless given; exploration noise is ``policy_kwargs``' own
+    :raises ValueError: without demonstrations, and as there
     """
 
     policy: IBRLPolicy
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": IBRLPolicy}
 
     @checked
-    def __init__(
-        self,
-        *args: Any,
-        bc_steps: Count = 2500,
-        gradient_steps: Positive = 5,
-        policy_delay: int | None = None,
-        target_policy_noise: Weight = 0.1,
-        **options: Any,
-    ) -> None:
-        if options.get("action_noise") is not None:
-            raise ValueError(f"action_noise={options['action_noise']!r}: use policy_kwargs={{'exploration_noise': 0.1}}")
-        super().__init__(
-            *args,
-            bc_steps=bc_steps,
-            gradient_steps=gradient_steps,
-            policy_delay=gradient_steps if policy_delay is None else policy_delay,
-            target_policy_noise=target_policy_noise,
-            **options,
-        )
+    def __init__(self, *args: Any, gradient_steps: Positive = 5, **options: Any) -> None:
+        options = {"bc_steps": 2500, "policy_delay": gradient_steps, "target_policy_noise": 0.1, **options}
+        super().__init__(*args, gradient_steps=gradient_steps, **options)
 
     def _setup_model(self) -> None:
         if self.env is not None and self.demonstrations is None:
@@ -129,38 +101,24 @@ class IBRL(TD3Demo):
 
     def _clone_actor(self) -> None:
         """Train the BC policy, not the actor."""
-        model = BC(
-            "MlpPolicy",
-            self.env,
-            demonstrations=self.demonstrations,
-            n_demonstrations=self.n_demonstrations,
-            n_demonstration_transitions=self.n_demonstration_transitions,
-            learning_rate=lambda left: 1e-3 * left,
-            batch_size=64,
-            seed=self.seed,
-            device=self.device,
-        )
+        shown = "demonstrations", "n_demonstrations", "n_demonstration_transitions", "seed", "device"
+        same = {name: getattr(self, name) for name in shown}
+        model = BC("MlpPolicy", self.env, learning_rate=lambda left: 1e-3 * left, batch_size=64, **same)
         model.learn(self.bc_steps, log_interval=None)
         self.policy.bc.load_state_dict(model.policy.state_dict())
 
     def _sample_action(self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1) -> Any:
         self.policy.follows_bc = self.num_timesteps < learning_starts
-        try:
-            return super()._sample_action(0, action_noise, n_envs)
-        finally:
-            self.policy.follows_bc = False
+        chosen = super()._sample_action(0, action_noise, n_envs)
+        self.policy.follows_bc = False
+        return chosen
 
-    def _critic_targets(self, batch: Any) -> th.Tensor:
-        """The better of the actor's and the BC policy's actions bootstraps, (B, 1)."""
-        discounts = self.gamma if batch.discounts is None else batch.discounts
-        with th.no_grad():
-            actions = self._smoothed_next_actions(batch)
-            proposed = self.policy.bc_actions(batch.next_observations)
-            # one call: the same two critics value both
-            observations = batch.next_observations.repeat(2, 1)
-            values = self.policy.target_values(observations, th.cat([actions, proposed]))
-            bootstrap = values.view(2, -1, 1).amax(dim=0)
-            return batch.rewards + (1 - batch.dones) * discounts * bootstrap
+    def _next_values(self, batch: Any, next_actions: th.Tensor) -> th.Tensor:
+        """Of the actor's and the BC policy's actions the better one's, by the smaller value of two critics, (B, 1)."""
+        actions = th.cat([next_actions, self.policy.bc_actions(batch.next_observations)])
+        values = th.stack(self.critic_target(batch.next_observations.repeat(2, 1), actions))
+        drawn = th.randperm(len(values), device=values.device)[:N_TARGET_CRITICS]
+        return values[drawn].amin(dim=0).view(2, -1, 1).amax(dim=0)
 
     def _actor_values(self, observations: Any, actions: th.Tensor) -> th.Tensor:
         """The smallest value of all critics."""
@@ -169,7 +127,7 @@ class IBRL(TD3Demo):
     def _update_critic(self, batch: Any) -> None:
         """The target critics follow every update."""
         super()._update_critic(batch)
-        polyak_update(self.critic.parameters(), self.critic_target.parameters(), self._tau_of(self.critic_kwargs))
+        self._follow("critic")
 
     def _update_targets(self) -> None:
-        polyak_update(self.actor.parameters(), self.actor_target.parameters(), self._tau_of(self.actor_kwargs))
+        self._follow("actor")

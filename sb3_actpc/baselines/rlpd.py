@@ -21,14 +21,11 @@ class RLPDPolicy(SACPolicy):
     """SBX's SAC policy with layer-normalized critics, for observations normalized by the demonstrations.
 
     :param args: as SBX's
-    :param n_critics: number of critics
+    :param n_critics: number of critics, at least two
     :param options: further keywords, as SBX's
-    :raises ValueError: for fewer than two critics
     """
 
     def __init__(self, *args: Any, n_critics: int = 10, **options: Any) -> None:
-        if n_critics < N_TARGET_CRITICS:
-            raise ValueError(f"n_critics={n_critics!r} must be at least {N_TARGET_CRITICS}: two of them bootstrap")
         super().__init__(*args, **{"layer_norm": True, **options, "n_critics": n_critics})
         self.mean = np.float32(0.0)
         self.spread = np.float32(1.0)
@@ -62,10 +59,9 @@ class RLPD(DemonstratedAlgorithm, SAC):
     3. Returns can be n-step (``n_steps``).
 
     :param args: policy, "MlpPolicy" or "MultiInputPolicy", and env; ``policy_kwargs`` takes ``net_arch`` and ``n_critics``
-    :param gradient_steps: critic updates per environment step
-    :param policy_delay: critic updates per actor update; None for ``gradient_steps``
-    :param ent_coef: of SAC; "auto_0.1" learns it from 0.1 on
-    :param options: keywords of :class:`~sb3_actpc.baselines.demonstrated.DemonstratedAlgorithm` and of SBX's SAC
+    :param gradient_steps: critic updates per environment step, and per actor update unless ``policy_delay`` is given
+    :param options: keywords of :class:`~sb3_actpc.baselines.demonstrated.DemonstratedAlgorithm` and of SBX's SAC, whose
+        ``ent_coef`` is "auto_0.1" unless given
     :raises ValueError: for a keyword with a value that is not allowed, for demonstrations that do not fit the environment
     """
 
@@ -73,57 +69,34 @@ class RLPD(DemonstratedAlgorithm, SAC):
     is_resumable: ClassVar[bool] = False  # checkpoints hold torch networks, these are JAX's
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": RLPDPolicy, "MultiInputPolicy": RLPDPolicy}
 
-    def __init__(
-        self,
-        *args: Any,
-        gradient_steps: int = 10,
-        policy_delay: int | None = None,
-        ent_coef: str | float = "auto_0.1",
-        **options: Any,
-    ) -> None:
-        delay = gradient_steps if policy_delay is None else policy_delay
-        super().__init__(*args, gradient_steps=gradient_steps, policy_delay=delay, ent_coef=ent_coef, **options)
+    def __init__(self, *args: Any, gradient_steps: int = 10, **options: Any) -> None:
+        options = {"policy_delay": gradient_steps, "ent_coef": "auto_0.1", **options}
+        super().__init__(*args, gradient_steps=gradient_steps, **options)
 
     def _setup_model(self) -> None:
         self.device = get_device("cpu")  # of the replay buffer: SBX takes its batches as NumPy arrays
         is_new = getattr(self, "policy", None) is None
         super()._setup_model()
-        demonstrated = getattr(self.replay_buffer, "demonstrated", None)
-        if is_new and demonstrated is not None:
-            parts = demonstrated.observations
-            columns = [parts[key] for key in parts] if isinstance(parts, dict) else [parts]
-            rows = [column.reshape(len(column), -1) for column in columns]
-            self.policy.fit_normalization(np.concatenate(rows, axis=1).astype(np.float32))
+        if is_new and self.env is not None and self.demonstrations is not None:
+            self.policy.fit_normalization(self._fitted_demonstrations().observations)
 
     def _train(self, tau: float, target_entropy: Any, gradient_steps: int, data: Any, *states: Any) -> Any:
-        """SBX's updates, on normalized observations.
-
-        SBX cuts the rows into one batch after the other. The demonstrated rows come last, so every batch takes each
-        ``gradient_steps``-th row: all batches then hold the same share of demonstrations.
-        """
+        """SBX's updates, on normalized observations. SBX cuts the rows into batches, and the demonstrated rows come last: each
+        batch takes every ``gradient_steps``-th row, so that all hold the same share of demonstrations."""
         rows = np.arange(len(data.rewards)).reshape(-1, gradient_steps).T.ravel()
-        columns = data._replace(
+        data = data._replace(
             observations=self.policy.normalized(data.observations.reshape(len(rows), -1)),
             next_observations=self.policy.normalized(data.next_observations.reshape(len(rows), -1)),
         )
-        batches = type(data)(*(column[rows] for column in columns))
+        batches = type(data)(*(column[rows] for column in data))
         return super()._train(tau, target_entropy, gradient_steps, batches, *states)
 
     @staticmethod
     @jax.jit
-    def update_critic(
-        actor_state: Any,
-        qf_state: Any,
-        ent_coef_state: Any,
-        observations: jax.Array,
-        actions: jax.Array,
-        next_observations: jax.Array,
-        rewards: jax.Array,
-        dones: jax.Array,
-        discounts: jax.Array,
-        key: jax.Array,
-    ) -> Any:
-        """One update of all critics, on rewards, dones and discounts (B,): the new state, (loss, entropy weight), and key."""
+    def update_critic(*arguments: Any) -> Any:
+        """One update of all critics: their new state, (loss, entropy weight), and key."""
+        actor_state, qf_state, ent_coef_state, observations, actions, next_observations, *rest = arguments
+        rewards, dones, discounts, key = rest  # the first three (B,)
         key, action_key, draw_key = jax.random.split(key, 3)
         next_actions = actor_state.apply_fn(actor_state.params, next_observations).sample(seed=action_key)
         # (n_critics, B, 1)

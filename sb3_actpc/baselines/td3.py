@@ -1,7 +1,6 @@
 """TD3 and DDPG with demonstrations; actor and critic have rates, optimisers and target rates of their own, as in the paper."""
 
 from collections import defaultdict
-from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -12,16 +11,14 @@ from stable_baselines3.common.utils import polyak_update
 from typing_extensions import Self
 
 from sb3_actpc.baselines.demonstrated import DemonstratedAlgorithm
-from sb3_actpc.baselines.demonstration_buffers import WithDemonstrations
-from sb3_actpc.utils.arguments import Count, Share, Weight, checked
-from sb3_actpc.utils.checks import check_kind
+from sb3_actpc.utils.arguments import Count, Weight, checked
 from sb3_actpc.utils.nested import map_observations
 
 OPTIMIZERS: dict[str, type[th.optim.Optimizer]] = {"adam": th.optim.Adam, "adamw": th.optim.AdamW}
 SMALLEST_VALUE = 1e-8  # mean absolute action-value that divides
 BC_LEARNING_RATE = 1e-3  # falls linearly to 0
 BC_BATCH_SIZE = 256
-NETWORK_KEYWORDS = ("learning_rate", "optimizer", "optimizer_kwargs", "tau")
+NETWORK_KEYWORDS = ("learning_rate", "optimizer", "tau")
 
 
 class TD3Demo(DemonstratedAlgorithm, TD3):
@@ -31,7 +28,7 @@ class TD3Demo(DemonstratedAlgorithm, TD3):
 
     :param args: policy and env, as SB3's
     :param actor_kwargs: of the actor alone: ``learning_rate`` (a number; it follows the schedule of the algorithm's),
-        ``optimizer`` ("adam" or "adamw"), ``optimizer_kwargs`` and ``tau``
+        ``optimizer`` ("adam" or "adamw") and ``tau``
     :param critic_kwargs: the same for the critic
     :param policy_gradient_weight: of minus the mean action-value, where a cloning loss is added; otherwise 1
     :param cloning_weight: of the mean over the batch's demonstrations of the squared distance between action and
@@ -69,88 +66,67 @@ class TD3Demo(DemonstratedAlgorithm, TD3):
     def _setup_model(self) -> None:
         super()._setup_model()
         self._losses: dict[str, list[float]] = defaultdict(list)
-        for name, given in (("actor", self.actor_kwargs), ("critic", self.critic_kwargs)):
-            if given:
-                self._give_optimizer(name, given)
+        for network, given in self._networks():
+            if unknown := sorted(set(given) - set(NETWORK_KEYWORDS)):
+                raise ValueError(
+                    f"unknown keys {unknown} of actor_kwargs or critic_kwargs: choose from {', '.join(NETWORK_KEYWORDS)}"
+                )
+            kind = given.get("optimizer", "adam")
+            if kind not in OPTIMIZERS:
+                raise ValueError(f"optimizer={kind!r} is unknown; choose one of {sorted(OPTIMIZERS)}")
+            if "optimizer" in given or "learning_rate" in given:
+                rate = given.get("learning_rate", self.lr_schedule(1.0))
+                network.optimizer = OPTIMIZERS[kind](network.parameters(), lr=rate)  # type: ignore[call-arg]
 
-    def _give_optimizer(self, name: str, given: dict[str, Any]) -> None:
-        unknown = sorted(set(given) - set(NETWORK_KEYWORDS))
-        if unknown:
-            raise ValueError(f"{name}_kwargs has unknown keys {unknown}: choose from {', '.join(NETWORK_KEYWORDS)}")
-        if given.get("optimizer", "adam") not in OPTIMIZERS:
-            raise ValueError(f"{name}_kwargs: optimizer={given['optimizer']!r} is unknown; choose one of {sorted(OPTIMIZERS)}")
-        for keyword in sorted({"learning_rate", "tau"} & set(given)):
-            check_kind(keyword, given[keyword], float)
-        network: BaseModel = getattr(self, name)
-        kind, options = self.policy.optimizer_class, self.policy.optimizer_kwargs
-        if "optimizer" in given:
-            kind, options = OPTIMIZERS[given["optimizer"]], {}
-        rate = given.get("learning_rate", self.lr_schedule(1.0))
-        options = {**options, **given.get("optimizer_kwargs", {})}
-        network.optimizer = kind(network.parameters(), lr=rate, **options)  # type: ignore[call-arg]
-
-    def _tau_of(self, given: dict[str, Any] | None) -> float:
-        return (given or {}).get("tau", self.tau)
-
-    def _update_learning_rate(self, optimizers: list[th.optim.Optimizer] | th.optim.Optimizer) -> None:
-        """SB3's schedule; a network's own learning rate falls as the schedule does."""
-        super()._update_learning_rate(optimizers)
-        start = self.lr_schedule(1.0)
-        progress = self.lr_schedule(self._current_progress_remaining) / start if start else 0.0
-        given = {id(self.actor.optimizer): self.actor_kwargs, id(self.critic.optimizer): self.critic_kwargs}
-        for optimizer in optimizers if isinstance(optimizers, Iterable) else [optimizers]:
-            own = (given.get(id(optimizer)) or {}).get("learning_rate")
-            if own is not None:
-                for group in optimizer.param_groups:
-                    group["lr"] = own * progress
+    def _networks(self) -> list[tuple[BaseModel, dict[str, Any]]]:
+        """Actor and critic, with what each has of its own."""
+        return [(self.actor, self.actor_kwargs or {}), (self.critic, self.critic_kwargs or {})]
 
     def train(self, gradient_steps: int, batch_size: int = 100) -> None:
         """TD3's updates: so many of the critic; the actor and the targets follow every ``policy_delay``."""
         assert self.replay_buffer is not None
         self.policy.set_training_mode(True)
         self._update_learning_rate([self.actor.optimizer, self.critic.optimizer])
+        for network, given in self._networks():
+            if "learning_rate" in given:  # it falls as the schedule does
+                progress = self.lr_schedule(self._current_progress_remaining) / self.lr_schedule(1.0)
+                network.optimizer.param_groups[0]["lr"] = given["learning_rate"] * progress
         for _ in range(gradient_steps):
             self._n_updates += 1
             batch = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
             self._update_critic(batch)
             if self._n_updates % self.policy_delay == 0:
-                self._update_actor(batch)
+                self._step("actor", self.actor, self._actor_loss(batch, self.actor(batch.observations)))
                 self._update_targets()
-        self._log_training()
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        for name, values in self._losses.items():
+            self.logger.record(f"train/{name}", np.mean(values))
+        self._losses.clear()
+
+    def _step(self, name: str, network: BaseModel, loss: th.Tensor) -> None:
+        self._losses[f"{name}_loss"].append(loss.item())
+        network.optimizer.zero_grad()
+        loss.backward()
+        network.optimizer.step()
 
     def _update_critic(self, batch: Any) -> None:
-        targets = self._critic_targets(batch)
-        values = self.critic(batch.observations, batch.actions)
-        loss = self._critic_loss(th.stack(values), targets)
-        self._losses["critic_loss"].append(loss.item())
-        self.critic.optimizer.zero_grad()
-        loss.backward()
-        self.critic.optimizer.step()
-
-    def _smoothed_next_actions(self, batch: Any) -> th.Tensor:
-        """The target actor's actions with clipped noise, (B, A)."""
-        noise = batch.actions.clone().normal_(0, self.target_policy_noise)
-        noise = noise.clamp(-self.target_noise_clip, self.target_noise_clip)
-        return (self.actor_target(batch.next_observations) + noise).clamp(-1, 1)
-
-    def _critic_targets(self, batch: Any) -> th.Tensor:
-        """Clipped double Q-learning with target policy smoothing, (B, 1)."""
+        """Clipped double Q-learning with target policy smoothing."""
         discounts = self.gamma if batch.discounts is None else batch.discounts
         with th.no_grad():
-            next_actions = self._smoothed_next_actions(batch)
-            next_values = th.cat(self.critic_target(batch.next_observations, next_actions), dim=1).amin(dim=1, keepdim=True)
-            return batch.rewards + (1 - batch.dones) * discounts * next_values
+            noise = batch.actions.clone().normal_(0, self.target_policy_noise)
+            noise = noise.clamp(-self.target_noise_clip, self.target_noise_clip)
+            next_actions = (self.actor_target(batch.next_observations) + noise).clamp(-1, 1)
+            targets = batch.rewards + (1 - batch.dones) * discounts * self._next_values(batch, next_actions)
+        values = self.critic(batch.observations, batch.actions)
+        self._step("critic", self.critic, self._critic_loss(th.stack(values), targets))
+
+    def _next_values(self, batch: Any, next_actions: th.Tensor) -> th.Tensor:
+        """What the targets bootstrap from, given the target actor's smoothed actions (B, A): (B, 1)."""
+        return th.cat(self.critic_target(batch.next_observations, next_actions), dim=1).amin(dim=1, keepdim=True)
 
     def _critic_loss(self, values: th.Tensor, targets: th.Tensor) -> th.Tensor:
         """Mean squared error of values (n_critics, B, 1) and targets (B, 1), summed over the critics."""
         return sum((th.nn.functional.mse_loss(one, targets) for one in values), start=values.new_zeros(()))
-
-    def _update_actor(self, batch: Any) -> None:
-        loss = self._actor_loss(batch, self.actor(batch.observations))
-        self._losses["actor_loss"].append(loss.item())
-        self.actor.optimizer.zero_grad()
-        loss.backward()
-        self.actor.optimizer.step()
 
     def _actor_loss(self, batch: Any, actions: th.Tensor) -> th.Tensor:
         """Minus the mean action-value of the actor's actions, (B, A), and the cloning loss on the demonstrated rows."""
@@ -158,10 +134,15 @@ class TD3Demo(DemonstratedAlgorithm, TD3):
         n_demonstrated = self.replay_buffer.n_demonstrated(len(actions))  # type: ignore[union-attr]
         if not (n_demonstrated and self.cloning_weight):
             return -values.mean()
-        demonstrated = slice(len(actions) - n_demonstrated, None)
-        distances = (actions[demonstrated] - batch.actions[demonstrated]).square().sum(dim=1, keepdim=True)
-        is_cloned = self._worth_cloning(batch, actions, demonstrated)
+        last = slice(len(actions) - n_demonstrated, None)
+        own, demonstrated = actions[last], batch.actions[last]
+        is_cloned = th.ones_like(batch.rewards[last])
+        if self.q_filter:
+            rows = map_observations(lambda part: part[last], batch.observations)
+            with th.no_grad():
+                is_cloned = (self.critic.q1_forward(rows, demonstrated) > self.critic.q1_forward(rows, own)).float()
         self._losses["cloned_share"].append(is_cloned.mean().item())
+        distances = (own - demonstrated).square().sum(dim=1, keepdim=True)
         value_weight = self.policy_gradient_weight
         if self.normalize_values:
             value_weight = value_weight / values.detach().abs().mean().clamp(min=SMALLEST_VALUE).item()
@@ -171,26 +152,16 @@ class TD3Demo(DemonstratedAlgorithm, TD3):
         """The action-values that the actor climbs, (B, 1): the first critic's."""
         return self.critic.q1_forward(observations, actions)
 
-    def _worth_cloning(self, batch: Any, actions: th.Tensor, demonstrated: slice) -> th.Tensor:
-        """The Q-filter: 1 where the critic values the demonstrated action above the actor's, (n_demonstrated, 1)."""
-        if not self.q_filter:
-            return th.ones_like(batch.rewards[demonstrated])
-        rows = map_observations(lambda part: part[demonstrated], batch.observations)
-        with th.no_grad():
-            demonstrated_values = self.critic.q1_forward(rows, batch.actions[demonstrated])
-            return (demonstrated_values > self.critic.q1_forward(rows, actions[demonstrated])).float()
-
     def learn(self, total_timesteps: int, *args: Any, **options: Any) -> Self:
         """As SB3's; the first call begins with ``bc_steps`` steps of behavior cloning."""
         is_new = not self.num_timesteps and not self._n_updates
-        if self.bc_steps and is_new and getattr(self.replay_buffer, "demonstrated", None) is not None:
+        if self.bc_steps and is_new and self.demonstrations is not None:
             self._clone_actor()
         return super().learn(total_timesteps, *args, **options)
 
     def _clone_actor(self) -> None:
         """Start the actor as behavior cloning does: least squares on the demonstrated actions, in [-1, 1]."""
-        assert isinstance(self.replay_buffer, WithDemonstrations) and self.replay_buffer.demonstrated is not None
-        demonstrated = self.replay_buffer.demonstrated
+        demonstrated: Any = self.replay_buffer.demonstrated  # type: ignore[union-attr]
         optimizer = th.optim.Adam(self.actor.parameters(), lr=BC_LEARNING_RATE)
         self.actor.set_training_mode(True)
         for step in range(self.bc_steps):
@@ -203,17 +174,16 @@ class TD3Demo(DemonstratedAlgorithm, TD3):
         self.actor_target.load_state_dict(self.actor.state_dict())
 
     def _update_targets(self) -> None:
-        polyak_update(self.critic.parameters(), self.critic_target.parameters(), self._tau_of(self.critic_kwargs))
-        polyak_update(self.actor.parameters(), self.actor_target.parameters(), self._tau_of(self.actor_kwargs))
-        # running means of batch normalisation are copied, as in SB3
+        self._follow("critic")
+        self._follow("actor")
+        # running means of batch normalization are copied, as in SB3
         polyak_update(self.critic_batch_norm_stats, self.critic_batch_norm_stats_target, 1.0)
         polyak_update(self.actor_batch_norm_stats, self.actor_batch_norm_stats_target, 1.0)
 
-    def _log_training(self) -> None:
-        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        for name, values in self._losses.items():
-            self.logger.record(f"train/{name}", np.mean(values))
-        self._losses.clear()
+    def _follow(self, name: str) -> None:
+        """Move a network's target towards it."""
+        tau = (getattr(self, f"{name}_kwargs") or {}).get("tau", self.tau)
+        polyak_update(getattr(self, name).parameters(), getattr(self, f"{name}_target").parameters(), tau)
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_losses"]
@@ -232,34 +202,14 @@ class DDPGDemo(TD3Demo):
     1. Episodes start as the task starts them; theirs also start from demonstrated states.
     2. No hindsight relabelling here; :class:`~sb3_actpc.baselines.HER` adds it.
     3. Returns are one-step unless ``n_steps`` says otherwise.
-    4. No L2 penalty on weights; ``actor_kwargs`` can ask for AdamW's decay.
+    4. No L2 penalty on weights, unless ``actor_kwargs`` asks for AdamW.
 
     :param args: policy and env, as SB3's
-    :param policy_gradient_weight: λ1
-    :param cloning_weight: λ2, of the mean
-    :param q_filter: as :class:`TD3Demo`'s
-    :param demonstration_fraction: share of each batch; Nair et al. take 128 of 1152
-    :param options: further keywords of :class:`TD3Demo`
+    :param options: keywords of :class:`TD3Demo`; ``demonstration_fraction`` is 1 / 9 unless given (Nair et al.: 128 of 1152)
     """
 
-    @checked
-    def __init__(
-        self,
-        *args: Any,
-        policy_gradient_weight: Weight = 0.001,
-        cloning_weight: Weight = 1.0,
-        q_filter: bool = True,
-        demonstration_fraction: Share = 1 / 9,
-        policy_kwargs: dict[str, Any] | None = None,
-        **options: Any,
-    ) -> None:
+    def __init__(self, *args: Any, policy_kwargs: dict[str, Any] | None = None, **options: Any) -> None:
         sb3s_ddpg = {"policy_delay": 1, "target_policy_noise": 0.1, "target_noise_clip": 0.0}
-        super().__init__(
-            *args,
-            policy_gradient_weight=policy_gradient_weight,
-            cloning_weight=cloning_weight,
-            q_filter=q_filter,
-            demonstration_fraction=demonstration_fraction,
-            policy_kwargs={"n_critics": 1, **(policy_kwargs or {})},
-            **{**sb3s_ddpg, **options},
-        )
+        nairs = {"policy_gradient_weight": 0.001, "cloning_weight": 1.0, "q_filter": True, "demonstration_fraction": 1 / 9}
+        policy_kwargs = {"n_critics": 1, **(policy_kwargs or {})}
+        super().__init__(*args, policy_kwargs=policy_kwargs, **{**sb3s_ddpg, **nairs, **options})

@@ -1,7 +1,6 @@
 """``sb3-actpc baselines``: what the baselines of other packages need."""
 
 import argparse
-from pathlib import Path
 
 
 def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
@@ -10,20 +9,15 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
     install = commands.add_parser(
         "install",
         help="make the virtual environment of a package",
-        description="Make a virtual environment for a package that pins other versions: d3rlpy (bcq, cql). "
-        "One that is whole stays as it is. The environment variable SB3_ACTPC_BASELINES says where they are "
-        "(default: ~/.cache/sb3_actpc/baselines).",
+        description="Make a virtual environment for d3rlpy (bcq, cql), which pins other versions. The environment variable "
+        "SB3_ACTPC_BASELINES says where (default: ~/.cache/sb3_actpc/baselines).",
     )
-    install.add_argument("package", help="d3rlpy")
-    install.add_argument("--dir", metavar="DIR", help="folder of the environments (default: as above)")
+    install.add_argument("package", choices=["d3rlpy"])
 
 
 def run(args: argparse.Namespace) -> int:
     """Install."""
-    from sb3_actpc.baselines.offline.installation import FOLDER_VARIABLE, environments_folder, install
+    from sb3_actpc.baselines.served import install
 
-    folder = None if args.dir is None else Path(args.dir).absolute()
-    install(args.package, folder, report=lambda line: print(line, flush=True))
-    if folder is not None and folder != environments_folder():
-        print(f"to use it: export {FOLDER_VARIABLE}={folder}")
+    install()
     return 0

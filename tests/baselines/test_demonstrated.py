@@ -1,4 +1,5 @@
-"""What every baseline does: no transition is lost or misjoined, bad action spaces are refused, the caller's settings stay."""
+"""Every batch holds the asked share of demonstrations, as the environment would have shown and paid them. No transition is
+lost or misjoined, bad action spaces are refused, and the caller's settings stay."""
 
 from copy import deepcopy
 from typing import Any
@@ -6,13 +7,111 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch as th
+from gymnasium import spaces
+from stable_baselines3 import DDPG, SAC, TD3
 from stable_baselines3.common.callbacks import BaseCallback, StopTrainingOnMaxEpisodes
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_actpc.baselines import BC, LOGO, DDPGDemo, TD3Demo
-from sb3_actpc.demonstrations import Demonstrations
+from sb3_actpc.baselines.demonstrated import DemonstrationNStepReplayBuffer, DemonstrationReplayBuffer
+from sb3_actpc.demonstrations import Demonstrations, fit_demonstrations
 from tests.recordings import record
 
+BOX = spaces.Box(-1.0, 1.0, (2,), np.float32)
+WIDE = spaces.Box(-2.0, 2.0, (1,), np.float32)
 SMALL: dict[str, Any] = {"policy_kwargs": {"net_arch": [8]}, "learning_starts": 1000, "buffer_size": 200, "seed": 0}
+
+
+def numbered(n: int, reward: float = 7.0) -> Demonstrations:
+    """One episode of n transitions whose observations are 100, 101, ... and whose actions are 1 of at most 2."""
+    rows = np.repeat(np.arange(100.0, 101.0 + n)[:, None], 2, axis=1)
+    rewards, ends = np.full(n, reward), np.zeros(n, dtype=bool)
+    return Demonstrations(rows[:-1], np.ones((n, 1)), rows[1:], rewards, ends, np.zeros(1, dtype=int), "Numbered-v0")
+
+
+def fill(buffer: DemonstrationReplayBuffer, n: int) -> None:
+    for step in range(n):
+        row = np.full((1, 2), float(step))
+        buffer.add(row, row + 1, np.zeros((1, 1)), np.zeros(1), np.zeros(1), [{}])
+
+
+@pytest.mark.parametrize(("fraction", "n_shown"), [(0.0, 0), (0.25, 4), (0.5, 8), (1.0, 16)])
+def test_the_share_of_demonstrations_is_the_asked_one_and_they_come_last(fraction: float, n_shown: int) -> None:
+    buffer = DemonstrationReplayBuffer(50, BOX, WIDE, demonstrations=numbered(5), demonstration_fraction=fraction)
+    fill(buffer, 20)
+    batch = buffer.sample(16)
+    shown = batch.observations[:, 0] >= 100
+    assert shown.tolist() == [False] * (16 - n_shown) + [True] * n_shown
+    assert buffer.n_demonstrated(16) == n_shown
+    assert (batch.rewards[:, 0] == 7.0).tolist() == shown.tolist()
+    assert th.equal(batch.next_observations, batch.observations + 1)
+
+
+def test_demonstrated_actions_are_scaled_and_a_time_limit_is_no_end() -> None:
+    buffer = DemonstrationReplayBuffer(50, BOX, WIDE, demonstrations=numbered(5), demonstration_fraction=1.0)
+    batch = buffer.sample(64)
+    assert (batch.actions == 0.5).all()
+    assert (batch.dones == 0).all()
+
+
+def test_n_step_returns_of_demonstrations_are_n_step_returns() -> None:
+    """In an episode of 5 rewards of 7, each sums the three that follow, fewer at its end."""
+    buffer = DemonstrationNStepReplayBuffer(
+        50, BOX, WIDE, n_steps=3, gamma=0.5, demonstrations=numbered(5), demonstration_fraction=1.0
+    )
+    batch = buffer.sample(200)
+    counts = th.clamp(105 - batch.observations[:, :1], max=3)
+    assert th.allclose(batch.rewards, 7 * (2 - 2 * 0.5**counts))
+    assert th.allclose(batch.discounts, 0.5**counts)
+
+
+@pytest.mark.parametrize("algorithm", [TD3, DDPG, SAC])
+def test_sb3s_own_algorithms_learn_from_the_buffer(algorithm: type) -> None:
+    shown = fit_demonstrations(record("Pendulum-v1"), None, spaces.Box(-8, 8, (3,)), spaces.Box(-2, 2, (1,)))
+    buffer = {"replay_buffer_class": DemonstrationReplayBuffer, "replay_buffer_kwargs": {"demonstrations": shown}}
+    model = algorithm("MlpPolicy", "Pendulum-v1", batch_size=8, learning_starts=5, **buffer).learn(10)
+    assert model.replay_buffer.n_demonstrated(8) == 4
+    assert len(model.replay_buffer.sample(8).observations) == 8
+
+
+def test_demonstrations_are_paid_by_the_environment_that_learns() -> None:
+    """Recorded with 0 for a miss, they are worth -1 to an agent that gets -1 for it."""
+    env = make_vec_env("SparseReacher-v5", env_kwargs={"miss_reward": -1.0})
+    model = TD3Demo("MlpPolicy", env, demonstrations=record("SparseReacher-v5"), demonstration_fraction=1.0)
+    assert model.replay_buffer is not None
+    rewards = model.replay_buffer.sample(200).rewards
+    assert set(rewards.flatten().tolist()) <= {-1.0, 1.0} and (rewards == -1.0).any()
+    env.close()
+
+
+def test_demonstrations_of_another_task_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"SparseHopper-v5.*SparseWalker2d-v5|SparseWalker2d-v5.*SparseHopper-v5"):
+        TD3Demo("MlpPolicy", "SparseHopper-v5", demonstrations=record("SparseWalker2d-v5"))
+
+
+def test_another_buffer_is_refused() -> None:
+    with pytest.raises(ValueError, match="must be None; for hindsight replay use HER"):
+        TD3Demo("MultiInputPolicy", "GoalReacher-v5", replay_buffer_class=HerReplayBuffer)
+
+
+def test_an_agent_loaded_to_play_has_no_buffer_until_it_has_an_environment(tmp_path) -> None:
+    """rl-zoo3 plays agents without one: neither the memory nor the demonstrations' file may be needed."""
+    path = tmp_path / "shown.npz"
+    record("Pendulum-v1").save(path)
+    model = TD3Demo("MlpPolicy", "Pendulum-v1", demonstrations=path, policy_kwargs={"net_arch": [8]}, batch_size=8)
+    model.save(tmp_path / "model.zip")
+    held = path.read_bytes()
+    path.unlink()
+    loaded = TD3Demo.load(tmp_path / "model.zip")
+    assert loaded.replay_buffer.buffer_size == 1
+    observation = model.env.reset()
+    assert np.array_equal(model.predict(observation)[0], loaded.predict(observation)[0])
+    path.write_bytes(held)
+    loaded.set_env(model.env)
+    assert loaded.replay_buffer.buffer_size == model.buffer_size
+    assert loaded.replay_buffer.demonstrated.buffer_size == 24
 
 
 class Corridor(gym.Env[np.ndarray, np.ndarray]):
@@ -69,7 +168,7 @@ def test_a_callback_that_stops_at_an_episodes_end_loses_nothing(train_freq: Any)
     n_steps = 5 + 6 + 7 + 8 + 9 + 10
     assert len(rewards) == model.num_timesteps == n_steps
     assert (rewards.sum(), dones.sum()) == (6, 6)
-    assert model._episode_num == len(model.ep_info_buffer) == 6
+    assert len(model.ep_info_buffer) == 6
     assert (following[:, 1] == observations[:, 1] + 1).all() and (following[:, 0] == observations[:, 0]).all()
 
 

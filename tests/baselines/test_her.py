@@ -3,7 +3,6 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-import torch as th
 from stable_baselines3.common.env_checker import check_env
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
@@ -12,7 +11,7 @@ from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 from sb3_actpc import ActPC, preset, shipped_demonstrations
 from sb3_actpc.actpc.buffers import CombinedDictReplayBuffer, CombinedHerReplayBuffer
 from sb3_actpc.baselines import HER
-from sb3_actpc.baselines.prioritized import PrioritizedHerReplayBuffer, SumTree
+from sb3_actpc.baselines.her import PrioritizedHerReplayBuffer
 from sb3_actpc.demonstrations import Demonstrations, fit_demonstrations
 from sb3_actpc.envs import GOAL_MUJOCO_IDS, sparse_env_id
 from sb3_actpc.experiments.runs import Run, train_run
@@ -21,7 +20,7 @@ from tests.checkpoints.runs import assert_same, learn_in_two, learn_straight
 from tests.recordings import record
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*out of date.*", "ignore:.*infinity.*")
-SMALL = {"policy_kwargs": {"net_arch": [16]}, "batch_size": 16, "buffer_size": 200, "seed": 1, "learning_starts": 0}
+SMALL = {"policy_kwargs": {"net_arch": [16]}, "batch_size": 16, "buffer_size": 700, "seed": 1, "learning_starts": 0}
 
 
 # ---------------------------------------------------------------------- goal tasks
@@ -100,16 +99,6 @@ def test_demonstrations_of_the_sparse_task_become_those_that_the_goal_task_recor
 # ---------------------------------------------------------------------- priorities
 
 
-def test_the_tree_sums_and_draws_in_proportion() -> None:
-    tree = SumTree(5)
-    tree[np.arange(5)] = np.array([1.0, 0.0, 2.0, 4.0, 1.0])
-    tree[np.array([4, 4])] = np.array([3.0, 1.0])
-    assert tree.total == 8.0 and tree[np.array([3, 4])].tolist() == [4.0, 1.0]
-    counts = np.bincount(np.concatenate([tree.draw(64) for _ in range(100)]), minlength=5) / 6400
-    # each draw comes from a part of the total of its own: the shares are all but exact
-    assert counts == pytest.approx([1 / 8, 0, 2 / 8, 4 / 8, 1 / 8], abs=0.01)
-
-
 def goal_buffer(size: int = 40, **options: float) -> PrioritizedHerReplayBuffer:
     env = make_vec_env("GoalReacher-v5")
     return PrioritizedHerReplayBuffer(
@@ -142,18 +131,21 @@ def test_every_transition_is_there_twice_with_its_own_and_with_its_episodes_last
 
 
 def test_transitions_are_drawn_by_their_errors_and_weighed_against_it() -> None:
+    """Of ten transitions, each with two goals, one has an error of 16: its priority is 4."""
     buffer = goal_buffer(alpha=0.5, beta=0.4, beta_increment=0.1, epsilon=0.0)
     add_episode(buffer, 1, 10)
-    buffer.sample(20)
-    assert sorted(buffer._drawn) == list(range(20))  # all equal: each is drawn once
-    errors = np.where(buffer._drawn == 4, -16.0, 1.0)
-    buffer.update_priorities(errors)  # priorities 4 and 1
-    batch = buffer.sample(2300)
-    drawn = np.bincount(buffer._drawn, minlength=20)
-    assert drawn[4] / 2300 == pytest.approx(4 / 23, abs=0.005)
-    weights = buffer.importance_weights.flatten()[th.as_tensor(buffer._drawn == 4)]
-    assert weights == pytest.approx(np.full(len(weights), 4**-0.5))  # beta was 0.4 and is 0.5
-    assert len(batch.rewards) == 2300
+
+    def is_the_one(batch) -> np.ndarray:
+        is_second = batch.next_observations["achieved_goal"][:, 1] == 2
+        return (is_second & (batch.observations["desired_goal"][:, 0] == 0)).numpy()
+
+    chosen = is_the_one(buffer.sample(20))
+    assert chosen.sum() == 1  # all are equal: each is drawn once
+    buffer.update_priorities(np.where(chosen, -16.0, 1.0))
+    chosen = is_the_one(buffer.sample(2300))
+    assert chosen.mean() == pytest.approx(4 / 23, abs=0.005)
+    weights = buffer.importance_weights[:, 0].numpy()
+    assert weights[chosen] == pytest.approx(4**-0.5) and weights[~chosen] == pytest.approx(1.0)  # beta was 0.4 and is 0.5
     assert buffer.beta == pytest.approx(0.6)
     add_episode(buffer, 2, 1)
     assert buffer.priorities[10, 0].tolist() == [4.0, 4.0]
@@ -164,17 +156,8 @@ def test_an_overwritten_episode_is_drawn_no_more() -> None:
     add_episode(buffer, 1, 6)
     add_episode(buffer, 2, 4)
     add_episode(buffer, 3, 2)  # overwrites the first two steps of the first episode: all of it goes
-    for _ in range(20):
-        numbers = buffer.sample(32).next_observations["achieved_goal"][:, 0]
-        assert set(numbers.tolist()) <= {2.0, 3.0}
-    leaves = buffer._tree[np.arange(20)].reshape(10, 1, 2)
-    assert np.array_equal(leaves, buffer.priorities)
-    assert np.array_equal(leaves[:, 0, 0] > 0, buffer.ep_length[:, 0] > 0)
-
-
-def test_nothing_can_be_drawn_before_an_episode_has_ended() -> None:
-    with pytest.raises(RuntimeError, match="no whole episode"):
-        goal_buffer().sample(4)
+    numbers = np.concatenate([buffer.sample(32).next_observations["achieved_goal"][:, 0] for _ in range(20)])
+    assert set(numbers.tolist()) == {2.0, 3.0}
 
 
 # ---------------------------------------------------------------------- the algorithm
@@ -186,22 +169,29 @@ def make(**options: object) -> HER:
 
 def test_random_actions_become_rarer_down_to_their_smallest_share() -> None:
     model = make(demonstrations=None, random_action_decay=0.99)
-    model.actor.load_state_dict({name: 0 * value for name, value in model.actor.state_dict().items()})  # always acts 0
-    model._last_obs = model.env.reset()
     for steps, share in ((0, 1.0), (50, 0.99**50), (1000, 0.32)):
         model.num_timesteps = steps
         assert model.random_action_probability == pytest.approx(share)
-        random = np.mean([bool(model._sample_action(0)[0].any()) for _ in range(600)])
-        assert random == pytest.approx(share, abs=0.06)
+    share = {"random_action_start": 0.4, "random_action_decay": 1.0, "random_action_end": 0.1}
+    model = make(demonstrations=None, train_freq=600, **share)
+    for parameter in model.actor.parameters():
+        parameter.data.zero_()  # always acts 0
+    model.learn(600)
+    assert model.replay_buffer.actions[:600].any(axis=(1, 2)).mean() == pytest.approx(0.4, abs=0.06)
+
+
+def weights(model: HER) -> np.ndarray:
+    return np.concatenate([parameter.detach().numpy().ravel() for parameter in model.policy.parameters()])
 
 
 @pytest.mark.parametrize("prioritized", [True, False])
 def test_it_learns_from_its_own_episodes_and_from_demonstrations_with_relabelled_goals(prioritized: bool) -> None:
     model = make(prioritized=prioritized, cloning_weight=1.0)
+    before = weights(model)
     model.learn(49)
-    assert model._n_updates == 0  # no episode has ended
+    assert np.array_equal(before, weights(model))  # no episode has ended
     model.learn(5, reset_num_timesteps=False)
-    assert model._n_updates > 0
+    assert not np.array_equal(before, weights(model))
     shown = model.replay_buffer.demonstrated.sample(200)
     ends = record("SparseReacher-v5").next_observations[[11, 23]]
     last = {tuple(np.round(row[8:10] + row[4:6], 4)) for row in ends.astype(np.float64)}
@@ -209,17 +199,13 @@ def test_it_learns_from_its_own_episodes_and_from_demonstrations_with_relabelled
     assert relabelled == last
 
 
-def test_the_loss_is_weighed_and_the_priorities_follow_the_errors() -> None:
-    model = make(demonstration_fraction=0.5)
-    model.learn(50)
-    buffer = model.replay_buffer
-    buffer.sample(16)
-    buffer.importance_weights = th.linspace(0.1, 0.8, 8)[:, None]
-    values, targets = th.randn(1, 16, 1), th.randn(16, 1)
-    expected = th.cat([buffer.importance_weights, th.ones(8, 1)])
-    assert model._critic_loss(values, targets).item() == pytest.approx((expected * (values[0] - targets) ** 2).mean().item())
-    stored = buffer.priorities.reshape(-1)[buffer._drawn[-1]]
-    assert stored == pytest.approx((abs(float(values[0, 7] - targets[7])) + 0.01) ** 0.6, rel=1e-5)
+@pytest.mark.parametrize(("alpha", "matters"), [(0.0, False), (0.6, True)])
+def test_the_loss_is_weighed_where_priorities_differ(alpha: float, matters: bool) -> None:
+    """With α = 0 they are all 1, whatever the errors are, and so are the weights, whatever β is."""
+    kwargs = {"alpha": alpha, "beta_increment": 0.0}
+    none, full = (make(replay_buffer_kwargs={**kwargs, "beta": beta}).learn(60) for beta in (0.0, 1.0))
+    assert np.array_equal(weights(none), weights(full)) is not matters
+    assert (len(np.unique(none.replay_buffer.priorities[:50])) > 2) is matters
 
 
 def test_a_stopped_run_goes_on_bit_for_bit(tmp_path) -> None:
@@ -227,8 +213,8 @@ def test_a_stopped_run_goes_on_bit_for_bit(tmp_path) -> None:
     resumed = learn_in_two(make, tmp_path / "two", 120, 75)
     assert_same(straight, resumed)
     mine, theirs = straight.replay_buffer, resumed.replay_buffer
-    assert (mine.beta, mine.largest_priority) == (theirs.beta, theirs.largest_priority)
-    assert np.array_equal(mine._tree.nodes, theirs._tree.nodes)
+    assert mine.checkpoint_state() == theirs.checkpoint_state()
+    assert np.array_equal(mine.priorities, theirs.priorities)
 
 
 def test_a_task_without_goals_is_refused() -> None:
@@ -237,21 +223,10 @@ def test_a_task_without_goals_is_refused() -> None:
 
 
 def test_actpc_runs_on_the_same_goal_task_and_demonstrations() -> None:
-    model = ActPC(
-        "MultiInputPolicy",
-        "GoalReacher-v5",
-        replay_buffer_class="HerReplayBuffer",
-        demonstrations=record("SparseReacher-v5"),
-        learning_starts=50,
-        batch_size=16,
-        guidance_kwargs={"bc_updates": 2},
-        gradient_steps=1,
-        policy_kwargs={"net_arch": [8]},
-        seed=0,
-    )
-    model.learn(55)
-    assert model._n_updates == 5
-    assert model.expert.demonstrations.env_id == "GoalReacher-v5"
+    shown = {"replay_buffer_class": "HerReplayBuffer", "demonstrations": record("SparseReacher-v5")}
+    few = {**SMALL, "learning_starts": 50, "guidance_kwargs": {"bc_updates": 2}, "gradient_steps": 1}
+    model = ActPC("MultiInputPolicy", "GoalReacher-v5", **shown, **few).learn(55)
+    assert model.num_timesteps == 55 and model.expert.demonstrations.env_id == "GoalReacher-v5"
 
 
 def test_actpc_and_her_run_on_fetch(tmp_path) -> None:

@@ -38,13 +38,12 @@ def test_every_critic_learns_and_the_actor_does(n_steps: int) -> None:
 
 
 def test_critics_are_layer_normalized() -> None:
-    assert "LayerNorm" in str(make().policy.qf_state.params.keys()) + str(make().policy.qf_state.params)
+    assert "LayerNorm" in str(make().policy.qf_state.params)
 
 
 def test_there_is_one_actor_update_for_the_updates_of_one_step() -> None:
     model = make(gradient_steps=5)
     model.learn(14)
-    assert model._n_updates == 20
     assert int(model.policy.qf_state.step) == 20
     assert int(model.policy.actor_state.step) == 4
 
@@ -73,11 +72,4 @@ def test_goal_tasks_have_demonstrations_too() -> None:
     demonstrations = record("SparseReacher-v5")
     model = RLPD("MultiInputPolicy", "GoalReacher-v5", demonstrations=demonstrations, policy_kwargs={"net_arch": [8]}, **SMALL)
     model.learn(12)
-    assert model._n_updates == 4
-
-
-def test_one_critic_is_refused_and_the_callers_settings_stay_as_they_were() -> None:
-    given = {"net_arch": [8], "n_critics": 1}
-    with pytest.raises(ValueError, match="n_critics=1 must be at least 2"):
-        make(policy_kwargs=given)
-    assert given == {"net_arch": [8], "n_critics": 1}
+    assert int(model.policy.qf_state.step) == 4

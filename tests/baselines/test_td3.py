@@ -5,6 +5,7 @@ import pytest
 import torch as th
 from stable_baselines3 import DDPG, TD3
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_actpc.baselines import DDPGDemo, TD3Demo
 from tests.checkpoints.runs import assert_same, learn_in_two, learn_straight
@@ -27,21 +28,14 @@ def test_without_demonstrations_it_is_sb3s_number_by_number(ours: type, theirs: 
 
 
 def test_actor_and_critic_have_rates_optimisers_and_targets_of_their_own() -> None:
-    model = TD3Demo(
-        "MlpPolicy",
-        "Pendulum-v1",
-        **SMALL,
-        learning_rate=lambda left: 1e-3 * left,
-        policy_delay=1,
-        actor_kwargs={"learning_rate": 1e-4, "optimizer": "adamw", "tau": 1.0},
-        critic_kwargs={"tau": 0.0},
-    )
+    own = {"actor_kwargs": {"learning_rate": 1e-4, "optimizer": "adamw", "tau": 1.0}, "critic_kwargs": {"tau": 0.0}}
+    rate = LinearSchedule(1e-3, 0.5e-3, 1.0)
+    model = TD3Demo("MlpPolicy", "Pendulum-v1", **SMALL, learning_rate=rate, policy_delay=1, **own)
     before = [parameter.clone() for parameter in model.critic_target.parameters()]
     model.learn(40)
     assert isinstance(model.actor.optimizer, th.optim.AdamW) and not isinstance(model.critic.optimizer, th.optim.AdamW)
-    left = model._current_progress_remaining
-    assert model.actor.optimizer.param_groups[0]["lr"] == pytest.approx(1e-4 * left)
-    assert model.critic.optimizer.param_groups[0]["lr"] == pytest.approx(1e-3 * left)
+    rates = [network.optimizer.param_groups[0]["lr"] for network in (model.actor, model.critic)]
+    assert rates == pytest.approx([0.5e-4, 0.5e-3])
     for target, parameter in zip(model.actor_target.parameters(), model.actor.parameters(), strict=True):
         assert th.equal(target, parameter)
     assert all(th.equal(*pair) for pair in zip(before, model.critic_target.parameters(), strict=True))
@@ -50,9 +44,8 @@ def test_actor_and_critic_have_rates_optimisers_and_targets_of_their_own() -> No
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"actor_kwargs": {"lr": 1.0}}, "unknown keys \\['lr'\\]: choose from learning_rate"),
+        ({"actor_kwargs": {"lr": 1.0}}, "unknown keys .*lr.* choose from learning_rate"),
         ({"critic_kwargs": {"optimizer": "sgd"}}, "optimizer='sgd' is unknown; choose one of"),
-        ({"critic_kwargs": {"tau": "fast"}}, "tau='fast' must be a finite number"),
         ({"demonstration_fraction": 1.5}, "demonstration_fraction=1.5 must be between 0 and 1"),
         ({"demonstrations": 3}, "demonstrations must be a file path"),
     ],
@@ -63,38 +56,43 @@ def test_wrong_settings_are_named(options: dict, message: str) -> None:
 
 
 def demonstrating(**options: object) -> DDPGDemo:
-    given = {"demonstrations": record("Pendulum-v1"), "demonstration_fraction": 0.5, **options}
-    return DDPGDemo("MlpPolicy", "Pendulum-v1", **{**SMALL, **given})
+    """One critic, half of each batch demonstrated, and a few transitions of the agent's, before any update."""
+    given = {"demonstrations": record("Pendulum-v1"), "demonstration_fraction": 0.5, "learning_starts": 1000, **options}
+    return DDPGDemo("MlpPolicy", "Pendulum-v1", **{**SMALL, **given}).learn(20)
 
 
-def test_the_cloning_loss_is_the_mean_squared_distance_of_the_demonstrations_that_the_critic_prefers() -> None:
-    model = demonstrating(policy_gradient_weight=0.25, cloning_weight=2.0)
-    assert model.replay_buffer is not None
-    fill(model)
+def actor_step(**options: object) -> tuple[th.Tensor, th.Tensor]:
+    """The change of the actor's last bias by one update with plain gradient descent of rate 1, and the gradient that the
+    equations of Nair et al. give, with weights 0.25 and 2."""
+    model = demonstrating(policy_gradient_weight=0.25, cloning_weight=2.0, demonstration_fraction=1.0, **options)
+    model.actor.optimizer = th.optim.SGD(model.actor.parameters(), lr=1.0)
+    model.lr_schedule = lambda _: 1.0
+    model.critic.optimizer = th.optim.SGD([th.nn.Parameter(th.zeros(1))], lr=0.0)  # the critic stands still
+    bias = model.actor.mu[-2].bias
+    before = bias.detach().clone()
+    np.random.seed(5)
     batch = model.replay_buffer.sample(16)
     actions = model.actor(batch.observations)
-    loss = model._actor_loss(batch, actions)
-    with th.no_grad():
-        value = -model.critic.q1_forward(batch.observations, actions).mean()
-        theirs = model.critic.q1_forward(batch.observations[8:], batch.actions[8:])
-        better = theirs > model.critic.q1_forward(batch.observations[8:], actions[8:])
-        distances = ((actions[8:] - batch.actions[8:]) ** 2).sum(1, keepdim=True)
-    assert 0 < better.sum() < 8  # otherwise the filter shows nothing
-    assert loss.item() == pytest.approx((0.25 * value + 2.0 * (distances * better).sum() / 8).item(), rel=1e-5)
-    model.q_filter = False
-    unfiltered = model._actor_loss(batch, actions)
-    assert unfiltered.item() == pytest.approx((0.25 * value + 2.0 * distances.mean()).item(), rel=1e-5)
+    values = model.critic.q1_forward(batch.observations, actions)
+    is_cloned = model.critic.q1_forward(batch.observations, batch.actions) > values
+    assert 0 < is_cloned.sum() < 16  # otherwise the filter shows nothing
+    distances = (actions - batch.actions).square().sum(dim=1, keepdim=True)
+    cloning = distances * is_cloned if model.q_filter else distances
+    scale = values.detach().abs().mean() if model.normalize_values else 1.0
+    [gradient] = th.autograd.grad(2.0 * cloning.mean() - 0.25 / scale * values.mean(), bias)
+    np.random.seed(5)
+    model.train(1, 16)
+    return before - bias.detach(), gradient
 
 
-def fill(model: DDPGDemo) -> None:
-    """A few transitions of the agent's, before any update."""
-    model.learning_starts = 1000
-    model.learn(20)
+@pytest.mark.parametrize("options", [{}, {"q_filter": False}, {"q_filter": False, "normalize_values": True}])
+def test_the_actor_climbs_its_value_and_clones_what_the_critic_prefers(options: dict) -> None:
+    change, gradient = actor_step(**options)
+    assert change.numpy() == pytest.approx(gradient.numpy(), rel=1e-4)
 
 
 def test_cloning_alone_brings_the_actor_to_the_demonstrations() -> None:
     model = demonstrating(policy_gradient_weight=0.0, q_filter=False, learning_rate=1e-2)
-    fill(model)
     shown = model.replay_buffer.demonstrated.sample(64)
 
     def distance() -> float:
@@ -117,12 +115,6 @@ def test_a_stopped_run_goes_on_bit_for_bit(kind: type, tmp_path) -> None:
     assert_same(straight, learn_in_two(make, tmp_path / "two", 40, 25))
 
 
-def test_a_checkpoint_of_other_demonstrations_is_refused() -> None:
-    model = demonstrating()
-    with pytest.raises(ValueError, match="5 demonstrated transitions, this one 24: pass the same demonstrations="):
-        model.restore_checkpoint_state({"n_demonstrated": 5})
-
-
 def test_the_number_of_demonstrations_can_be_limited() -> None:
     model = demonstrating(n_demonstration_transitions=7)
     assert model.replay_buffer.demonstrated.buffer_size == 7
@@ -138,15 +130,3 @@ def test_a_start_from_behavior_cloning_acts_as_demonstrated() -> None:
         return float(np.square(model.predict(shown.observations, deterministic=True)[0] - shown.actions).mean())
 
     assert error(500) < 0.7 * error(0)
-
-
-def test_normalized_values_make_the_loss_independent_of_the_scale_of_rewards() -> None:
-    model = demonstrating(policy_gradient_weight=2.5, normalize_values=True, q_filter=False)
-    fill(model)
-    batch = model.replay_buffer.sample(16)
-    actions = model.actor(batch.observations)
-    loss = model._actor_loss(batch, actions).item()
-    for network in model.critic.q_networks:
-        for parameter in network[-1].parameters():
-            parameter.data *= 10.0
-    assert model._actor_loss(batch, actions).item() == pytest.approx(loss, rel=1e-4)

@@ -10,7 +10,7 @@ import torch as th
 import yaml
 
 from sb3_actpc import ActPC
-from sb3_actpc.baselines.offline.served import ServedAlgorithm
+from sb3_actpc.baselines.served import ServedAlgorithm
 from sb3_actpc.envs import ROBOSUITE_IDS, sparse_env_id
 from sb3_actpc.experiments.runs import ALGORITHMS, Run, load_preset, resolve
 from sb3_actpc.experiments.runs.environments import make_train_env, register_tasks
@@ -74,7 +74,7 @@ def test_every_entry_builds_its_agent_which_trains(
     preset: str, key: str, recordings: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # d3rlpy is not installed here: a slow test of test_served.py trains with the defaults where they are
-    monkeypatch.setattr("sb3_actpc.baselines.offline.served.environment_python", lambda package: sys.executable)
+    monkeypatch.setattr("sb3_actpc.baselines.served.environment_python", lambda: sys.executable)
     algo = ALGO_OF.get(preset, preset)
     if algo == "rlpd":
         pytest.importorskip("sbx", reason="sbx is an extra")

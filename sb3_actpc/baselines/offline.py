@@ -2,20 +2,44 @@
 
 from abc import abstractmethod
 from collections.abc import Mapping
-from pathlib import Path
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from typing_extensions import Self
 
 from sb3_actpc.demonstrations.dataset import Demonstrations
 from sb3_actpc.demonstrations.mixin import LearnsFromDemonstrations
 from sb3_actpc.utils.arguments import Positive, checked
 
-SelfOffline = TypeVar("SelfOffline", bound="OfflineAlgorithm")
+SMALLEST_SPREAD = 1e-3  # an entry that hardly varies in the demonstrations is not blown up
+LARGEST_INPUT = 10.0  # as in SB3's VecNormalize
+
+
+class NormalizingPolicy(BasePolicy):
+    """A policy that normalizes observations by the demonstrations' mean and standard deviation, and acts in [-1, 1], which is
+    scaled to the environment's units."""
+
+    mean: th.Tensor
+    spread: th.Tensor
+
+    def __init__(self, observation_space: spaces.Space, action_space: spaces.Box, **options: Any) -> None:
+        super().__init__(observation_space, action_space, normalize_images=False, squash_output=True, **options)
+        self.n_inputs, self.n_outputs = (int(np.prod(space.shape or ())) for space in (observation_space, action_space))
+        self.register_buffer("mean", th.zeros(self.n_inputs))
+        self.register_buffer("spread", th.ones(self.n_inputs))
+
+    def fit_normalization(self, rows: th.Tensor) -> None:
+        """Entries of these observations, (N, obs_dim), shall get mean 0 and standard deviation 1."""
+        self.mean.copy_(rows.mean(dim=0))
+        self.spread.copy_(rows.std(dim=0, correction=0).clamp(min=SMALLEST_SPREAD))
+
+    def normalized(self, observations: th.Tensor) -> th.Tensor:
+        """Normalized observations (B, obs_dim), of any shape (B, *shape)."""
+        return ((observations.float().flatten(1) - self.mean) / self.spread).clamp(-LARGEST_INPUT, LARGEST_INPUT)
 
 
 class OfflineAlgorithm(LearnsFromDemonstrations):
@@ -27,15 +51,16 @@ class OfflineAlgorithm(LearnsFromDemonstrations):
 
     :param policy: "MlpPolicy"
     :param env: a task with Box observations and actions; for its spaces and for evaluations
-    :param demonstrations: as of :class:`~sb3_actpc.demonstrations.mixin.LearnsFromDemonstrations`, with ``n_demonstrations``
-        and ``n_demonstration_transitions``
-    :param learning_rate: of the optimiser, or a schedule; the other keywords are SB3's
+    :param learning_rate: of the optimiser, or a schedule
     :param batch_size: B
+    :param options: further keywords, of :class:`~sb3_actpc.demonstrations.mixin.LearnsFromDemonstrations` and of SB3's
+        algorithms
     :raises ValueError: for a keyword with a value that is not allowed, without demonstrations, for demonstrations that do not
         fit the environment, for other spaces, and for an environment that normalises observations
     """
 
     is_offline: ClassVar[bool] = True  # for those who run any algorithm: its steps do nothing in the environment
+    policy: NormalizingPolicy
 
     @checked
     def __init__(
@@ -43,35 +68,13 @@ class OfflineAlgorithm(LearnsFromDemonstrations):
         policy: str | type[BasePolicy],
         env: GymEnv | str | None,
         *,
-        demonstrations: Demonstrations | str | Path | None = None,
-        n_demonstrations: int | None = None,
-        n_demonstration_transitions: int | None = None,
         learning_rate: float | Schedule = 1e-3,
         batch_size: Positive = 256,
-        policy_kwargs: dict[str, Any] | None = None,
-        stats_window_size: int = 100,
-        tensorboard_log: str | None = None,
-        verbose: int = 0,
-        seed: int | None = None,
-        device: th.device | str = "auto",
         _init_setup_model: bool = True,
+        **options: Any,
     ) -> None:
-        super().__init__(
-            policy,
-            env,
-            learning_rate=learning_rate,
-            policy_kwargs=policy_kwargs,
-            stats_window_size=stats_window_size,
-            tensorboard_log=tensorboard_log,
-            verbose=verbose,
-            device=device,
-            seed=seed,
-            support_multi_env=True,
-            supported_action_spaces=(spaces.Box,),
-            demonstrations=demonstrations,
-            n_demonstrations=n_demonstrations,
-            n_demonstration_transitions=n_demonstration_transitions,
-        )
+        options |= {"support_multi_env": True, "supported_action_spaces": (spaces.Box,)}
+        super().__init__(policy, env, learning_rate=learning_rate, **options)
         self.batch_size = batch_size
         if _init_setup_model:
             self._setup_model()
@@ -80,24 +83,17 @@ class OfflineAlgorithm(LearnsFromDemonstrations):
         self._check_actions()
         self._setup_lr_schedule()
         self.set_random_seed(self.seed)
-        kwargs = {**self._network_kwargs(), **self.policy_kwargs}
-        policy = self.policy_class(self.observation_space, self.action_space, self.lr_schedule, **kwargs)
-        self.policy = policy.to(self.device)
+        self.policy = self._new_policy()
         if self.env is not None:
             self._load_demonstrations()
 
-    def _network_kwargs(self) -> dict[str, Any]:
-        """Keywords of the policy that follow from the algorithm's."""
-        return {}
+    @abstractmethod
+    def _new_policy(self) -> Any:
+        """An untrained policy."""
 
-    def train(self) -> None:
-        """One gradient step; every hundredth logs its losses."""
-        losses = self._gradient_step()
-        self._n_updates += 1
-        if self._n_updates % 100 == 0:
-            for name, loss in losses.items():
-                self.logger.record(f"train/{name}", float(loss))
-            self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+    @abstractmethod
+    def _take(self, demonstrations: Demonstrations) -> None:
+        """Learn from these demonstrations, which fit the environment."""
 
     @abstractmethod
     def _gradient_step(self) -> Mapping[str, float | th.Tensor]:
@@ -105,10 +101,6 @@ class OfflineAlgorithm(LearnsFromDemonstrations):
 
     def _validate(self) -> None:
         """Choose what acts from now on; nothing to choose here."""
-
-    @abstractmethod
-    def _take(self, demonstrations: Demonstrations) -> None:
-        """Learn from these demonstrations, which fit the environment."""
 
     def _load_demonstrations(self) -> None:
         if self.demonstrations is None:
@@ -123,30 +115,32 @@ class OfflineAlgorithm(LearnsFromDemonstrations):
         self._load_demonstrations()
 
     def learn(
-        self: SelfOffline,
+        self,
         total_timesteps: int,
         callback: MaybeCallback = None,
         log_interval: int | None = 1000,
         tb_log_name: str | None = None,
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
-    ) -> SelfOffline:
+    ) -> Self:
         """As SB3's: ``total_timesteps`` are gradient steps, callbacks are called after each, and ``log_interval`` of them
         lie between two lines of the log (None: no log)."""
-        if self.env is None:
-            raise ValueError(f"{type(self).__name__} was loaded without an environment: set_env() first")
         name = tb_log_name or type(self).__name__
         total, callback = self._setup_learn(total_timesteps, callback, reset_num_timesteps, name, progress_bar)
         callback.on_training_start(locals(), globals())
+        # what callbacks look for after a step of the environment: there is none
+        callback.update_locals({"actions": np.empty(0, dtype=np.float32), "infos": [], "dones": np.empty(0, dtype=bool)})
         while self.num_timesteps < total:
             self._update_current_progress_remaining(self.num_timesteps, total)
-            self.train()
+            losses = self._gradient_step()
+            self._n_updates += 1
             self.num_timesteps += 1
+            if self._n_updates % 100 == 0:
+                self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+                for key, loss in losses.items():
+                    self.logger.record(f"train/{key}", float(loss))
             if log_interval is not None and self._n_updates % log_interval == 0:
                 self.logger.dump(self.num_timesteps)
-            # what callbacks look for after a step of the environment: there was none
-            nothing = np.empty(0, dtype=bool)
-            callback.update_locals({"actions": np.empty(0, dtype=np.float32), "infos": [], "dones": nothing})
             if not callback.on_step():
                 break
         self._validate()

@@ -1,1 +1,0 @@
-"""Offline methods of other packages, trained in virtual environments of their own."""
