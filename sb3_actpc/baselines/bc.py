@@ -48,7 +48,6 @@ class BCPolicy(NormalizingPolicy):
         return self.network(inputs)
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
-        assert isinstance(observation, th.Tensor)
         return self(self.normalized(observation)).clamp(-1, 1)
 
 
@@ -65,12 +64,7 @@ class BCRNNPolicy(BCPolicy):
 
     @checked
     def __init__(
-        self,
-        *args: Any,
-        hidden_size: Positive = 256,
-        n_layers: Positive = 1,
-        restart_every: Positive = 10,
-        **options: Any,
+        self, *args: Any, hidden_size: Positive = 256, n_layers: Positive = 1, restart_every: Positive = 10, **options: Any
     ) -> None:
         self.hidden_size, self.n_layers, self.restart_every = hidden_size, n_layers, restart_every
         super().__init__(*args, **options)
@@ -98,7 +92,6 @@ class BCRNNPolicy(BCPolicy):
         """
         self.set_training_mode(False)
         rows, is_batch = self.obs_to_tensor(observation)
-        assert isinstance(rows, th.Tensor)
         n = len(rows)
         if state is None:
             state = np.zeros((self.n_layers, n, self.hidden_size), dtype=np.float32), np.zeros(n, dtype=np.int64)
@@ -115,7 +108,6 @@ class BCRNNPolicy(BCPolicy):
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         """The first step of an episode; :meth:`predict` carries the state."""
-        assert isinstance(observation, th.Tensor)
         return self(self.normalized(observation)[:, None])[:, 0].clamp(-1, 1)
 
 
@@ -160,9 +152,8 @@ class BC(OfflineAlgorithm):
 
     def _take(self, demonstrations: Demonstrations) -> None:
         assert isinstance(self.action_space, spaces.Box)
-        rows = th.as_tensor(demonstrations.observations, device=self.device)
-        self.policy.fit_normalization(rows)
-        self._observations = self.policy.normalized(rows)
+        self.policy.fit_normalization(demonstrations.observations)
+        self._observations = self.policy.normalized(demonstrations.observations)
         self._actions = th.as_tensor(scaled_actions(demonstrations, self.action_space), device=self.device)
         bounds = demonstrations.episode_bounds
         lengths = bounds[:, 1] - bounds[:, 0]

@@ -30,8 +30,8 @@ class LOGO(LearnsFromDemonstrations, TRPO):
     uses no rewards of the demonstrations. After ``guidance_iterations``, δ shrinks whenever the agent's mean return of an
     iteration is above that of the last ten; near 0 guidance ends. Without demonstrations it is TRPO, number by number.
 
-    Defaults are the authors' for Hopper but ``n_steps``: theirs is 20,000 and 1500 iterations, so that δ first shrinks after a
-    million steps. With a small budget set ``n_steps`` and ``guidance_iterations`` so that it can shrink within it.
+    Defaults are the authors' for Hopper but ``n_steps`` (20,000). With a small budget set ``n_steps`` and
+    ``guidance_iterations`` so that δ can shrink within it.
 
     Differences from the authors' code (github.com/DesikRengarajan/LOGO; written anew from the paper):
 

@@ -8,7 +8,7 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, PyTorchObs, Schedule
 from typing_extensions import Self
 
 from sb3_actpc.demonstrations.dataset import Demonstrations
@@ -32,14 +32,16 @@ class NormalizingPolicy(BasePolicy):
         self.register_buffer("mean", th.zeros(self.n_inputs))
         self.register_buffer("spread", th.ones(self.n_inputs))
 
-    def fit_normalization(self, rows: th.Tensor) -> None:
+    def fit_normalization(self, observations: np.ndarray) -> None:
         """Entries of these observations, (N, obs_dim), shall get mean 0 and standard deviation 1."""
+        rows = th.as_tensor(observations, device=self.device)
         self.mean.copy_(rows.mean(dim=0))
         self.spread.copy_(rows.std(dim=0, correction=0).clamp(min=SMALLEST_SPREAD))
 
-    def normalized(self, observations: th.Tensor) -> th.Tensor:
+    def normalized(self, observations: np.ndarray | PyTorchObs) -> th.Tensor:
         """Normalized observations (B, obs_dim), of any shape (B, *shape)."""
-        return ((observations.float().flatten(1) - self.mean) / self.spread).clamp(-LARGEST_INPUT, LARGEST_INPUT)
+        rows = th.as_tensor(observations, dtype=th.float32, device=self.device).flatten(1)
+        return ((rows - self.mean) / self.spread).clamp(-LARGEST_INPUT, LARGEST_INPUT)
 
 
 class OfflineAlgorithm(LearnsFromDemonstrations):

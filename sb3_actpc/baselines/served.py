@@ -87,8 +87,7 @@ class ServerProcess:
         self._process.kill()
         self._process.wait()
 
-    def __del__(self) -> None:
-        self.close()
+    __del__ = close
 
 
 class ServedPolicy(NormalizingPolicy):
@@ -97,7 +96,6 @@ class ServedPolicy(NormalizingPolicy):
     owner: "ServedAlgorithm"
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
-        assert isinstance(observation, th.Tensor)
         rows = self.normalized(observation).cpu().numpy()
         return th.as_tensor(self.owner.server.call("predict", rows), device=self.device).clamp(-1, 1)
 
@@ -140,14 +138,11 @@ class ServedAlgorithm(OfflineAlgorithm):
         return policy
 
     def _take(self, demonstrations: Demonstrations) -> None:
-        rows, following = (
-            th.as_tensor(part, device=self.device) for part in (demonstrations.observations, demonstrations.next_observations)
-        )
         if not len(self.trained):  # a loaded agent keeps the normalization that its networks learned with
-            self.policy.fit_normalization(rows)
+            self.policy.fit_normalization(demonstrations.observations)
         self._transitions = {
-            "observations": self.policy.normalized(rows).cpu().numpy(),
-            "next_observations": self.policy.normalized(following).cpu().numpy(),
+            "observations": self.policy.normalized(demonstrations.observations).cpu().numpy(),
+            "next_observations": self.policy.normalized(demonstrations.next_observations).cpu().numpy(),
             "actions": scaled_actions(demonstrations, self.action_space),  # type: ignore[arg-type]
             "rewards": demonstrations.rewards[:, None],
             "terminals": demonstrations.terminations[:, None].astype(np.float32),
@@ -162,14 +157,15 @@ class ServedAlgorithm(OfflineAlgorithm):
     def server(self) -> ServerProcess:
         """The other process, started when it is not running: with the networks as they were last fetched, or new ones."""
         if self._process is None:
-            self._process = ServerProcess([str(environment_python()), "-I", str(SERVER)])
+            process = ServerProcess([str(environment_python()), "-I", str(SERVER)])
             # without a seed every agent has another; one that goes on does not draw the same batches again
             seed = int(np.random.randint(2**31)) if self.seed is None else self.seed + self._n_updates
             self._random = np.random.default_rng(seed)
             sizes = self.policy.n_inputs, self.policy.n_outputs
-            self._process.call("build", self.method, *sizes, self.batch_size, seed, self.method_kwargs)
+            process.call("build", self.method, *sizes, self.batch_size, seed, self.method_kwargs)
             if len(self.trained):
-                self._process.call("load", self.trained.cpu().numpy().tobytes())
+                process.call("load", self.trained.cpu().numpy().tobytes())
+            self._process = process
         return self._process
 
     def close(self) -> None:

@@ -18,7 +18,7 @@ OPTIMIZERS: dict[str, type[th.optim.Optimizer]] = {"adam": th.optim.Adam, "adamw
 SMALLEST_VALUE = 1e-8  # mean absolute action-value that divides
 BC_LEARNING_RATE = 1e-3  # falls linearly to 0
 BC_BATCH_SIZE = 256
-NETWORK_KEYWORDS = ("learning_rate", "optimizer", "tau")
+NETWORK_KEYWORDS = {"learning_rate", "optimizer", "tau"}
 
 
 class TD3Demo(DemonstratedAlgorithm, TD3):
@@ -67,19 +67,16 @@ class TD3Demo(DemonstratedAlgorithm, TD3):
         super()._setup_model()
         self._losses: dict[str, list[float]] = defaultdict(list)
         for network, given in self._networks():
-            if unknown := sorted(set(given) - set(NETWORK_KEYWORDS)):
+            kind = OPTIMIZERS.get(given.get("optimizer", "adam"))
+            if kind is None or not given.keys() <= NETWORK_KEYWORDS:
                 raise ValueError(
-                    f"unknown keys {unknown} of actor_kwargs or critic_kwargs: choose from {', '.join(NETWORK_KEYWORDS)}"
+                    f"{given} of a network: choose from {sorted(NETWORK_KEYWORDS)}, optimizers {list(OPTIMIZERS)}"
                 )
-            kind = given.get("optimizer", "adam")
-            if kind not in OPTIMIZERS:
-                raise ValueError(f"optimizer={kind!r} is unknown; choose one of {sorted(OPTIMIZERS)}")
-            if "optimizer" in given or "learning_rate" in given:
+            if given.keys() - {"tau"}:
                 rate = given.get("learning_rate", self.lr_schedule(1.0))
-                network.optimizer = OPTIMIZERS[kind](network.parameters(), lr=rate)  # type: ignore[call-arg]
+                network.optimizer = kind(network.parameters(), lr=rate)  # type: ignore[call-arg]
 
     def _networks(self) -> list[tuple[BaseModel, dict[str, Any]]]:
-        """Actor and critic, with what each has of its own."""
         return [(self.actor, self.actor_kwargs or {}), (self.critic, self.critic_kwargs or {})]
 
     def train(self, gradient_steps: int, batch_size: int = 100) -> None:

@@ -69,12 +69,6 @@ def test_the_discriminator_sees_demonstrations_normalised_as_the_agents_observat
         th.testing.assert_close(mine, theirs, atol=1e-4, rtol=1e-3)
 
 
-def test_bounds_in_float64_are_no_obstacle() -> None:
-    env = gym.make("Pendulum-v1")
-    env.action_space = gym.spaces.Box(-2.0, 2.0, (1,), np.float64)
-    assert "train/discriminator_accuracy" in make(env).learn(64).logger.name_to_value
-
-
 def test_guidance_moves_the_policy_towards_the_demonstrated_actions_within_its_trust_region() -> None:
     """TRPO's own step is made tiny, so that guidance alone moves the policy."""
     shown = pushes()

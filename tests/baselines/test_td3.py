@@ -44,8 +44,8 @@ def test_actor_and_critic_have_rates_optimisers_and_targets_of_their_own() -> No
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"actor_kwargs": {"lr": 1.0}}, "unknown keys .*lr.* choose from learning_rate"),
-        ({"critic_kwargs": {"optimizer": "sgd"}}, "optimizer='sgd' is unknown; choose one of"),
+        ({"actor_kwargs": {"lr": 1.0}}, "'lr': 1.0.* of a network: choose from .'learning_rate'"),
+        ({"critic_kwargs": {"optimizer": "sgd"}}, "sgd.* of a network: choose from .*optimizers .'adam', 'adamw'"),
         ({"demonstration_fraction": 1.5}, "demonstration_fraction=1.5 must be between 0 and 1"),
         ({"demonstrations": 3}, "demonstrations must be a file path"),
     ],
