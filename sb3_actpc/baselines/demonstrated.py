@@ -10,7 +10,7 @@ from gymnasium import spaces
 from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import GymEnv, RolloutReturn
-from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_actpc.demonstrations import Demonstrations, scaled_actions
@@ -99,6 +99,12 @@ class DemonstrationDictReplayBuffer(WithDemonstrations, DictReplayBuffer):
 class DemonstrationHerReplayBuffer(WithDemonstrations, HerReplayBuffer):
     """SB3's hindsight replay buffer with demonstrations, which are relabelled as the agent's own transitions are."""
 
+    def set_env(self, env: VecEnv) -> None:
+        """:param env: the environment whose ``compute_reward`` relabels, of a buffer that was loaded"""
+        super().set_env(env)
+        if isinstance(self.demonstrated, HerReplayBuffer):
+            self.demonstrated.set_env(env)
+
     def cut_running_episodes(self) -> None:
         """As :meth:`WithDemonstrations.cut_running_episodes`."""
         with warnings.catch_warnings():
@@ -139,8 +145,7 @@ class DemonstratedAlgorithm(LearnsFromDemonstrations, StoresLastTransition):
         self._check_actions()
         if self.replay_buffer_class is not None:
             raise ValueError(f"replay_buffer_class={self.replay_buffer_class!r} must be None; for hindsight replay use HER")
-        buffer = self._make_replay_buffer() if self.replay_buffer is None else self.replay_buffer
-        self.replay_buffer = buffer
+        buffer = self.replay_buffer = self._make_replay_buffer()
         super()._setup_model()
         # SB3 replaces None by its own default, and SBX makes a buffer of its own
         self.replay_buffer_class = None

@@ -17,7 +17,7 @@ import torch as th
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import PyTorchObs
 
-from sb3_actpc.baselines.offline import NormalizingPolicy, OfflineAlgorithm
+from sb3_actpc.baselines.bc import NormalizingPolicy, OfflineAlgorithm
 from sb3_actpc.demonstrations import Demonstrations, scaled_actions
 from sb3_actpc.utils.arguments import checked
 
@@ -107,7 +107,7 @@ class ServedAlgorithm(OfflineAlgorithm):
     [-1, 1]. It starts when it is first needed, computes on the CPU, and holds the networks, which are fetched to be saved. It
     ends with :meth:`close`, or with the agent.
 
-    :param args: policy and env of :class:`~sb3_actpc.baselines.offline.OfflineAlgorithm`
+    :param args: policy and env of :class:`~sb3_actpc.baselines.bc.OfflineAlgorithm`
     :param batch_size: B
     :param method_kwargs: the method's own settings, by d3rlpy's names, and ``net_arch``, the hidden sizes of all networks
     :param options: further keywords as there; the learning rates are among ``method_kwargs``

@@ -160,12 +160,12 @@ def test_the_shared_evaluation_carries_the_state() -> None:
 @pytest.mark.parametrize(
     ("kind", "options", "message"),
     [
-        (BC, {"demonstrations": None}, "demonstrations=None: BC learns from nothing else"),
+        (BC, {"demonstrations": None}, "demonstrations=None.*: an offline method needs a file"),
         (BC, {"batch_size": 0}, "batch_size=0 must be at least 1"),
         (BC, {"weight_decay": float("nan")}, "weight_decay=nan must be a finite number"),
         (BC, {"n_demonstrations": 99}, "n_demonstrations=99.*: n_episodes must be"),
         (BCRNN, {"policy_kwargs": {"hidden_size": 0}}, "hidden_size=0 must be at least 1"),
-        (BC, {"env": VecNormalize(make_vec_env(ENV))}, "leave VecNormalize out"),
+        (BC, {"env": VecNormalize(make_vec_env(ENV))}, "or VecNormalize: an offline method .* normalizes by it itself"),
     ],
 )
 def test_what_it_cannot_learn_from_is_refused(kind: type[BC], options: dict[str, Any], message: str) -> None:

@@ -217,6 +217,14 @@ def test_a_stopped_run_goes_on_bit_for_bit(tmp_path) -> None:
     assert np.array_equal(mine.priorities, theirs.priorities)
 
 
+def test_a_saved_replay_buffer_relabels_again(tmp_path) -> None:
+    model = make().learn(60)
+    model.save_replay_buffer(tmp_path / "buffer.pkl")
+    loaded = make()
+    loaded.load_replay_buffer(tmp_path / "buffer.pkl")
+    assert len(loaded.replay_buffer.sample(16).rewards) == 16
+
+
 def test_a_task_without_goals_is_refused() -> None:
     with pytest.raises(ValueError, match="such as GoalReacher-v5"):
         HER("MlpPolicy", "SparseReacher-v5")
