@@ -1,11 +1,14 @@
-"""Short demonstrations of any task with Box observations, recorded with random actions."""
+"""Short demonstrations of any task with Box observations, recorded with random actions, and Minari's files of them."""
 
 from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
+import numpy as np
 
 import sb3_actpc  # noqa: F401  (registers the tasks)
 from sb3_actpc.demonstrations import Demonstrations
+from sb3_actpc.demonstrations.rows import split_observations
 
 
 def record(env_id: str, n_episodes: int = 2, n_steps: int = 12, **env_kwargs: object) -> Demonstrations:
@@ -21,3 +24,27 @@ def record_file(folder: Path, env_id: str, n_episodes: int = 2) -> Path:
     if not path.exists():
         record(env_id, n_episodes).save(path)
     return path
+
+
+def write_minari(shown: Demonstrations, dataset_id: str, env: gym.Env) -> Any:
+    """A new local Minari dataset of the same episodes, with the environment's id and spaces."""
+    import minari
+    from minari.data_collector import EpisodeBuffer
+
+    buffers = []
+    for episode in shown.episodes:
+        seen = np.concatenate([episode["observations"], episode["next_observations"][-1:]])
+        is_last = np.arange(len(episode["actions"])) == len(episode["actions"]) - 1
+        dense = {} if shown.dense_rewards is None else {"dense_reward": np.append(np.float32(0), episode["dense_rewards"])}
+        buffers.append(
+            EpisodeBuffer(
+                observations=split_observations(env.observation_space, seen),
+                actions=split_observations(env.action_space, episode["actions"]),
+                rewards=episode["rewards"],
+                terminations=episode["terminations"],
+                truncations=is_last & ~episode["terminations"],
+                infos=dense,
+            )
+        )
+    made = {"observation_space": env.observation_space, "action_space": env.action_space}
+    return minari.create_dataset_from_buffers(dataset_id, buffers, env=env.spec, **made)

@@ -223,7 +223,7 @@ def command_line(args: argparse.Namespace, options: Sequence[str]) -> str:
 
 
 def _convert(args: argparse.Namespace) -> int:
-    from sb3_actpc.demonstrations import Demonstrations, write_robomimic
+    from sb3_actpc.demonstrations import Demonstrations, read_hdf5, write_robomimic
 
     is_npz = args.file.suffix == ".npz"
     output = args.output or args.file.with_suffix(".hdf5" if is_npz else ".npz")
@@ -232,28 +232,15 @@ def _convert(args: argparse.Namespace) -> int:
     if not is_npz:
         if output.suffix != ".npz":
             raise ValueError(f"--output {output} must end in .npz")
-        return _save(_read_hdf5(args), output)
+        if args.env is None:
+            raise ValueError(f"--env is needed to convert {args.file}: give one of {', '.join(ROBOSUITE_IDS)}")
+        return _save(read_hdf5(args.file, args.env, args.obs or "paper", args.filter_key), output)
     if output.suffix not in HDF5_SUFFIXES:
         raise ValueError(f"--output {output} must end in {' or '.join(HDF5_SUFFIXES)}: it will be a robomimic file")
     for option in ("env", "obs", "filter_key"):
         if getattr(args, option) is not None:
             raise ValueError(f"--{option.replace('_', '-')} is for HDF5 files: leave it out, {args.file} is written as it is")
     return _save(Demonstrations.load(args.file), output, write_robomimic)
-
-
-def _read_hdf5(args: argparse.Namespace) -> "Demonstrations":
-    from sb3_actpc.demonstrations import read_robomimic, read_robosuite
-    from sb3_actpc.demonstrations.hdf5 import open_hdf5
-
-    if args.env is None:
-        raise ValueError(f"--env is needed to convert {args.file}: give one of {', '.join(ROBOSUITE_IDS)}")
-    with open_hdf5(args.file) as data:
-        is_robomimic = "env_args" in data.attrs
-    if is_robomimic:
-        return read_robomimic(args.file, args.env, args.obs or "paper", args.filter_key)
-    if args.filter_key is not None:
-        raise ValueError(f"--filter-key {args.filter_key}: {args.file} is not a robomimic file and has no masks; leave it out")
-    return read_robosuite(args.file, args.env, args.obs or "paper")
 
 
 def _download(args: argparse.Namespace) -> int:

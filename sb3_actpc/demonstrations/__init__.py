@@ -5,8 +5,7 @@ Every source gives a :class:`Demonstrations`.
 
 from sb3_actpc.demonstrations.dataset import Demonstrations, shipped_demonstrations
 from sb3_actpc.demonstrations.fitting import fit_demonstrations, is_minari_id, resolve, scaled_actions
-from sb3_actpc.demonstrations.robomimic import read_robomimic, write_robomimic
-from sb3_actpc.demonstrations.robosuite_states import read_robosuite
+from sb3_actpc.demonstrations.robomimic import read_hdf5, write_robomimic
 from sb3_actpc.demonstrations.scripted import MIXED_DEMONSTRATORS, ScriptedDemonstrator, collect_scripted
 
 __all__ = [
@@ -16,8 +15,7 @@ __all__ = [
     "collect_scripted",
     "fit_demonstrations",
     "is_minari_id",
-    "read_robomimic",
-    "read_robosuite",
+    "read_hdf5",
     "resolve",
     "scaled_actions",
     "shipped_demonstrations",

@@ -16,17 +16,10 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from sb3_actpc.demonstrations.minari import read_minari, write_minari
+from sb3_actpc.demonstrations.minari import read_minari
 from sb3_actpc.demonstrations.npz import read_npz, write_npz
-from sb3_actpc.demonstrations.recording import env_name, record_episodes, time_limit, trajectory_columns
-from sb3_actpc.demonstrations.rows import (
-    box_paths,
-    field_error,
-    flat_size,
-    outside_bounds,
-    unchained_indices,
-    whole_columns,
-)
+from sb3_actpc.demonstrations.recording import env_name, record_episodes, trajectory_columns
+from sb3_actpc.demonstrations.rows import box_paths, field_error, outside_bounds, whole_columns
 from sb3_actpc.envs import SPARSE_IDS
 from sb3_actpc.utils.precision import warn_of_indistinguishable
 
@@ -133,7 +126,8 @@ class Demonstrations:
         metadata: Mapping[str, Any] | None = None,
         source: str = "",
     ) -> Demonstrations:
-        """Join episodes, each a dictionary of columns named as in ``COLUMNS``.
+        """Join episodes, each a dictionary of columns named as in ``COLUMNS``; those of two sets of demonstrations are
+        ``[*first.episodes, *second.episodes]``.
 
         :param episodes: columns of n rows. ``next_observations`` may be left out where ``observations`` has n + 1 rows, and
             ``terminations`` where no episode terminated. Dense rewards are kept if all episodes have them
@@ -143,19 +137,11 @@ class Demonstrations:
         :raises ValueError: when there are no episodes, or columns do not fit together
         :warns UserWarning: for features of the observations that float32 cannot follow
         """
-        if metadata is not None and not isinstance(metadata, Mapping):
-            raise field_error(source, "metadata", "a dictionary", repr(metadata))
-        if isinstance(episodes, Mapping):
-            raise field_error(
-                source, "episodes", "a sequence of dictionaries, one of each episode", "a dictionary: put it in a list"
-            )
         episodes = [whole_columns(episode, COLUMNS, source) for episode in episodes]
         if not episodes:
             raise field_error(source, "episodes", "at least one episode", "none")
         columns = {}
-        for name in COLUMNS:
-            if name == "dense_rewards" and not all(episode.get(name) is not None for episode in episodes):
-                continue
+        for name in [name for name in COLUMNS if all(name in episode for episode in episodes)]:
             try:
                 columns[name] = np.concatenate([episode[name] for episode in episodes])
             except ValueError as error:
@@ -195,7 +181,7 @@ class Demonstrations:
                 return cls.record(demonstrator, made, n_episodes, only_successes, metadata=metadata, **options)
         if not isinstance(env, gym.Env):
             raise ValueError(f"env must be a Gymnasium environment or the id of one, found {env!r}")
-        demonstrators = demonstrator if isinstance(demonstrator, list | tuple) else [demonstrator]
+        demonstrators = demonstrator if demonstrator and isinstance(demonstrator, list | tuple) else [demonstrator]
         episodes, made_by = record_episodes(demonstrators, env, n_episodes, only_successes, **options)
         recorded = cls.from_episodes(episodes, env_name(env), {**made_by, **(metadata or {})})
         recorded.check(env.observation_space, env.action_space)
@@ -222,7 +208,8 @@ class Demonstrations:
         :param final_reward: reward of the last step where there are no ``rews``; all others are 0
         :raises ValueError: when something is missing, does not fit together, or is of a Discrete space
         """
-        limit = time_limit(env_id)
+        spec = gym.registry.get(env_id.rpartition(":")[2])
+        limit = None if spec is None else spec.max_episode_steps
         if limit is None and any(one.infos is None and one.terminal for one in trajectories):
             warnings.warn(
                 f"trajectories without infos, of {env_id}, whose time limit is not known: all their ends count as "
@@ -231,21 +218,6 @@ class Demonstrations:
             )
         columns = [trajectory_columns(one, observation_space, final_reward, limit) for one in trajectories]
         return cls.from_episodes(columns, env_id, source="trajectories")
-
-    @classmethod
-    def concatenate(cls, parts: Sequence[Demonstrations]) -> Demonstrations:
-        """All episodes of demonstrations of one task, with the metadata on which all agree; dense rewards stay where all have
-        them. ValueError when there are none, or they are of several tasks or sizes."""
-        names = sorted({base_name(part.env_id) for part in parts})
-        if len(names) > 1:
-            raise ValueError(f"demonstrations of several tasks cannot be concatenated, found {', '.join(names)}")
-        episodes = [episode for part in parts for episode in part.episodes]
-        metadata = dict(parts[0].metadata) if parts else {}
-        agreed = {key: value for key, value in metadata.items() if all(part.metadata.get(key) == value for part in parts)}
-        agreed.pop("filter_keys", None)  # of single episodes
-        return cls.from_episodes(
-            episodes, parts[0].env_id if parts else "", agreed, " + ".join(part.source for part in parts if part.source)
-        )
 
     @property
     def episodes(self) -> Iterator[dict[str, np.ndarray]]:
@@ -276,13 +248,12 @@ class Demonstrations:
         if env_id is not None and base_name(env_id) != base_name(self.env_id):
             raise self._error("env_id", f"{env_id!r} (any version)", repr(self.env_id))
         box_paths(observation_space)
-        obs_dim = flat_size(observation_space)
-        if self.observations.shape[1] != obs_dim:
-            raise self._error("observations", f"{obs_dim} values a row", f"{self.observations.shape[1]}")
         if not isinstance(action_space, spaces.Box):
             raise self._error("actions", "a Box action space", repr(action_space))
-        if self.actions.shape[1] != flat_size(action_space):
-            raise self._error("actions", f"{flat_size(action_space)} values a row", f"{self.actions.shape[1]}")
+        for name, space in (("observations", observation_space), ("actions", action_space)):
+            size, found = spaces.flatdim(space), getattr(self, name).shape[1]
+            if size != found:
+                raise self._error(name, f"{size} values a row", f"{found}")
         outside = outside_bounds(self.actions, action_space)
         if outside.any():
             row, column = (int(index) for index in np.argwhere(outside)[0])
@@ -322,7 +293,7 @@ class Demonstrations:
         :param dataset: a ``minari.MinariDataset``, or the id of one in the local Minari folder (nothing is downloaded)
         :param env_id: by default the one recorded in the dataset
         :param observation_space: the environment's own space, for a Dict whose keys are not in alphabetical order: Minari
-            sorts them, so by default only :meth:`to_minari`'s datasets keep another order
+            sorts them
         :raises ImportError: when Minari is not installed
         :raises FileNotFoundError: when no local dataset has this id
         :raises ValueError: when the dataset has no episodes, no environment id, spaces other than Box (or Dicts of Box
@@ -331,72 +302,34 @@ class Demonstrations:
         episodes, fields = read_minari(dataset, env_id, observation_space)
         return cls.from_episodes(episodes, **fields)
 
-    def to_minari(self, dataset_id: str, env: gym.Env[Any, Any] | None = None, **options: Any) -> Any:
-        """Write the episodes as a new local Minari dataset (needs the ``minari`` extra).
-
-        :param dataset_id: Minari id, such as ``"sparse-hopper/expert-v0"``; must not exist yet
-        :param env: environment whose spaces and, if JSON can hold it, specification are recorded; by default ``env_id`` is
-            made if it is registered, otherwise plain unbounded Box spaces are recorded
-        :param options: further keywords of ``minari.create_dataset_from_buffers`` (``author``, ``description``, …)
-        :return: the ``minari.MinariDataset``; :meth:`from_minari` gives equal arrays back
-        :raises ImportError: when Minari is not installed
-        :raises ValueError: when the id exists or is malformed, the demonstrations do not fit the environment, or an
-            episode's next observations are not its following observations, which Minari cannot hold
-        """
-        if env is None and self.env_id in gym.registry:
-            with gym.make(self.env_id) as made:
-                return self.to_minari(dataset_id, made, **options)
-        sizes = self.observations.shape[1], self.actions.shape[1]
-        boxes: list[spaces.Space[Any]] = [spaces.Box(-np.inf, np.inf, (size,), np.float32) for size in sizes]
-        observation_space, action_space = boxes
-        if env is not None:
-            observation_space, action_space = env.observation_space, env.action_space
-            self.check(observation_space, action_space, None if env.spec is None else env.spec.id)
-        unchained = unchained_indices(self.observations, self.next_observations, self.episode_starts)
-        jumps = np.setdiff1d(unchained, self.episode_bounds[:, 1] - 1)
-        if len(jumps) > 0:
-            expected = "the following observation at every transition within an episode"
-            raise self._error("next_observations", expected, f"another one at transition {jumps[0]}")
-        metadata = {"env_id": self.env_id, "demonstrations_metadata": self.metadata}
-        return write_minari(dataset_id, list(self.episodes), observation_space, action_space, env, metadata, options)
-
     def _error(self, name: str, expected: str, found: str) -> ValueError:
         return field_error(self.source, name, expected, found)
 
     def _convert(self, name: str, *shape: int | None, dtype: type[np.generic] = np.float32) -> np.ndarray:
         """Give a field its type, if every value allows it and its shape is this one (None: any length but 0)."""
+        sizes = ", ".join("1 or more" if size is None else str(size) for size in shape)
         try:
             given = np.asarray(getattr(self, name))
         except ValueError:
-            raise self._error(name, "an array of numbers", "rows of unequal length") from None
-        if given.dtype.kind not in ("iu" if dtype is np.int64 else "biuf"):
-            expected = "whole numbers" if dtype is np.int64 else "numbers"
-            raise self._error(name, expected, f"type {given.dtype}, shape {given.shape}")
+            raise self._error(name, f"an array of shape ({sizes})", "rows of unequal length") from None
         fits = [size in (None, found) for found, size in zip(given.shape, shape, strict=False)]
-        if given.ndim != len(shape) or given.size == 0 or not all(fits):
-            expected = ", ".join("1 or more" if size is None else str(size) for size in shape)
-            raise self._error(name, f"an array of shape ({expected})", f"shape {given.shape}")
+        if given.dtype.kind not in "biuf" or given.ndim != len(shape) or given.size == 0 or not all(fits):
+            raise self._error(name, f"numbers of shape ({sizes})", f"type {given.dtype}, shape {given.shape}")
         with np.errstate(over="ignore", invalid="ignore"):
             values = np.asarray(given, dtype=dtype, order="C")
         wrong = ~np.isfinite(values) if dtype is np.float32 else values != given
         if wrong.any():
             where = tuple(int(index) for index in np.argwhere(wrong)[0])
-            expected = "finite float32 values" if dtype is np.float32 else "true or false"
-            raise self._error(name, expected, f"{given[where]} at index {where}")
+            raise self._error(name, f"finite {np.dtype(dtype)} values", f"{given[where]} at index {where}")
         object.__setattr__(self, name, values)
         return values
 
     def _json_metadata(self) -> dict[str, Any]:
         """A copy of the metadata as a JSON file would give it back."""
-        if not isinstance(self.metadata, Mapping):
-            raise self._error("metadata", "a dictionary", repr(self.metadata))
-        for key, value in self.metadata.items():
-            if not isinstance(key, str) or isinstance(value, Mapping):
-                raise self._error("metadata", "a flat dictionary with text keys", f"{key!r}: {value!r}")
         try:
             return dict(json.loads(json.dumps(dict(self.metadata), allow_nan=False)))
         except (TypeError, ValueError) as error:
-            raise self._error("metadata", "JSON values", f"{self.metadata!r} ({error})") from None
+            raise self._error("metadata", "a dictionary of JSON values", f"{self.metadata!r} ({error})") from None
 
     def _check_count(self, name: str, count: int, available: int) -> None:
         is_whole = isinstance(count, (int, np.integer)) and not isinstance(count, bool)

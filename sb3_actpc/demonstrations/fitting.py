@@ -11,12 +11,12 @@ import numpy as np
 from gymnasium import spaces
 
 from sb3_actpc.demonstrations.dataset import DATA_FOLDER, Demonstrations, base_name
+from sb3_actpc.demonstrations.recording import wrapper_names
 from sb3_actpc.demonstrations.rows import box_paths, join_observations, split_observations
-from sb3_actpc.demonstrations.wrappers import check_wrapping, wrapping_of_vectorised
 from sb3_actpc.envs import SPARSE_MUJOCO_IDS, dense_env_id, sparse_env_id
 
 if TYPE_CHECKING:
-    from stable_baselines3.common.vec_env import VecEnv, VecTransposeImage
+    from stable_baselines3.common.vec_env import VecEnv
 
 MINARI_ID = re.compile(r"([\w-]+/)*[\w-]+-v\d+")
 
@@ -66,9 +66,9 @@ def fit_demonstrations(
     :param n_episodes: use only this many episodes, the first ones
     :param n_transitions: use only this many transitions, the first ones
     :raises FileNotFoundError: when there is no such file
-    :raises ValueError: for demonstrations that are damaged, too few, of another task, or recorded in other units
-    :warns UserWarning: where the agent's wrappers may change the units, see :mod:`~sb3_actpc.demonstrations.wrappers`, or
-        where episodes are longer than the environment's time limit
+    :raises ValueError: for demonstrations that are damaged, too few, of another task, or recorded behind other wrappers of
+        observations or actions
+    :warns UserWarning: where other wrappers differ, or those of the recording are not known
     """
     has_goals = env is not None and env.has_attr("goal_demonstrations")
     demonstrations = resolve(source, None if has_goals else observation_space)  # they may be of the task without goals
@@ -91,50 +91,13 @@ def fit_demonstrations(
         demonstrations.check(observation_space, action_space, env_id)
     except ValueError as error:
         fix = "record them in this environment, wrapped as it is here (Demonstrations.record)"
-        is_named_otherwise = env_id is not None and base_name(env_id) != base_name(demonstrations.env_id)
-        if is_named_otherwise and _fits(demonstrations, observation_space, action_space):
-            fix += f", or rename them: dataclasses.replace(demonstrations, env_id={env_id!r})"
+        if env_id is not None and base_name(env_id) != base_name(demonstrations.env_id):
+            fix += f", or, if it is the same task, rename them: dataclasses.replace(demonstrations, env_id={env_id!r})"
         raise ValueError(f"{error}: {fix}") from None
     if env is None:
         return demonstrations
-    _compare_lengths(demonstrations, env)
-    # sb3-actpc demos collect makes the environment by its id
-    is_collected = str(demonstrations.metadata.get("command", "")).startswith("sb3-actpc demos collect")
-    recorded_behind = demonstrations.metadata.get("wrappers", [] if is_collected else None)
-    if env_id is not None or recorded_behind is not None:
-        check_wrapping(wrapping_of_vectorised(env, demonstrations.actions), recorded_behind, env_id or demonstrations.env_id)
+    _check_wrappers(demonstrations, env)
     return _transposed(demonstrations, env).rewarded_by(env)
-
-
-def _transposed(demonstrations: Demonstrations, env: "VecEnv") -> Demonstrations:
-    """Images with their channels first, where SB3 has wrapped the environment so; they were recorded without."""
-    from stable_baselines3.common.vec_env import VecTransposeImage, unwrap_vec_wrapper  # heavy: demonstrations do without
-
-    transposes = unwrap_vec_wrapper(env, VecTransposeImage)
-    if transposes is None:
-        return demonstrations
-    columns = demonstrations.observations, demonstrations.next_observations
-    observations, following = (_channels_first(rows, transposes) for rows in columns)
-    return dataclasses.replace(demonstrations, observations=observations, next_observations=following)
-
-
-def _compare_lengths(demonstrations: Demonstrations, env: "VecEnv") -> None:
-    """A UserWarning for episodes that are longer than the environment lets an episode be."""
-    name = "_max_episode_steps"  # of TimeLimit; not every specification can be sent from another process
-    limit = env.get_attr(name, indices=[0])[0] if env.has_attr(name) else None
-    longest = int(np.diff(demonstrations.episode_bounds, axis=1).max())
-    if isinstance(limit, int) and longest > limit:
-        warnings.warn(
-            f"demonstrated episodes have up to {longest} steps, the environment's at most {limit}: their returns cannot be "
-            f"compared. Make it with gymnasium.make(..., max_episode_steps={longest}), or record in it as it is",
-            stacklevel=3,
-        )
-
-
-def _channels_first(rows: np.ndarray, env: "VecTransposeImage") -> np.ndarray:
-    """Rows (N, flat size) of the inner environment in the wrapper's order of channels."""
-    observations = env.transpose_observations(split_observations(env.venv.observation_space, rows))
-    return join_observations(observations, box_paths(env.observation_space))
 
 
 def scaled_actions(demonstrations: Demonstrations, action_space: spaces.Box) -> np.ndarray:
@@ -143,10 +106,38 @@ def scaled_actions(demonstrations: Demonstrations, action_space: spaces.Box) -> 
     return np.clip(2.0 * (demonstrations.actions - low) / (high - low) - 1.0, -1.0, 1.0).astype(np.float32)
 
 
-def _fits(demonstrations: Demonstrations, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> bool:
-    """Whether demonstrations have these spaces, whatever their environment's id is."""
+def _check_wrappers(demonstrations: Demonstrations, env: "VecEnv") -> None:
+    """Compare the names of the wrappers that may change units with those that the demonstrations were recorded behind."""
+    # sb3-actpc demos collect makes the environment by its id
+    is_collected = str(demonstrations.metadata.get("command", "")).startswith("sb3-actpc demos collect")
+    recorded = demonstrations.metadata.get("wrappers", [] if is_collected else None)
     try:
-        demonstrations.check(observation_space, action_space)
-    except ValueError:
-        return False
-    return True
+        found = wrapper_names(str(env.env_method("__str__", indices=[0])[0]))
+    except (AttributeError, NotImplementedError):  # not every kind of vectorised environment can be asked
+        return
+    if found == (recorded or []):
+        return
+    theirs = "wrappers that are not known" if recorded is None else ", ".join(recorded) or "no wrapper"
+    message = (
+        f"demonstrations of {demonstrations.env_id} were recorded behind {theirs}, the agent learns behind "
+        f"{', '.join(found) or 'no wrapper'}: record them in the agent's environment (Demonstrations.record). If they are in "
+        "its units, say so: dataclasses.replace(demonstrations, metadata={**demonstrations.metadata, "
+        f'"wrappers": {found}}})'
+    )
+    if recorded is not None and re.search("Observation|Action", " ".join({*found} ^ {*recorded})):
+        raise ValueError(message)
+    warnings.warn(message, stacklevel=3)
+
+
+def _transposed(demonstrations: Demonstrations, env: "VecEnv") -> Demonstrations:
+    """Images with their channels first, where SB3 has wrapped the environment so; they were recorded without."""
+    from stable_baselines3.common.vec_env import VecTransposeImage, unwrap_vec_wrapper  # heavy: demonstrations do without
+
+    wrapper = unwrap_vec_wrapper(env, VecTransposeImage)
+    if wrapper is None:
+        return demonstrations
+    columns: dict[str, Any] = {}
+    for name in ("observations", "next_observations"):
+        images = split_observations(wrapper.venv.observation_space, getattr(demonstrations, name))
+        columns[name] = join_observations(wrapper.transpose_observations(images), box_paths(wrapper.observation_space))
+    return dataclasses.replace(demonstrations, **columns)

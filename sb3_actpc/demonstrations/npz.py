@@ -14,17 +14,14 @@ from sb3_actpc.demonstrations.rows import field_error, unchained_indices
 from sb3_actpc.utils.files import atomic_write
 
 FORMAT_VERSION = 1
-FROM_IMITATION = (
-    "if the imitation library wrote it, read it with imitation.data.serialize.load and make "
-    "Demonstrations.from_trajectories of that"
+OTHERS = (
+    "for others: `sb3-actpc demos convert` (HDF5 of Lift and PickPlaceCan), Demonstrations.from_trajectories (of imitation's "
+    "files, read with imitation.data.serialize.load), Demonstrations.from_episodes (arrays)"
 )
-HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 
 _ARRAYS = ("observations", "actions", "rewards", "terminations", "episode_starts")
 _TEXTS = ("env_id", "metadata")
 _NEXT = ("next_observation_indices", "next_observation_rows")
-# of what the next observations are rebuilt from: kinds of numbers, number of dimensions, shape
-_FORMS = (("observations", "f", 2, "N, size"), ("episode_starts", "iu", 1, "n"), (_NEXT[0], "iu", 1, "n"))
 
 
 def write_npz(path: str | os.PathLike[str], fields: Mapping[str, Any]) -> None:
@@ -52,52 +49,32 @@ def read_npz(path: str | os.PathLike[str]) -> dict[str, Any]:
     source = str(path)
     if not os.path.exists(path):
         raise FileNotFoundError(f"no demonstrations file at {source}")
-    if not os.path.isfile(path):
-        is_dataset = os.path.isfile(os.path.join(path, "dataset_info.json"))
-        found = f"a folder: {FROM_IMITATION}" if is_dataset else "a folder or device"
-        raise ValueError(f"{source}: expected a demonstrations file, found {found}")
-    stored = _read_entries(Path(path).read_bytes(), source)
+    try:
+        content = Path(path).read_bytes()
+        archive = zipfile.ZipFile(io.BytesIO(content))
+    except Exception as error:  # whatever the reader raises on bytes that are not its own
+        expected = f"{source}: expected a demonstrations .npz file, as Demonstrations.save writes it"
+        raise ValueError(f"{expected} ({error}); {OTHERS}") from None
+    with archive:
+        version = _read_array(archive, "format_version", source)
+        if not np.array_equal(version, FORMAT_VERSION):
+            raise field_error(source, "format_version", f"{FORMAT_VERSION} (of a newer one: update sb3-actpc)", str(version))
+        stored = {name: _read_array(archive, name, source) for name in (*_ARRAYS, "dense_rewards", *_NEXT)}
+        texts = {name: _read_array(archive, name, source) for name in _TEXTS}
     dense_rewards = stored["dense_rewards"]
     return {
         **{name: stored[name] for name in _ARRAYS},
         "next_observations": _rebuild_next_observations(stored, source),
         "dense_rewards": None if dense_rewards.shape == (0,) else dense_rewards,
-        **{name: _read_json(stored[name], name, source) for name in _TEXTS},
+        **{name: _read_json(text, name, source) for name, text in texts.items()},
         "source": source,
     }
 
 
-def _read_entries(content: bytes, source: str) -> dict[str, np.ndarray]:
-    """Every stored entry; each one's checksum is verified before it is parsed."""
-    try:
-        archive = zipfile.ZipFile(io.BytesIO(content))
-    except Exception as error:  # whatever the reader raises on bytes that are not its own
-        found = f"{len(content)} bytes ({error})"
-        if content.startswith(HDF5_SIGNATURE):
-            found = (
-                "HDF5: convert it with `sb3-actpc demos convert` if it is of robosuite's Lift or PickPlaceCan; of another "
-                "task read it with h5py, and make Demonstrations.from_episodes of it"
-            )
-        raise ValueError(f"{source}: expected a demonstrations .npz file, found {found}") from None
-    with archive:
-        if "format_version.npy" not in archive.namelist():
-            expected = "an entry, as Demonstrations.save writes it (for arrays: Demonstrations.from_episodes)"
-            found = f"only {', '.join(archive.namelist()) or 'none'}"
-            if {"obs.npy", "acts.npy"} <= set(archive.namelist()):
-                found += f": {FROM_IMITATION}"
-            raise field_error(source, "format_version", expected, found)
-        version = _read_array(archive, "format_version", source)
-        if version.shape != () or version.dtype.kind not in "iu" or version < 1:
-            found = f"type {version.dtype}, shape {version.shape}" if version.shape else repr(version.item())
-            raise field_error(source, "format_version", "a whole number of at least 1", found)
-        if version > FORMAT_VERSION:
-            raise field_error(source, "format_version", f"at most {FORMAT_VERSION} (update sb3-actpc)", str(version))
-        return {name: _read_array(archive, name, source) for name in (*_ARRAYS, "dense_rewards", *_NEXT, *_TEXTS)}
-
-
 def _read_array(archive: zipfile.ZipFile, name: str, source: str) -> np.ndarray:
+    """A stored entry; its checksum is verified before it is parsed."""
     if f"{name}.npy" not in archive.namelist():
-        raise field_error(source, name, f"an entry {name}.npy", f"only {', '.join(archive.namelist()) or 'none'}")
+        raise field_error(source, name, f"an entry {name}.npy ({OTHERS})", f"only {', '.join(archive.namelist()) or 'none'}")
     try:
         return np.lib.format.read_array(io.BytesIO(archive.read(f"{name}.npy")), allow_pickle=False)
     except Exception as error:  # the readers of zip, deflate and npy have a dozen kinds
@@ -106,31 +83,17 @@ def _read_array(archive: zipfile.ZipFile, name: str, source: str) -> np.ndarray:
 
 def _read_json(array: np.ndarray, name: str, source: str) -> Any:
     try:
-        if array.shape == () and array.dtype.kind == "U":
-            return json.loads(array.item())
-    except json.JSONDecodeError as error:
-        raise field_error(source, name, "JSON text", f"{array.item()[:60]!r} ({error})") from None
-    raise field_error(source, name, "JSON text", f"type {array.dtype}, shape {array.shape}")
+        return json.loads(array.item())
+    except (TypeError, ValueError) as error:
+        raise field_error(source, name, "JSON text", f"type {array.dtype}, shape {array.shape} ({error})") from None
 
 
 def _rebuild_next_observations(stored: dict[str, np.ndarray], source: str) -> np.ndarray:
     """Next observations, (N, obs_dim): the following rows, except where others are stored."""
-    for name, kinds, n_dims, shape in _FORMS:
-        array = stored[name]
-        if array.dtype.kind not in kinds or array.ndim != n_dims or array.size == 0:
-            expected = f"{'floats' if kinds == 'f' else 'whole numbers'} of shape ({shape})"
-            raise field_error(source, name, expected, f"type {array.dtype}, shape {array.shape}")
-    observations, starts = stored["observations"], stored["episode_starts"].astype(np.int64)
-    indices, rows = stored[_NEXT[0]].astype(np.int64), stored[_NEXT[1]]
-    last = np.append(starts[1:], len(observations)) - 1
-    is_within = np.all(np.diff(indices) > 0) and indices[0] >= 0 and indices[-1] < len(observations)
-    if not is_within or not np.isin(last, indices).all():
-        expected = f"increasing indices below {len(observations)} that include the end of every episode"
-        raise field_error(source, "next_observation_indices", expected, f"{len(indices)} indices that do not")
-    if rows.shape != (len(indices), observations.shape[1]) or rows.dtype != observations.dtype:
-        expected = f"shape {(len(indices), observations.shape[1])} of {observations.dtype}"
-        raise field_error(source, "next_observation_rows", expected, f"shape {rows.shape} of {rows.dtype}")
-    next_observations = np.empty_like(observations)
-    next_observations[:-1] = observations[1:]
-    next_observations[indices] = rows
+    observations, (indices, rows) = stored["observations"], (stored[name] for name in _NEXT)
+    try:
+        next_observations = np.concatenate([observations[1:], observations[-1:]])
+        next_observations[indices] = rows
+    except (IndexError, TypeError, ValueError) as error:
+        raise field_error(source, _NEXT[0], f"indices of as many {_NEXT[1]}", f"others ({error})") from None
     return next_observations

@@ -1,29 +1,26 @@
-"""Recording episodes of trained agents, scripted demonstrators and plain functions."""
+"""Recording episodes of trained agents, scripted demonstrators and plain functions; reading the imitation library's."""
 
+import re
 import sys
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from numbers import Integral
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from sb3_actpc.demonstrations.rows import (
-    box_paths,
-    column_names,
-    flatten_observation,
-    join_observations,
-    outside_bounds,
-    transition_columns,
-)
-from sb3_actpc.demonstrations.wrappers import wrapping_of
+from sb3_actpc.demonstrations.rows import box_paths, join_observations, outside_bounds, transition_columns
 from sb3_actpc.utils.extras import installed_version
-from sb3_actpc.utils.precision import warn_of_indistinguishable
 
-Columns = dict[str, np.ndarray]
+Columns = dict[str, Any]
 Report = Callable[[str], None]
 ENDLESS = 5000  # steps of an episode, after which the user is warned
+# wrappers that pass observations, actions and rewards on as they are, or only clip or cast them
+PLAIN = {"Monitor", "TimeLimit", "PassiveEnvChecker", "RecordEpisodeStatistics", "Autoreset", "ClipAction"}
+PLAIN |= {"RecordVideo", "RenderCollection", "HumanRendering", "DtypeObservation"}
+PLAIN |= {"PatchedTimeLimit"}  # rl-zoo3 replaces Gymnasium's TimeLimit by it on import
 
 
 def silent(_: str) -> None:
@@ -48,21 +45,17 @@ def record_episodes(
     :param seed: try number i is reset with the seed ``seed + i``
     :param max_tries: episodes played at most, None for ``10 * n_episodes``
     :param report: takes one line of progress per kept episode
-    :return: the columns of each episode (floats float32), and how they were made
+    :return: the columns of each episode, and how they were made
     :raises ValueError: if too few of the tries succeed, or an argument is not allowed
 
     For the other parameters see ``Demonstrations.record``.
     """
-    numbers: list[tuple[str, Any, int]] = [("n_episodes", n_episodes, 1), ("max_tries", max_tries, 1), ("seed", seed, 0)]
-    for name, value, least in numbers:
-        is_whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
-        if not (is_whole and value >= least) and (value is not None or name == "n_episodes"):
+    for name, value, least in (("n_episodes", n_episodes, 1), ("max_tries", max_tries or 1, 1), ("seed", seed, 0)):
+        if not isinstance(value, Integral) or int(value) < least:
             raise ValueError(f"{name}={value!r} must be at least {least}, a whole number")
     if not isinstance(env.action_space, spaces.Box):
         raise ValueError(f"demonstrations need a Box action space, found {env.action_space}")
     box_paths(env.observation_space)
-    if not demonstrators:
-        raise ValueError("demonstrator=[] must be at least one: an object with predict, or a function of the observation")
     max_tries = 10 * n_episodes if max_tries is None else max_tries
     actors = [_actor(demonstrator, deterministic) for demonstrator in demonstrators]
     episodes: list[Columns] = []
@@ -76,7 +69,7 @@ def record_episodes(
         n_tries += 1
         if _is_kept(info, only_successes):
             episodes.append(episode)
-            returns = f"return {episode['rewards'].sum():.1f}, dense {episode['dense_rewards'].sum():.1f}"
+            returns = f"return {sum(episode['rewards']):.1f}, dense {sum(episode['dense_rewards']):.1f}"
             report(f"episode {len(episodes)}/{n_episodes} (try {n_tries}): {returns}")
     if len(episodes) < n_episodes:
         raise ValueError(
@@ -84,11 +77,9 @@ def record_episodes(
             "demonstrator (train it longer: --steps), allow more tries (--max-tries, max_tries=), ask for fewer episodes "
             "(--episodes, n_episodes=), or keep those that fail too (only_successes=False)"
         )
-    made_by: dict[str, Any] = {"seed": seed, "n_tries": n_tries, "deterministic": deterministic}
-    if env.spec is not None:
-        made_by["wrappers"] = list(wrapping_of(env, episodes[0]["actions"]).names)
+    made_by = {"seed": seed, "n_tries": n_tries, "deterministic": deterministic, "wrappers": wrapper_names(str(env))}
     simulators = [name for name in ("gymnasium", "mujoco", "robosuite") if name in sys.modules]
-    return _as_stored(episodes, env.observation_space), made_by | {name: installed_version(name) for name in simulators}
+    return episodes, made_by | {name: installed_version(name) for name in simulators}
 
 
 def env_name(env: gym.Env[Any, Any]) -> str:
@@ -96,10 +87,11 @@ def env_name(env: gym.Env[Any, Any]) -> str:
     return env.spec.id if env.spec is not None else type(env.unwrapped).__name__
 
 
-def time_limit(env_id: str) -> int | None:
-    """After how many steps Gymnasium cuts the episodes of a registered environment; None where that is not known."""
-    spec = gym.registry.get(env_id.rpartition(":")[2])
-    return None if spec is None else spec.max_episode_steps
+def wrapper_names(written: str) -> list[str]:
+    """The wrappers, the outermost first, that may change what an id stands for, of an environment as Gymnasium writes it:
+    ``<Monitor<RescaleAction<OrderEnforcing<PendulumEnv<Pendulum-v1>>>>>``."""
+    outside = written.partition("<OrderEnforcing")[0]  # the innermost wrapper of gymnasium.make
+    return [name for name in re.findall(r"<(\w+)(?=<\w+(?:[< ]|$)|$)", outside) if name not in PLAIN]
 
 
 def trajectory_columns(
@@ -114,25 +106,22 @@ def trajectory_columns(
     if isinstance(observations, Mapping) and observation_space is None:
         raise ValueError("trajectories with dict observations need observation_space: give the environment's")
     if not isinstance(observations, Mapping) and np.ndim(observations) < 2:
-        raise ValueError(
-            f"trajectories need Box observations, found obs of shape {np.shape(observations)}, as of a Discrete space"
-        )
+        raise ValueError(f"trajectories need Box observations, found obs of shape {np.shape(observations)}")
     rows = join_observations(observations, [[]] if observation_space is None else box_paths(observation_space))
     n_steps = len(trajectory.acts)
     infos = [{}] * n_steps if trajectory.infos is None else [info or {} for info in trajectory.infos]
     if n_steps < 1 or len(infos) != n_steps:
         raise ValueError(f"trajectories need at least 1 action and an info of each, found {n_steps} acts, {len(infos)} infos")
-    columns = transition_columns(rows, trajectory.acts, "a trajectory")
-    rewards = getattr(trajectory, "rews", None)
-    if rewards is None:
+    columns: Columns = transition_columns(rows, trajectory.acts, "a trajectory")
+    columns["rewards"] = getattr(trajectory, "rews", None)
+    if columns["rewards"] is None:
         if final_reward is None:
             raise ValueError("trajectories without rews need final_reward, the reward of each one's last step (1.0, say)")
-        rewards = np.append(np.zeros(n_steps - 1), final_reward)
-    columns |= {"rewards": np.asarray(rewards), "terminations": np.zeros(n_steps, dtype=bool)}
+        columns["rewards"] = np.append(np.zeros(n_steps - 1), final_reward)
     was_cut = infos[-1].get("TimeLimit.truncated", n_steps == limit)  # Stable-Baselines3 writes it, Gymnasium does not
-    columns["terminations"][-1] = trajectory.terminal and not was_cut
+    columns["terminations"] = [False] * (n_steps - 1) + [bool(trajectory.terminal and not was_cut)]
     if all("dense_reward" in info for info in infos):
-        columns["dense_rewards"] = np.array([info["dense_reward"] for info in infos])
+        columns["dense_rewards"] = [info["dense_reward"] for info in infos]
     return columns
 
 
@@ -159,50 +148,30 @@ def _actor(demonstrator: Any, deterministic: bool) -> Callable[[Any, bool], np.n
 
 def _play(act: Callable[[Any, bool], np.ndarray], env: gym.Env[Any, Any], seed: int) -> tuple[Columns, dict[str, Any]]:
     """One episode as columns, and its last info."""
+    assert isinstance(env.action_space, spaces.Box)
     rows: list[tuple[Any, ...]] = []
     observation, info = env.reset(seed=seed)
-    # copies: the environment may go on writing on what it gave
-    row = flatten_observation(env.observation_space, observation)
+    # copies, here and below: environment and demonstrator may go on writing on what they gave
+    row = spaces.flatten(env.observation_space, observation)
     done = False
     while not done:
         action = act(observation, not rows)
-        if isinstance(action, tuple):
+        is_array = not isinstance(action, tuple) and np.shape(action) == env.action_space.shape
+        if not is_array or outside_bounds(np.ravel(action), env.action_space).any():
             raise ValueError(
-                "the demonstrator gives a tuple: return the action alone, or give the agent itself, not its predict"
+                f"the demonstrator gives {action!r} at step {len(rows)}: {env_name(env)} takes an array of "
+                f"{env.action_space} (numpy.clip keeps to the bounds; of an agent give itself, not its predict)"
             )
-        if np.shape(action) != env.action_space.shape:
-            expected = f"{env_name(env)} takes {env.action_space.shape}: return an array of that shape"
-            raise ValueError(f"the demonstrator gives an action of shape {np.shape(action)}, {expected}")
-        row_action = np.array(action).ravel()  # a copy: environment and demonstrator may write on theirs
-        if isinstance(env.action_space, spaces.Box) and outside_bounds(row_action, env.action_space).any():
-            expected = f"{env_name(env)} takes {env.action_space}: clip it (numpy.clip)"
-            raise ValueError(f"the demonstrator gives the action {row_action} at step {len(rows)}, {expected}")
+        row_action = np.array(action, dtype=np.float32).ravel()
         observation, reward, terminated, truncated, info = env.step(action)
-        next_row = flatten_observation(env.observation_space, observation)
-        if next_row.shape != row.shape:
-            sizes = f"{next_row.size} values at step {len(rows) + 1}, after {row.size} before"
-            raise ValueError(f"{env_name(env)} gives an observation of {sizes}: it must keep to its observation_space")
-        rows.append((row, next_row, row_action, reward, terminated, info.get("dense_reward", reward)))
+        next_row = spaces.flatten(env.observation_space, observation)
+        rows.append((row, next_row, row_action, float(reward), bool(terminated), info.get("dense_reward", float(reward))))
         row, done = next_row, terminated or truncated
         if len(rows) == ENDLESS:
-            warnings.warn(
-                f"an episode of {env_name(env)} has gone on for {ENDLESS} steps and is recorded to its end: if it never ends, "
-                "limit it with gymnasium.wrappers.TimeLimit",
-                stacklevel=2,
-            )
+            limit = "limit it with gymnasium.wrappers.TimeLimit if it never ends"
+            warnings.warn(f"an episode of {env_name(env)} has gone on for {ENDLESS} steps: {limit}", stacklevel=2)
     names = ("observations", "next_observations", "actions", "rewards", "terminations", "dense_rewards")
-    columns = {name: np.asarray(values) for name, values in zip(names, zip(*rows, strict=True), strict=True)}
-    return {**columns, "terminations": columns["terminations"].astype(bool)}, info
-
-
-def _as_stored(episodes: list[Columns], space: spaces.Space[Any]) -> list[Columns]:
-    """The same episodes in float32; warns of the features of the observations that it cannot hold."""
-    rows = np.concatenate([episode["observations"] for episode in episodes])
-    warn_of_indistinguishable(rows, "", column_names(space))
-    return [
-        {name: column if column.dtype == bool else column.astype(np.float32) for name, column in episode.items()}
-        for episode in episodes
-    ]
+    return dict(zip(names, map(list, zip(*rows, strict=True)), strict=True)), info
 
 
 def _is_kept(info: Mapping[str, Any], only_successes: bool | None) -> bool:

@@ -21,6 +21,7 @@ from sb3_actpc.demonstrations import Demonstrations
 from sb3_actpc.experiments.runs import Run, finish_run
 from sb3_actpc.experiments.runs.episode_log import dense_reward
 from tests.cli.line import ENV_ID, RUN, rows_of, train
+from tests.recordings import write_minari
 
 ROOT = Path(__file__).resolve().parents[2]
 OWN_TASK = """
@@ -91,7 +92,7 @@ def test_a_minari_dataset_is_named_by_its_id(monkeypatch: pytest.MonkeyPatch, ca
     pytest.importorskip("minari")
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(Path("sets").absolute()))
     shown = Demonstrations.record(lambda _: np.zeros(1), ENV_ID, 2, only_successes=False)
-    shown.to_minari("line/still-v0")
+    write_minari(shown, "line/still-v0", gym.make(ENV_ID))
     quick = ["train", "--env", ENV_ID, "--steps", "20", "--no-progress", "--output", "mine"]
     quick += ["--set", "guidance_kwargs.bc_updates=3"]
     assert main([*quick, "--demonstrations", "line/moving-v0"]) == 2
@@ -104,7 +105,7 @@ def test_a_minari_dataset_is_named_by_its_id(monkeypatch: pytest.MonkeyPatch, ca
     resume = ["train", "--resume", "mine", "--steps", "10", "--no-progress"]
     assert main(resume) == 0
     shutil.rmtree("sets")
-    shown.select(1).to_minari("line/still-v0")  # another set under the same name
+    write_minari(shown.select(1), "line/still-v0", gym.make(ENV_ID))  # another set under the same name
     assert main(resume) == 2
     assert "the demonstrations (line/still-v0) are not those that the run began with" in capsys.readouterr().err
 
