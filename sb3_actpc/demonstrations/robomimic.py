@@ -21,7 +21,7 @@ from gymnasium import spaces
 
 from sb3_actpc.demonstrations.dataset import Demonstrations
 from sb3_actpc.demonstrations.recording import Columns, Report, silent
-from sb3_actpc.envs.robosuite_layouts import ACTION_DIM, OBSERVATIONS, PROPRIOCEPTION, RobosuiteTask, robosuite_task
+from sb3_actpc.envs.robosuite_layouts import ACTION_DIM, OBSERVATIONS, RobosuiteTask, robosuite_task
 from sb3_actpc.utils.extras import import_extra
 from sb3_actpc.utils.files import atomic_write
 
@@ -217,8 +217,7 @@ def _read_episode(demo: Any, task: RobosuiteTask, obs: str) -> Columns:
 
 def _read_parts(demo: Any, kind: str, task: RobosuiteTask, obs: str, length: int) -> dict[str, np.ndarray]:
     """Every part of the observations, (length, size), in the order of robosuite 1.5."""
-    sizes = {**PROPRIOCEPTION, "object": task.object_dim}
-    parts = {name: _read_array(demo, f"{kind}/{name}", length, sizes[name]) for name in OBSERVATIONS[obs]}
+    parts = {name: _read_array(demo, f"{kind}/{name}", length, task.part_sizes()[name]) for name in OBSERVATIONS[obs]}
     where = f"{demo.file.filename}: {demo.name}/{kind}/object"
     parts["object"] = _object_states(parts["object"], parts["robot0_eef_pos"], parts["robot0_eef_quat"], task, where)
     return parts

@@ -63,13 +63,12 @@ class GoalTask(gym.ObservationWrapper[Any, np.ndarray, Any]):
         if recorded != own.replace("Goal", "Sparse", 1) or not fits:
             return demonstrations
         rows, next_rows = self._demonstrated_rows(demonstrations)
-        rewards = self.compute_reward(next_rows["achieved_goal"], next_rows["desired_goal"], None)
-        keys = sorted(next_rows)  # the order of a Dict space
         return dataclasses.replace(
             demonstrations,
-            observations=np.concatenate([rows[key] for key in keys], axis=1),
-            next_observations=np.concatenate([next_rows[key] for key in keys], axis=1),
-            rewards=rewards,
+            # the order of a Dict space
+            observations=np.concatenate([rows[key] for key in sorted(rows)], axis=1),
+            next_observations=np.concatenate([next_rows[key] for key in sorted(rows)], axis=1),
+            rewards=self.compute_reward(next_rows["achieved_goal"], next_rows["desired_goal"], None),
             env_id=env_id,
         )
 
@@ -128,7 +127,7 @@ class GoalLocomotion(GoalTask):
                 "computed: record them again (sb3-actpc demos collect)"
             )
         task: Any = self.unwrapped
-        moved = task._demonstrated_velocities(demonstrations) * task.dt
+        moved = task.demonstrated_velocities(demonstrations) * task.dt
         after = np.concatenate([np.cumsum(moved[start:end]) for start, end in demonstrations.episode_bounds])
         desired = np.full((len(after), 1), task.distance)
         rows = {"observation": demonstrations.observations, "achieved_goal": (after - moved)[:, None], "desired_goal": desired}

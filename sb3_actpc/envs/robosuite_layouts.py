@@ -34,18 +34,16 @@ class RobosuiteTask:
     name: str  # robosuite's
     object_parts: dict[str, int]  # the parts of the object's state, in order, and their sizes
 
-    @property
-    def object_dim(self) -> int:
-        """Size of the object's state."""
-        return sum(self.object_parts.values())
-
     def layout(self, obs: str) -> dict[str, slice]:
         """Part -> its columns in an observation, in order; ValueError for an ``obs`` that is no key of ``OBSERVATIONS``."""
         if obs not in OBSERVATIONS:
             raise ValueError(f"obs={obs!r} is not one of {', '.join(OBSERVATIONS)}: choose one of these")
-        sizes = {**PROPRIOCEPTION, "object": self.object_dim}
-        ends = np.cumsum([sizes[part] for part in OBSERVATIONS[obs]]).tolist()
-        return {part: slice(end - sizes[part], end) for part, end in zip(OBSERVATIONS[obs], ends, strict=True)}
+        sizes = self.part_sizes()
+        return _columns({part: sizes[part] for part in OBSERVATIONS[obs]})
+
+    def part_sizes(self) -> dict[str, int]:
+        """Part of an observation -> its size."""
+        return {**PROPRIOCEPTION, "object": sum(self.object_parts.values())}
 
     def obs_dim(self, obs: str) -> int:
         """Size of an observation, for a key of ``OBSERVATIONS``."""
@@ -53,16 +51,14 @@ class RobosuiteTask:
 
     def obs_of_size(self, obs_dim: int) -> str:
         """The key of ``OBSERVATIONS`` that gives observations of this size; ValueError where none does."""
-        sizes = {obs: self.obs_dim(obs) for obs in OBSERVATIONS}
-        for obs, size in sizes.items():
-            if size == obs_dim:
-                return obs
-        raise ValueError(f"an observation of {self.env_id} has {sizes} numbers, found {obs_dim}: use one of these layouts")
+        sizes = {self.obs_dim(obs): obs for obs in OBSERVATIONS}
+        if obs_dim not in sizes:
+            raise ValueError(f"an observation of {self.env_id} has {sizes} numbers, found {obs_dim}: use one of these layouts")
+        return sizes[obs_dim]
 
     def object_columns(self) -> dict[str, slice]:
         """Part of the object's state -> its columns in it."""
-        ends = np.cumsum(list(self.object_parts.values())).tolist()
-        return {part: slice(end - size, end) for (part, size), end in zip(self.object_parts.items(), ends, strict=True)}
+        return _columns(self.object_parts)
 
     def object_states(
         self, positions: np.ndarray, quats: np.ndarray, eef_positions: np.ndarray, eef_quats: np.ndarray
@@ -94,6 +90,12 @@ class RobosuiteTask:
         distances = np.linalg.norm(eef_positions - positions, axis=1)
         inside = ((positions > CAN_BIN_LOW) & (positions < CAN_BIN_HIGH)).all(axis=1)
         return inside & (1.0 - np.tanh(10.0 * distances) < 0.6)
+
+
+def _columns(sizes: dict[str, int]) -> dict[str, slice]:
+    """Name -> its columns, of parts that follow each other."""
+    ends = np.cumsum(list(sizes.values())).tolist()
+    return {name: slice(end - size, end) for (name, size), end in zip(sizes.items(), ends, strict=True)}
 
 
 # of robosuite 1.5.2: environments/manipulation/{lift,pick_place}.py

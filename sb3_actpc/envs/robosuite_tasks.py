@@ -58,7 +58,7 @@ class SparseRobosuiteEnv(gym.Env[np.ndarray, np.ndarray], utils.EzPickle):
     stages: ClassVar[tuple[str, ...]]
 
     # what robosuite holds is put into checkpoints by checkpoint_state
-    checkpoint_skipped: ClassVar[tuple[str, ...]] = ("_simulation", "_renderer", "_layout", "task")
+    checkpoint_skipped: ClassVar[tuple[str, ...]] = ("simulation", "_renderer", "_layout", "task")
 
     def __init__(
         self,
@@ -71,19 +71,16 @@ class SparseRobosuiteEnv(gym.Env[np.ndarray, np.ndarray], utils.EzPickle):
     ) -> None:
         self.task: RobosuiteTask = robosuite_task(self.env_id)
         self._layout = self.task.layout(obs)
-        for name, value in (("horizon", horizon), ("width", width), ("height", height)):
-            if isinstance(value, bool) or not isinstance(value, numbers.Integral) or value < 1:
-                raise ValueError(f"{name}={value!r} must be a whole number of at least 1: give one, or leave it out")
-        if render_mode not in (None, "rgb_array"):
-            raise ValueError(f"render_mode={render_mode!r} is not available: choose 'rgb_array' or None")
+        if not isinstance(horizon, numbers.Integral) or horizon < 1:
+            raise ValueError(f"horizon={horizon!r} must be a whole number of at least 1: give one, or leave it out")
         utils.EzPickle.__init__(self, obs, horizon, render_mode, camera, width, height)
         self.obs, self.horizon, self.render_mode, self.camera = obs, int(horizon), render_mode, camera
-        self.width, self.height = int(width), int(height)
+        self.width, self.height = width, height
         self.observation_space = spaces.Box(-np.inf, np.inf, (self.task.obs_dim(obs),), np.float32)
         self.action_space = spaces.Box(-1.0, 1.0, (ACTION_DIM,), np.float32)
-        self._simulation = make_simulation(self.task.name)
-        self.model: Any = self._simulation.sim.model._model
-        self.data: Any = self._simulation.sim.data._data
+        self.simulation = make_simulation(self.task.name)
+        self.model: Any = self.simulation.sim.model._model
+        self.data: Any = self.simulation.sim.data._data
         cameras = [self.model.camera(i).name for i in range(self.model.ncam)]
         if camera not in cameras:
             raise ValueError(f"camera={camera!r} does not exist: choose one of {', '.join(cameras)}")
@@ -96,9 +93,9 @@ class SparseRobosuiteEnv(gym.Env[np.ndarray, np.ndarray], utils.EzPickle):
         for bit, None goes on with the generator. ``options`` are not used; the info is ``{"is_success": False, "stage":
         "start"}``."""
         super().reset(seed=seed)
-        share_generator(self._simulation, self.np_random)
+        share_generator(self.simulation, self.np_random)
         self._randomize_model()
-        self._simulation.reset()
+        self.simulation.reset()
         self._elapsed_steps = self._stage = 0
         return self._observe(), {"is_success": False, "stage": self.stages[0]}
 
@@ -106,10 +103,10 @@ class SparseRobosuiteEnv(gym.Env[np.ndarray, np.ndarray], utils.EzPickle):
         """Advance by one control step, 1/20 s, with an action (7,): observation (obs_dim,), reward (1 on success, else 0),
         terminated (success), truncated (the horizon), info with ``dense_reward`` (float), ``is_success`` (bool) and ``stage``
         (str)."""
-        dense_reward = float(self._simulation.step(np.asarray(action, dtype=np.float64))[1])
+        dense_reward = float(self.simulation.step(np.asarray(action, dtype=np.float64))[1])
         self._elapsed_steps += 1
         observation = self._observe()
-        is_success = bool(self._simulation._check_success())
+        is_success = bool(self.simulation._check_success())
         is_truncated = not is_success and self._elapsed_steps >= self.horizon
         self._stage = max(self._stage, len(self.stages) - 1 if is_success else self._present_stage())
         info = {"dense_reward": dense_reward, "is_success": is_success, "stage": self.stages[self._stage]}
@@ -144,18 +141,18 @@ class SparseRobosuiteEnv(gym.Env[np.ndarray, np.ndarray], utils.EzPickle):
         if self._renderer is not None:
             self._renderer.close()
             self._renderer = None
-        if self._simulation.sim is not None:
-            self._simulation.close()
+        if self.simulation.sim is not None:
+            self.simulation.close()
 
     def checkpoint_state(self) -> dict[str, Any]:
         """What a checkpoint needs beside ``data`` and the generators: plain values of the controllers, the gripper and the
         counters."""
-        return {name: _plain_attributes(part) for name, part in _stateful_parts(self._simulation).items()}
+        return {name: _plain_attributes(part) for name, part in _stateful_parts(self.simulation).items()}
 
     def restore_checkpoint_state(self, state: dict[str, Any]) -> None:
         """:param state: what :meth:`checkpoint_state` returned"""
-        share_generator(self._simulation, self.np_random)
-        for name, part in _stateful_parts(self._simulation).items():
+        share_generator(self.simulation, self.np_random)
+        for name, part in _stateful_parts(self.simulation).items():
             vars(part).update(state[name])
 
     def _randomize_model(self) -> None:
@@ -167,7 +164,7 @@ class SparseRobosuiteEnv(gym.Env[np.ndarray, np.ndarray], utils.EzPickle):
         return np.concatenate([parts[name] for name in self._layout]).astype(np.float32)
 
     def _observation_parts(self) -> dict[str, np.ndarray]:
-        robot = self._simulation.robots[0]
+        robot = self.simulation.robots[0]
         joints = self.data.qpos[robot._ref_joint_pos_indexes]
         eef_quat = np.roll(self.data.body(robot.robot_model.eef_name["right"]).xquat, -1)  # (w, x, y, z) to (x, y, z, w)
         eef_position = self.data.site_xpos[robot.eef_site_id["right"]]
@@ -186,8 +183,8 @@ class SparseRobosuiteEnv(gym.Env[np.ndarray, np.ndarray], utils.EzPickle):
 
     def _present_stage(self) -> int:
         """Index in ``stages`` of what the gripper is at, success left aside."""
-        gripper = self.data.site_xpos[self._simulation.robots[0].eef_site_id["right"]]
-        if self._simulation._check_grasp(gripper=self._simulation.robots[0].gripper, object_geoms=self._graspable()):
+        gripper = self.data.site_xpos[self.simulation.robots[0].eef_site_id["right"]]
+        if self.simulation._check_grasp(gripper=self.simulation.robots[0].gripper, object_geoms=self._graspable()):
             return self.stages.index("grasp")
         return int(np.linalg.norm(self._object_body().xpos - gripper) < REACH)
 
@@ -210,18 +207,18 @@ class SparseLiftEnv(SparseRobosuiteEnv):
     stages = ("start", "reach", "grasp", "lift")
 
     def _randomize_model(self) -> None:
-        resize_cube(self._simulation, self.np_random.uniform(*CUBE_HALF_EDGES, size=3))
+        resize_cube(self.simulation, self.np_random.uniform(*CUBE_HALF_EDGES, size=3))
 
     def _graspable(self) -> Any:
-        return self._simulation.cube
+        return self.simulation.cube
 
     def checkpoint_state(self) -> dict[str, Any]:
         """As above, and the cube's half edges in metres, (3,)."""
-        return {**super().checkpoint_state(), "cube": np.array(self._simulation.cube.size)}
+        return {**super().checkpoint_state(), "cube": np.array(self.simulation.cube.size)}
 
     def restore_checkpoint_state(self, state: dict[str, Any]) -> None:
         """:param state: what :meth:`checkpoint_state` returned"""
-        resize_cube(self._simulation, state["cube"])
+        resize_cube(self.simulation, state["cube"])
         super().restore_checkpoint_state(state)
 
 
@@ -237,12 +234,12 @@ class SparsePickPlaceCanEnv(SparseRobosuiteEnv):
 
     def _present_stage(self) -> int:
         stage = super()._present_stage()
-        height = self._object_body().xpos[2] - self._simulation.bin1_pos[2]
+        height = self._object_body().xpos[2] - self.simulation.bin1_pos[2]
         is_lifted = self.stages[stage] == "grasp" and height > LIFTED
         return self.stages.index("lift") if is_lifted else stage
 
     def _graspable(self) -> Any:
-        return self._simulation.objects[self._simulation.object_id]
+        return self.simulation.objects[self.simulation.object_id]
 
 
 def make_simulation(name: str, **kwargs: Any) -> Any:
@@ -301,20 +298,15 @@ def resize_cube(simulation: Any, half_edges: np.ndarray) -> None:
 @contextmanager
 def _quiet_import() -> Iterator[None]:
     """Without robosuite's greetings, and its choice of an OpenGL library, with which child processes may not find MuJoCo's."""
-    logger, backend = logging.getLogger("robosuite_logs"), os.environ.get("MUJOCO_GL")
-
-    def is_error(record: logging.LogRecord) -> bool:
-        return record.levelno >= logging.ERROR
-
-    logger.addFilter(is_error)
+    backend = {name: value for name, value in os.environ.items() if name == "MUJOCO_GL"}
+    disabled = logging.root.manager.disable
+    logging.disable(logging.WARNING)
     try:
         yield
     finally:
-        logger.removeFilter(is_error)
-        if backend is None:
-            os.environ.pop("MUJOCO_GL", None)
-        else:
-            os.environ["MUJOCO_GL"] = backend
+        logging.disable(disabled)
+        os.environ.pop("MUJOCO_GL", None)
+        os.environ.update(backend)
 
 
 def _stateful_parts(simulation: Any) -> dict[str, Any]:
@@ -328,8 +320,7 @@ def _plain_attributes(part: Any) -> dict[str, Any]:
     """Numbers, flags, and arrays of numbers among an object's attributes (arrays copied)."""
     plain: dict[str, Any] = {}
     for name, value in vars(part).items():
-        if isinstance(value, np.ndarray) and value.dtype.kind in "bif":
-            plain[name] = value.copy()
-        elif value is None or type(value) in (bool, int, float):
-            plain[name] = value
+        is_array = isinstance(value, np.ndarray) and value.dtype.kind in "bif"
+        if is_array or value is None or type(value) in (bool, int, float):
+            plain[name] = value.copy() if is_array else value
     return plain

@@ -13,7 +13,7 @@ from stable_baselines3.common.env_checker import check_env as sb3_check_env
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
-from sb3_actpc.envs import SPARSE_MUJOCO_IDS, dense_env_id, register_envs, sparse_env_id
+from sb3_actpc.envs import SPARSE_MUJOCO_IDS, dense_env_id, sparse_env_id
 from tests.recordings import record
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*out of date.*", "ignore:.*infinity.*")
@@ -23,18 +23,6 @@ LOCOMOTION_IDS = [env_id for env_id in SPARSE_MUJOCO_IDS if "Reacher" not in env
 FALLING_IDS = [env_id for env_id in LOCOMOTION_IDS if "Hopper" in env_id or "Walker2d" in env_id]
 DISTANCES = {"HalfCheetah": 20.0, "Hopper": 2.0, "Walker2d": 2.0, "Swimmer": 1.0}
 VELOCITIES = {"HalfCheetah": 3.5, "Hopper": 1.0, "Walker2d": 1.0, "Swimmer": 0.3}
-OBSERVATION_SIZES = {
-    "Reacher-v5": 10,
-    "Reacher-v4": 11,
-    "HalfCheetah-v5": 17,
-    "HalfCheetah-v4": 17,
-    "Walker2d-v5": 17,
-    "Walker2d-v4": 17,
-    "Hopper-v5": 11,
-    "Hopper-v4": 11,
-    "Swimmer-v5": 8,
-    "Swimmer-v4": 8,
-}
 
 
 def task_of(env_id: str) -> str:
@@ -75,20 +63,11 @@ def test_both_checkers_accept_the_task(env_id: str) -> None:
 
 
 @pytest.mark.parametrize("env_id", SPARSE_MUJOCO_IDS)
-def test_spaces_and_time_limit_are_the_base_tasks(env_id: str) -> None:
-    env, base = gym.make(env_id), gym.make(dense_env_id(env_id))
-    assert env.observation_space.shape == (OBSERVATION_SIZES[dense_env_id(env_id)],)
-    assert env.observation_space == base.observation_space
-    assert env.action_space == base.action_space
-    assert env.spec is not None and base.spec is not None
-    assert env.spec.max_episode_steps == base.spec.max_episode_steps
-    env.close()
-    base.close()
-
-
-@pytest.mark.parametrize("env_id", SPARSE_MUJOCO_IDS)
 def test_dense_reward_and_observations_equal_the_base_tasks_step_for_step(env_id: str) -> None:
     env, base = gym.make(env_id), gym.make(dense_env_id(env_id))
+    assert (env.observation_space, env.action_space) == (base.observation_space, base.action_space)
+    assert env.spec is not None and base.spec is not None
+    assert env.spec.max_episode_steps == base.spec.max_episode_steps
     observation, _ = env.reset(seed=3)
     base_observation, _ = base.reset(seed=3)
     np.testing.assert_array_equal(observation, base_observation)
@@ -109,26 +88,17 @@ def test_dense_reward_and_observations_equal_the_base_tasks_step_for_step(env_id
 
 
 @pytest.mark.parametrize("env_id", REACHER_IDS)
-def test_reacher_is_paid_within_6_cm_of_the_target_only(env_id: str) -> None:
-    env = gym.make(env_id)
+@pytest.mark.parametrize(
+    ("kwargs", "reach", "miss"), [({}, 0.06, 0.0), ({"miss_reward": -1.0, "threshold": 0.02}, 0.02, -1.0)]
+)
+def test_reacher_is_paid_near_the_target_only(env_id: str, kwargs: dict[str, float], reach: float, miss: float) -> None:
+    env = gym.make(env_id, **kwargs)
     env.reset(seed=0)
-    for distance, expected in ((0.05, 1.0), (0.07, 0.0), (0.01, 1.0), (0.2, 0.0)):
+    for distance in (0.05, 0.07, 0.01, 0.2):
         place_target(env, distance)
         reward, _, info = still_step(env)
-        assert reward == expected, distance
-        assert info["is_success"] is bool(expected), distance
-    env.close()
-
-
-@pytest.mark.parametrize("env_id", REACHER_IDS)
-def test_reacher_keywords_set_the_reward_of_a_miss_and_the_distance(env_id: str) -> None:
-    env = gym.make(env_id, miss_reward=-1.0, threshold=0.02)
-    env.reset(seed=0)
-    for distance, expected in ((0.05, -1.0), (0.01, 1.0)):
-        place_target(env, distance)
-        reward, _, info = still_step(env)
-        assert reward == expected
-        assert info["is_success"] is (expected == 1.0)
+        assert reward == (1.0 if distance < reach else miss), distance
+        assert info["is_success"] is (distance < reach), distance
     env.close()
 
 
@@ -152,17 +122,11 @@ def test_displacement_is_paid_on_every_step_beyond_the_threshold(env_id: str) ->
 
 @pytest.mark.parametrize("env_id", LOCOMOTION_IDS)
 def test_displacement_is_measured_from_each_resets_own_x(env_id: str) -> None:
-    distance = DISTANCES[task_of(env_id)]
     env = gym.make(env_id)
-    env.reset(seed=0)
-    shift_x(env, distance + 0.2)
-    still_step(env)
-    env.unwrapped.init_qpos[0] = distance + 1.0  # episodes begin beyond the threshold's x from now on
+    env.unwrapped.init_qpos[0] = DISTANCES[task_of(env_id)] + 1.0  # episodes begin beyond the threshold's x
     env.reset(seed=1)
     reward, _, info = still_step(env)
     assert (reward, info["is_success"]) == (0.0, False)
-    shift_x(env, distance + 0.2 - (env.unwrapped.data.qpos[0] - env.unwrapped._start_x))
-    assert still_step(env)[0] == 1.0
     env.close()
 
 
@@ -188,13 +152,10 @@ def test_a_threshold_of_zero_pays_any_motion_forward(env_id: str) -> None:
     """As the paper words it of Walker2d, Hopper and Swimmer."""
     env = gym.make(env_id, condition="forward", threshold=0.0)
     env.reset(seed=0)
-    for velocity in (-0.5, 0.5, 8.0):
+    for velocity in (-0.5, 0.2, 8.0):
         shift_x(env, 0.0, velocity)
         reward, _, info = still_step(env)
-        assert reward == float(info["x_velocity"] > 0.0)
-    shift_x(env, 0.0, 0.2)
-    reward, _, info = still_step(env)
-    assert (0.0 < info["x_velocity"] < VELOCITIES[task_of(env_id)], reward) == (True, 1.0)
+        assert reward == float(info["x_velocity"] > 0.0) == float(velocity > 0.0)
     env.close()
 
 
@@ -242,31 +203,31 @@ def test_the_time_limit_is_a_truncation(env_id: str) -> None:
     env.close()
 
 
-@pytest.mark.parametrize("env_id", LOCOMOTION_IDS)
-def test_bad_locomotion_keywords_name_the_value_and_the_fix(env_id: str) -> None:
-    with pytest.raises(ValueError, match=r"condition='sideways'.*'displacement', 'forward'.*choose"):
-        gym.make(env_id, condition="sideways")
-    for condition in ("displacement", "forward"):
-        for threshold in (-1.0, float("nan"), float("inf"), "far", True):
-            with pytest.raises(ValueError, match=r"threshold=.* must be a .*finite number .* or None"):
-                gym.make(env_id, condition=condition, threshold=threshold)
-    with pytest.raises(ValueError, match=r"threshold=0.0 must be a positive finite number \(metres from"):
-        gym.make(env_id, threshold=0.0)
-    with pytest.raises(ValueError, match=r"miss_reward=-1.0 is not allowed here.*leave it out"):
-        gym.make(env_id, miss_reward=-1.0)
+@pytest.mark.parametrize(
+    ("env_id", "kwargs"),
+    [
+        *[
+            (env_id, {"threshold": value})
+            for env_id in (REACHER_IDS[0], LOCOMOTION_IDS[0])
+            for value in (-1.0, np.nan, "far", True)
+        ],
+        (LOCOMOTION_IDS[0], {"condition": "sideways"}),
+        (LOCOMOTION_IDS[0], {"condition": "forward", "threshold": -1.0}),
+        *[(REACHER_IDS[0], {"miss_reward": value}) for value in (1.0, float("-inf"), "no", False)],
+    ],
+)
+def test_bad_keywords_are_named_with_their_value(env_id: str, kwargs: dict[str, Any]) -> None:
+    name, value = list(kwargs.items())[-1]
+    with pytest.raises(ValueError, match=f"{name}={value!r} (must be a finite number, at least|is not one of .*displacement)"):
+        gym.make(env_id, **kwargs)
 
 
-@pytest.mark.parametrize("env_id", REACHER_IDS)
-def test_bad_reacher_keywords_name_the_value_and_the_fix(env_id: str) -> None:
-    with pytest.raises(ValueError, match=r"condition='forward' is not allowed here.*leave it out"):
-        gym.make(env_id, condition="forward")
-    with pytest.raises(ValueError, match=r"threshold=-0.1 must be a positive"):
-        gym.make(env_id, threshold=-0.1)
-    for miss_reward in (1.0, float("-inf"), float("nan"), "no", False):
-        with pytest.raises(ValueError, match=r"miss_reward=.* must be a finite number below 1: give"):
-            gym.make(env_id, miss_reward=miss_reward)
-    env = gym.make(env_id, threshold=np.float32(0.5), miss_reward=np.int64(-1)).unwrapped
-    assert (env.threshold, env.miss_reward) == (0.5, -1.0) and type(env.miss_reward) is float
+@pytest.mark.parametrize(
+    ("env_id", "kwargs"), [(REACHER_IDS[0], {"condition": "forward"}), (LOCOMOTION_IDS[0], {"miss_reward": 0})]
+)
+def test_keywords_of_other_tasks_are_refused(env_id: str, kwargs: dict[str, Any]) -> None:
+    with pytest.raises(TypeError, match=f"unexpected keyword argument '{next(iter(kwargs))}'"):
+        gym.make(env_id, **kwargs)
 
 
 @pytest.mark.parametrize("env_id", SPARSE_MUJOCO_IDS)
@@ -274,9 +235,10 @@ def test_a_pickled_task_keeps_its_keywords(env_id: str) -> None:
     kwargs = {"miss_reward": -1.0} if env_id in REACHER_IDS else {"condition": "forward", "reset_noise_scale": 0.0}
     env = gym.make(env_id, threshold=0.25, **kwargs)
     copy = pickle.loads(pickle.dumps(env.unwrapped))
-    for name in ("threshold", "miss_reward") if env_id in REACHER_IDS else ("condition", "velocity", "_reset_noise_scale"):
-        assert getattr(copy, name) == getattr(env.unwrapped, name)
     np.testing.assert_array_equal(copy.reset(seed=5)[0], env.reset(seed=5)[0])
+    for action in np.linspace(-1.0, 1.0, 10):
+        one = np.full(env.action_space.shape, action, np.float32)
+        assert copy.step(one)[1] == env.step(one)[1]
     env.close()
 
 
@@ -305,12 +267,6 @@ def test_a_made_task_keeps_its_render_mode() -> None:
         env.close()
     assert isinstance(image, np.ndarray)
     assert image.shape == (48, 64, 3)
-
-
-def test_registering_again_changes_nothing() -> None:
-    before = {env_id: gym.spec(env_id) for env_id in SPARSE_MUJOCO_IDS}
-    register_envs()
-    assert {env_id: gym.spec(env_id) for env_id in SPARSE_MUJOCO_IDS} == before
 
 
 def test_ids_with_a_module_are_the_same_tasks() -> None:
@@ -368,13 +324,6 @@ def test_demonstrations_without_dense_rewards_keep_their_own() -> None:
     recorded = dataclasses.replace(record("SparseHopper-v5", 2), dense_rewards=None)
     env = make_vec_env("SparseHopper-v5", env_kwargs={"condition": "forward"})
     assert np.array_equal(recorded.rewarded_by(env).rewards, recorded.rewards)
-    env.close()
-
-
-def test_demonstrations_of_a_task_without_conditions_keep_their_rewards() -> None:
-    recorded = record("SparseHopper-v5", 1)
-    env = make_vec_env("Pendulum-v1")
-    assert recorded.rewarded_by(env) is recorded
     env.close()
 
 
