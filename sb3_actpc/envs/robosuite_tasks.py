@@ -10,7 +10,6 @@ step); the random numbers are Gymnasium's.
 """
 
 import logging
-import numbers
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -71,14 +70,14 @@ class SparseRobosuiteEnv(gym.Env[np.ndarray, np.ndarray], utils.EzPickle):
     ) -> None:
         self.task: RobosuiteTask = robosuite_task(self.env_id)
         self._layout = self.task.layout(obs)
-        if not isinstance(horizon, numbers.Integral) or horizon < 1:
+        if int(horizon) != horizon or horizon < 1:
             raise ValueError(f"horizon={horizon!r} must be a whole number of at least 1: give one, or leave it out")
         utils.EzPickle.__init__(self, obs, horizon, render_mode, camera, width, height)
         self.obs, self.horizon, self.render_mode, self.camera = obs, int(horizon), render_mode, camera
         self.width, self.height = width, height
         self.observation_space = spaces.Box(-np.inf, np.inf, (self.task.obs_dim(obs),), np.float32)
         self.action_space = spaces.Box(-1.0, 1.0, (ACTION_DIM,), np.float32)
-        self.simulation = make_simulation(self.task.name)
+        self.simulation: Any = make_simulation(self.task.name)
         self.model: Any = self.simulation.sim.model._model
         self.data: Any = self.simulation.sim.data._data
         cameras = [self.model.camera(i).name for i in range(self.model.ncam)]

@@ -35,7 +35,7 @@ LOCOMOTION_CONDITIONS: tuple[str, ...] = ("displacement", "forward")
 
 def _check_number(name: str, value: Any, low: float = -math.inf, high: float = math.inf) -> float:
     """ValueError for anything but a finite number of at least ``low`` and below ``high``."""
-    if isinstance(value, bool) or not isinstance(value, Real) or not math.isfinite(value) or not low <= value < high:
+    if isinstance(value, bool) or not isinstance(value, Real) or not math.isfinite(value) or not low <= float(value) < high:
         raise ValueError(f"{name}={value!r} must be a finite number, at least {low} and below {high}")
     return float(value)
 
