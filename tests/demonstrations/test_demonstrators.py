@@ -76,15 +76,11 @@ def test_every_task_is_learned_by_its_dense_base_task(algo: str) -> None:
         assert run.demonstrations == "none"
 
 
-def test_ids_with_this_packages_module_are_the_same_tasks() -> None:
-    assert demonstrator_run("sb3_actpc:SparseHopper-v5").env == "Hopper-v5"
+def test_the_default_training_is_2000_full_episodes() -> None:
+    assert demonstrator_run("sb3_actpc:SparseHalfCheetah-v5").n_timesteps == 2_000_000
+    assert demonstrator_run("GoalReacher-v4").n_timesteps == 100_000
     with pytest.raises(ValueError, match="env_id='sb3_actpc:SparseLift-v0' has no dense reward to learn by"):
         demonstrator_run("sb3_actpc:SparseLift-v0")
-
-
-def test_the_default_training_is_2000_full_episodes() -> None:
-    assert demonstrator_run("SparseHalfCheetah-v5").n_timesteps == 2_000_000
-    assert demonstrator_run("GoalReacher-v4").n_timesteps == 100_000
 
 
 @pytest.mark.parametrize("algo", sorted(DEMONSTRATOR_ALGORITHMS))
@@ -103,33 +99,21 @@ def test_the_agent_of_the_best_evaluation_demonstrates(algo: str, tmp_path: Path
     env.close()
 
 
-def test_training_stops_at_the_target_return(tmp_path: Path) -> None:
-    assert train_demonstrator(short_run(n_timesteps=100_000, target_return=-1e9), tmp_path).n_steps <= 64
-
-
-def test_a_folder_of_another_run_is_refused(tmp_path: Path) -> None:
-    train_demonstrator(short_run(), tmp_path)
-    with pytest.raises(ValueError, match="holds another run"):
-        train_demonstrator(short_run(seed=2), tmp_path)
-
-
 @pytest.mark.parametrize("is_finished", [True, False])
-def test_a_folder_of_another_target_is_refused(is_finished: bool, tmp_path: Path) -> None:
-    """The demonstrator there is better, or worse, than the one asked for."""
-    train_demonstrator(short_run(target_return=-1e9), tmp_path)
+def test_a_folder_of_another_training_is_refused(is_finished: bool, tmp_path: Path) -> None:
+    """The demonstrator there is better, or worse, than the one asked for; a longer training would be recorded as a shorter."""
+    there = {"target_return": -1e9}
+    assert train_demonstrator(short_run(**there), tmp_path).n_steps <= 64, "training stops at the target return"
     if not is_finished:
         (tmp_path / "result.json").unlink()
-    for target in (-1e8, None):
-        with pytest.raises(ValueError, match=rf"another run, with target_return=-1000000000.0 and not {target}: .*--work-dir"):
-            train_demonstrator(short_run(target_return=target), tmp_path)
-
-
-def test_a_folder_of_a_longer_training_is_refused(tmp_path: Path) -> None:
-    """It would be recorded as the shorter one."""
-    train_demonstrator(short_run(), tmp_path)
-    shorter = short_run(n_timesteps=64)
-    with pytest.raises(ValueError, match=r"holds a training of 128 steps, not of 64: .*--work-dir, or say --steps 128"):
-        train_demonstrator(shorter, tmp_path)
+    for other, message in (
+        ({**there, "seed": 2}, "holds another run"),
+        ({"target_return": -1e8}, r"another run, with target_return=-1000000000.0 and not -100000000.0: .*--work-dir"),
+        ({}, "another run, with target_return=-1000000000.0 and not None"),
+        ({**there, "n_timesteps": 64}, "a training of 128 steps, not of 64: .*--work-dir, or say --steps 128"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            train_demonstrator(short_run(**other), tmp_path)
 
 
 def test_a_mixed_set_is_by_a_demonstrator_and_itself_at_half_the_return(
@@ -219,11 +203,23 @@ class TestCommand:
         env.close()
 
     @pytest.mark.parametrize(
-        ("words", "target"),
-        [([], None), (["--target-return", "5"], 5.0), (["--quality", "0.5"], reference_return("SparseHopper-v5") / 2)],
+        ("words", "target", "share", "is_said"),
+        [
+            ([], None, 0.4, True),
+            ([], None, 0.6, False),
+            (["--target-return", "5"], 5.0, 0.4, False),
+            (["--quality", "0.5"], reference_return("SparseHopper-v5") / 2, 0.4, False),
+        ],
     )
-    def test_quality_is_a_target_return(
-        self, words: list[str], target: float | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    def test_quality_is_a_target_return_and_others_are_compared_with_the_packages(
+        self,
+        words: list[str],
+        target: float | None,
+        share: float,
+        is_said: bool,
+        tmp_path: Path,
+        monkeypatch: pytest.MonkeyPatch,
+        capsys: pytest.CaptureFixture[str],
     ) -> None:
         asked: list[Run] = []
 
@@ -231,32 +227,12 @@ class TestCommand:
             asked.append(run)
             return Demonstrator(Reaching(), 7, -3.0)
 
-        monkeypatch.setattr(demonstrators, "train_demonstrator", train)
-        monkeypatch.setattr(
-            demonstrators,
-            "record_demonstrators",
-            lambda *_, **options: Demonstrations.load(shipped_demonstrations("SparseReacher-v5")),
-        )
-        run_demos("collect", "--env", "SparseHopper-v5", "--algo", "trpo", "--output", str(tmp_path / "x.npz"), *words)
-        assert [(run.target_return, run.algo, run.env) for run in asked] == [(target, "trpo", "Hopper-v5")]
-
-    @pytest.mark.parametrize(
-        ("words", "share", "is_said"), [([], 0.4, True), ([], 0.6, False), (["--quality", "0.4"], 0.4, False)]
-    )
-    def test_poor_demonstrators_are_told_from_those_of_the_package(
-        self,
-        words: list[str],
-        share: float,
-        is_said: bool,
-        tmp_path: Path,
-        monkeypatch: pytest.MonkeyPatch,
-        capsys: pytest.CaptureFixture[str],
-    ) -> None:
         shown = Demonstrations.load(shipped_demonstrations("SparseHopper-v5"))
         poor = dataclasses.replace(shown, dense_rewards=share * shown.dense_rewards)  # type: ignore[operator]
-        monkeypatch.setattr(demonstrators, "train_demonstrator", lambda *_: Demonstrator(Reaching(), 7, -3.0))
+        monkeypatch.setattr(demonstrators, "train_demonstrator", train)
         monkeypatch.setattr(demonstrators, "record_demonstrators", lambda *_, **options: poor)
-        assert run_demos("collect", "--env", "SparseHopper-v5", "--output", str(tmp_path / "x.npz"), *words) == 0
+        run_demos("collect", "--env", "SparseHopper-v5", "--algo", "trpo", "--output", str(tmp_path / "x.npz"), *words)
+        assert [(run.target_return, run.algo, run.env) for run in asked] == [(target, "trpo", "Hopper-v5")]
         text = f"mean dense return {poor.dense_returns.mean():.1f} is far below {shown.dense_returns.mean():.1f}"
         assert (text in (printed := capsys.readouterr().out)) == ("--steps" in printed) == is_said
 
@@ -295,10 +271,6 @@ class TestCommand:
         with pytest.raises(ValueError, match=message):
             run_demos("collect", "--env", "SparseHopper-v5", *words)
 
-    def test_what_cannot_be_written_is_said_before_anybody_is_trained(self, tmp_path: Path) -> None:
-        with pytest.raises(IsADirectoryError, match=r"is a folder: give the file in it, such as .*demos\.npz"):
-            run_demos("collect", "--env", "SparseHopper-v5", "--output", str(tmp_path))
-
     def test_a_training_that_is_stopped_says_how_to_go_on(
         self, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
     ) -> None:
@@ -309,7 +281,9 @@ class TestCommand:
         assert run_demos("collect", "--env", "SparseHopper-v5") == EXIT_STOPPED
         assert "SIGTERM at step 500, saved in somewhere; the same command goes on with it" in capsys.readouterr().err
 
-    def test_an_unknown_task_and_a_missing_file_are_named(self, tmp_path: Path) -> None:
+    def test_an_unknown_task_and_files_that_cannot_be_used_are_named(self, tmp_path: Path) -> None:
+        with pytest.raises(IsADirectoryError, match=r"is a folder: give the file in it, such as .*demos\.npz"):
+            run_demos("collect", "--env", "SparseHopper-v5", "--output", str(tmp_path))
         with pytest.raises(gym.error.Error, match="SparseAnt"):
             run_demos("collect", "--env", "SparseAnt-v5")
         with pytest.raises(FileNotFoundError, match=r"no demonstration file .*absent\.npz: make one"):
