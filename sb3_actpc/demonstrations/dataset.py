@@ -16,11 +16,12 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from sb3_actpc.demonstrations.minari import read_minari
+from sb3_actpc.demonstrations.minari import minari_episodes, minari_files
 from sb3_actpc.demonstrations.npz import read_npz, write_npz
 from sb3_actpc.demonstrations.recording import env_name, record_episodes, trajectory_columns
 from sb3_actpc.demonstrations.rows import box_paths, field_error, outside_bounds, whole_columns
 from sb3_actpc.envs import SPARSE_IDS
+from sb3_actpc.utils.extras import import_extra
 from sb3_actpc.utils.precision import warn_of_indistinguishable
 
 if TYPE_CHECKING:
@@ -299,8 +300,12 @@ class Demonstrations:
         :raises ValueError: when the dataset has no episodes, no environment id, spaces other than Box (or Dicts of Box
             for observations), or data that fail the checks above
         """
-        episodes, fields = read_minari(dataset, env_id, observation_space)
-        return cls.from_episodes(episodes, **fields)
+        if isinstance(dataset, str):
+            minari_files(dataset)
+            dataset = import_extra("minari", "minari").load_dataset(dataset)
+        source = f"Minari dataset {dataset.spec.dataset_id}"
+        recorded_id = "" if dataset.env_spec is None else dataset.env_spec.id
+        return cls.from_episodes(minari_episodes(dataset, observation_space, source), env_id or recorded_id, source=source)
 
     def _error(self, name: str, expected: str, found: str) -> ValueError:
         return field_error(self.source, name, expected, found)

@@ -10,23 +10,12 @@ from sb3_actpc.demonstrations.rows import box_paths, field_error, join_observati
 from sb3_actpc.utils.extras import import_extra
 
 
-def read_minari(
-    dataset: Any, env_id: str | None = None, observation_space: spaces.Space[Any] | None = None
-) -> tuple[list[dict[str, Any]], dict[str, Any]]:
-    """
-    :return: the columns of each episode, and the further arguments of ``Demonstrations.from_episodes``; for the parameters and
-        the errors see ``Demonstrations.from_minari``
-    """
-    if isinstance(dataset, str):
-        minari_files(dataset)
-        dataset = import_extra("minari", "minari").load_dataset(dataset)
-    source = f"Minari dataset {dataset.spec.dataset_id}"
+def minari_episodes(dataset: Any, observation_space: spaces.Space[Any] | None, source: str) -> list[dict[str, Any]]:
+    """The columns of each episode of a ``minari.MinariDataset``; see ``Demonstrations.from_minari``."""
     if not isinstance(dataset.action_space, spaces.Box):
         raise field_error(source, "actions", "a Box action space", repr(dataset.action_space))
     paths = box_paths(dataset.observation_space if observation_space is None else observation_space)
-    episodes = [_columns(episode, paths, f"{source}: episode {episode.id}") for episode in dataset.iterate_episodes()]
-    recorded_id = "" if dataset.env_spec is None else dataset.env_spec.id
-    return episodes, {"env_id": env_id or recorded_id, "source": source}
+    return [_columns(episode, paths, f"{source}: episode {episode.id}") for episode in dataset.iterate_episodes()]
 
 
 def minari_files(dataset_id: str) -> list[Path]:

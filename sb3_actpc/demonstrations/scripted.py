@@ -200,13 +200,9 @@ class ScriptedDemonstrator:
     def _view(self, observation: np.ndarray) -> View:
         parts: dict[str, Any] = {name: np.asarray(observation[columns], float) for name, columns in self._layout.items()}
         fingers, state = parts["robot0_gripper_qpos"], parts["object"]
-        return View(
-            eef_position=parts["robot0_eef_pos"],
-            eef_quat=parts["robot0_eef_quat"],
-            finger_gap=float(fingers[0] - fingers[1]),
-            object_position=state[self._object_columns["pos"]],
-            object_quat=state[self._object_columns["quat"]],
-        )
+        object_position, object_quat = state[self._object_columns["pos"]], state[self._object_columns["quat"]]
+        finger_gap = float(fingers[0] - fingers[1])
+        return View(parts["robot0_eef_pos"], parts["robot0_eef_quat"], finger_gap, object_position, object_quat)
 
 
 def collect_scripted(

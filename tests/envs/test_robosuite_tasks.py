@@ -240,7 +240,6 @@ def test_the_horizon_truncates() -> None:
         ({"obs": "pixels"}, "obs='pixels' is not one of paper, robomimic"),
         ({"horizon": 0}, "horizon=0 must be a whole number of at least 1"),
         ({"horizon": 2.5}, "horizon=2.5"),
-        ({"camera": "backstage"}, "camera='backstage' does not exist: choose one of frontview"),
     ],
 )
 def test_a_wrong_keyword_is_named_with_what_is_allowed(kwargs: dict[str, Any], message: str) -> None:
