@@ -152,8 +152,9 @@ class HER(DDPGDemo):
         return actions, scaled
 
     def train(self, gradient_steps: int, batch_size: int = 100) -> None:
-        """DDPG's updates; none before the first episode has ended, since hindsight needs one."""
-        if self.replay_buffer.ep_length.any():  # type: ignore[union-attr]
+        """DDPG's updates; none before the first episode has ended, since hindsight needs one, unless all is demonstrated."""
+        buffer: Any = self.replay_buffer
+        if buffer.n_demonstrated(batch_size) == batch_size or buffer.ep_length.any():
             self.logger.record("rollout/random_action_probability", self.random_action_probability)
             super().train(gradient_steps, batch_size)
 
