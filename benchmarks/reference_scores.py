@@ -14,7 +14,7 @@ import pandas as pd
 
 from sb3_actpc.demonstrations import Demonstrations
 from sb3_actpc.envs import ROBOSUITE_IDS, SPARSE_MUJOCO_IDS
-from sb3_actpc.experiments.report.references import SCORES_FILE
+from sb3_actpc.experiments.report.results import SCORES_FILE
 from sb3_actpc.experiments.runs import play_episodes
 from sb3_actpc.experiments.runs.presets import find_demonstrations
 from sb3_actpc.experiments.runs.run import make_eval_envs

@@ -2,12 +2,13 @@
 
 import argparse
 
+from sb3_actpc.cli import count
+
 
 def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
     parser = subparsers.add_parser("bench", help="time one update of ActPC against SB3's TD3")
-    parser.add_argument("--rounds", type=int, default=40, help="interleaved measurements (default: %(default)s)")
-    parser.add_argument("--threads", type=int, help="torch threads (default: torch's own choice)")
-    parser.add_argument("--device", default="cpu", help="torch device (default: %(default)s)")
+    parser.add_argument("--rounds", type=count, default=40, help="interleaved measurements (default: %(default)s)")
+    parser.add_argument("--threads", type=count, help="torch threads (default: torch's own choice)")
     parser.add_argument("--training", action="store_true", help="also steps of training, SBX's SAC with sbx-rl")
 
 
@@ -16,17 +17,13 @@ def run(args: argparse.Namespace) -> int:
     import torch as th
 
     from sb3_actpc.experiments import timing
-    from sb3_actpc.utils.checks import check_device
 
-    if args.rounds < 1 or (args.threads is not None and args.threads < 1):
-        raise ValueError(f"--rounds {args.rounds} and --threads {args.threads} must be at least 1")
-    check_device(args.device)
     if args.threads is not None:
         th.set_num_threads(args.threads)
-    sizes = f"batch {timing.BATCH_SIZE}, {timing.TASK}, {args.device}, {th.get_num_threads()} threads"
+    sizes = f"batch {timing.BATCH_SIZE}, {timing.TASK}, {th.get_num_threads()} threads"
     print(f"{sizes}; median ratios to {timing.BASE}")
     kinds = {"update": timing.updates, "step of training": timing.training}
     for kind, entries in kinds.items() if args.training else [("update", timing.updates)]:
-        for name, ratio in timing.measure(entries(args.device), args.rounds).items():
+        for name, ratio in timing.measure(entries(), args.rounds).items():
             print(f"{kind:16s}  {name:22s} {ratio:6.2f}")
     return 0

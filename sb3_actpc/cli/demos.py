@@ -7,16 +7,12 @@ from collections.abc import Callable, Sequence
 from contextlib import closing, suppress
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from sb3_actpc.envs import ROBOSUITE_IDS, SPARSE_IDS, SPARSE_MUJOCO_IDS, sparse_env_id
+from sb3_actpc.envs import ROBOSUITE_IDS, SPARSE_IDS, sparse_env_id
 from sb3_actpc.utils.files import folder_name
 
-if TYPE_CHECKING:
-    from sb3_actpc.demonstrations import Demonstrations
-
 Subparsers = Any  # argparse's own type is private
-
 HDF5_SUFFIXES = (".hdf5", ".h5")
 _report = partial(print, flush=True)
 
@@ -32,22 +28,13 @@ def add_parser(subparsers: Subparsers) -> None:
 
 
 def _add_collect(commands: Subparsers) -> None:
-    collect = commands.add_parser(
-        "collect",
-        help="record a demonstrator's episodes",
-        description="Train a demonstrator (a sparse MuJoCo task by its dense base task, any other by its own rewards) and "
-        "record its successful episodes. A finished training is not repeated, a stopped one goes on. Robosuite "
-        "tasks: record scripted demonstrators.",
+    about = (
+        "record successful episodes of a trained demonstrator (of a sparse MuJoCo task: on its dense one), or a scripted one"
     )
+    collect = commands.add_parser("collect", help=about, description=f"{about}. A training that was stopped goes on.")
     add = collect.add_argument
-    add(
-        "--env",
-        required=True,
-        metavar="ID",
-        help="Gymnasium id, such as SparseHopper-v5 (of a goal task: its sparse one)",
-    )
-    who = "who demonstrates (default: scripted for robosuite tasks, else trained)"
-    add("--demonstrator", choices=["trained", "scripted"], help=who)
+    add("--env", required=True, metavar="ID", help="Gymnasium id, such as SparseHopper-v5 (of a goal task: its sparse one)")
+    add("--demonstrator", choices=["trained", "scripted"], help="default: scripted for robosuite tasks, else trained")
     add("--episodes", type=int, help="episodes to record (default: 20; scripted 50, or 300 when mixed)")
     add("--max-tries", type=int, help="episodes to play at most (default: ten times --episodes)")
     several = "a trained one and itself when it stood at half the return, or six scripted ones of three proficiencies"
@@ -60,8 +47,7 @@ def _add_collect(commands: Subparsers) -> None:
     add("--target-return", type=float, help="stop training at this mean dense return (default: never)")
     add("--quality", type=float, help="stop training at this share of the dense return of the package's demonstrations")
     add("--stochastic", action="store_true", help="sample the actions, not the most likely ones")
-    folder = "folder of the training run (default: demonstrators/<task>_<algo>_<seed>)"
-    add("--work-dir", type=Path, metavar="DIR", help=folder)
+    add("--work-dir", type=Path, metavar="DIR", help="of the training run (default: demonstrators/<task>_<algo>_<seed>)")
     add("--save-every", type=int, default=50_000, help="steps between two evaluations (default: 50000)")
     add("--n-envs", type=int, default=1, help="parallel environments of the training (default: 1)")
     add("--gym-packages", nargs="+", default=[], metavar="MODULE", help="modules that register the task")
@@ -71,12 +57,8 @@ def _add_collect(commands: Subparsers) -> None:
 
 
 def _add_convert(commands: Subparsers) -> None:
-    add = commands.add_parser(
-        "convert",
-        help="HDF5 of robomimic or robosuite to .npz, or .npz to robomimic's HDF5",
-        description="Reads robomimic's low-dimensional files and robosuite's demo.hdf5 (its states are replayed), "
-        "or writes a .npz file as a robomimic file.",
-    ).add_argument
+    about = "HDF5 of robomimic (low-dimensional) or robosuite (demo.hdf5, replayed) to .npz, or .npz to robomimic's HDF5"
+    add = commands.add_parser("convert", help=about, description=about).add_argument
     add("file", type=Path, metavar="FILE", help=".hdf5 or .npz")
     add("--env", metavar="ID", help=f"task of an .hdf5 file, one of {', '.join(ROBOSUITE_IDS)}")
     add("--obs", metavar="LAYOUT", help="observations, paper or robomimic (default: paper)")
@@ -85,15 +67,10 @@ def _add_convert(commands: Subparsers) -> None:
 
 
 def _add_download(commands: Subparsers) -> None:
-    add = commands.add_parser(
-        "download",
-        help="fetch robomimic's human demonstrations and convert them",
-        description="Fetches robomimic's file of low-dimensional observations (MIT licence, 30 to 130 MB), checks it and "
-        "converts it. Without a network: download the address it names elsewhere, and use `sb3-actpc demos convert`.",
-    ).add_argument
+    about = "fetch robomimic's human demonstrations (MIT licence, 30 to 130 MB), check and convert them"
+    add = commands.add_parser("download", help=about, description=about).add_argument
     add("--env", required=True, metavar="ID", help=f"one of {', '.join(ROBOSUITE_IDS)}")
-    kinds = "mh: 300 by six humans of three levels (default); ph: 200 by one"
-    add("--kind", default="mh", metavar="{mh,ph}", help=kinds)
+    add("--kind", default="mh", metavar="{mh,ph}", help="mh: 300 by six humans of three levels (default); ph: 200 by one")
     add("--url", help="another address of such a file")
     add("--obs", default="paper", metavar="LAYOUT", help="observations, paper or robomimic (default: paper)")
     add("--output", type=Path, metavar="FILE", help=".npz file to write (default: <task>_<kind>.npz)")
@@ -116,7 +93,7 @@ def _collect(args: argparse.Namespace) -> int:
     known = sparse_env_id(args.env.rpartition(":")[2])  # what is recorded in it serves the goal task
     args.env = known if known in SPARSE_IDS else args.env
     demonstrator = args.demonstrator or ("scripted" if args.env in ROBOSUITE_IDS else "trained")
-    if demonstrator == "trained" and (args.proficiency is not None or args.obs is not None):
+    if demonstrator == "trained" and (args.proficiency, args.obs) != (None, None):
         raise ValueError("--proficiency and --obs are for scripted demonstrators of robosuite tasks: leave them out")
     if demonstrator == "scripted" and (args.stochastic or args.quality is not None or args.target_return is not None):
         raise ValueError("--stochastic, --quality and --target-return are for trained demonstrators: give --proficiency")
@@ -136,36 +113,27 @@ def _default_output(env_id: str, suffix: str = "") -> Path:
     return Path(f"{name.replace('sparse', 'sparse_', 1)}{suffix}.npz")
 
 
-def _save(demonstrations: "Demonstrations", output: Path, write: Callable[..., None] | None = None) -> int:
+def _save(demonstrations: Any, output: Path, write: Callable[..., None] | None = None) -> int:
     (write or type(demonstrations).save)(demonstrations, output)
     _report(repr(demonstrations))
     _report(f"wrote {output} ({output.stat().st_size / 1e6:.2f} MB)")
     return 0
 
 
-def _collect_scripted(args: argparse.Namespace) -> "Demonstrations":
+def _collect_scripted(args: argparse.Namespace) -> Any:
     from sb3_actpc.demonstrations import MIXED_DEMONSTRATORS, collect_scripted
 
     if args.mixed and args.proficiency is not None:
         raise ValueError(f"--proficiency {args.proficiency} and --mixed, which has six of them: give one of the two")
-    proficiency = 1.0 if args.proficiency is None else args.proficiency
-    default = 50 * (len(MIXED_DEMONSTRATORS) if args.mixed else 1)
-    n_episodes = default if args.episodes is None else args.episodes
-    _report(f"scripted demonstrators{' of three levels' if args.mixed else f' of proficiency {proficiency}'} in {args.env}")
+    proficiency = "mixed" if args.mixed else 1.0 if args.proficiency is None else args.proficiency
+    n_episodes = args.episodes or 50 * (len(MIXED_DEMONSTRATORS) if args.mixed else 1)
+    _report(f"scripted demonstrators in {args.env}, proficiency: {proficiency}")
     options = ("env", "demonstrator", "proficiency", "mixed", "obs", "episodes", "max_tries", "seed")
-    return collect_scripted(
-        args.env,
-        "mixed" if args.mixed else proficiency,
-        n_episodes,
-        args.seed,
-        args.obs or "paper",
-        {"command": command_line(args, options)},
-        max_tries=args.max_tries,
-        report=_report,
-    )
+    given = (args.env, proficiency, n_episodes, args.seed, args.obs or "paper", {"command": command_line(args, options)})
+    return collect_scripted(*given, max_tries=args.max_tries, report=_report)
 
 
-def _collect_trained(args: argparse.Namespace) -> "Demonstrations":
+def _collect_trained(args: argparse.Namespace) -> Any:
     import gymnasium as gym
 
     from sb3_actpc.demonstrations.rows import box_paths
@@ -196,13 +164,12 @@ def _collect_trained(args: argparse.Namespace) -> "Demonstrations":
         _report(f"demonstrator of {one.n_steps} steps: mean dense return {one.mean_return:.1f}")
     words = ("env", "algo", "steps", "target_return", "quality", "stochastic", "mixed", "episodes", "max_tries", "seed")
     metadata = {"command": command_line(args, (*words, "save_every", "n_envs", "gym_packages")), "algorithm": args.algo}
-    n_episodes = 20 if args.episodes is None else args.episodes
     recorded = demonstrators.record_demonstrators(
-        trained, args.env, n_episodes, args.stochastic, args.seed, metadata, max_tries=args.max_tries, report=_report
+        trained, args.env, args.episodes or 20, args.stochastic, args.seed, metadata, max_tries=args.max_tries, report=_report
     )
     returns = recorded.dense_returns
     with suppress(FileNotFoundError):  # nothing is shipped
-        usual = demonstrators.reference_return(args.env) if args.env in SPARSE_MUJOCO_IDS else float("-inf")
+        usual = demonstrators.reference_return(args.env)
         if target is None and returns is not None and returns.mean() < demonstrators.share_of(usual, 0.5):
             less = f"mean dense return {returns.mean():.1f} is far below {usual:.1f}, that of the package's"
             _report(f"{less}: train longer (--steps), or say that they are to be weak (--quality)")
@@ -214,11 +181,9 @@ def command_line(args: argparse.Namespace, options: Sequence[str]) -> str:
     words = ["sb3-actpc", "demos", "collect"]
     for option in options:
         value = getattr(args, option)
-        if value is True:
-            words.append("--" + option)
-        elif value is not None and value is not False and value != []:
-            values = value if isinstance(value, list) else [int(value) if option == "steps" else value]
-            words += ["--" + option.replace("_", "-"), *map(str, values)]
+        if value is not None and value is not False and value != []:
+            values = value if isinstance(value, list) else [] if value is True else [value]
+            words += ["--" + option.replace("_", "-"), *(f"{one:.0f}" if option == "steps" else str(one) for one in values)]
     return shlex.join(words)
 
 
@@ -229,18 +194,16 @@ def _convert(args: argparse.Namespace) -> int:
     output = args.output or args.file.with_suffix(".hdf5" if is_npz else ".npz")
     if output.resolve() == args.file.resolve() or (args.output is None and output.exists()):
         raise FileExistsError(f"{output} is there already: give another --output, what it holds may be more")
-    if not is_npz:
-        if output.suffix != ".npz":
-            raise ValueError(f"--output {output} must end in .npz")
-        if args.env is None:
-            raise ValueError(f"--env is needed to convert {args.file}: give one of {', '.join(ROBOSUITE_IDS)}")
-        return _save(read_hdf5(args.file, args.env, args.obs or "paper", args.filter_key), output)
-    if output.suffix not in HDF5_SUFFIXES:
-        raise ValueError(f"--output {output} must end in {' or '.join(HDF5_SUFFIXES)}: it will be a robomimic file")
-    for option in ("env", "obs", "filter_key"):
-        if getattr(args, option) is not None:
-            raise ValueError(f"--{option.replace('_', '-')} is for HDF5 files: leave it out, {args.file} is written as it is")
-    return _save(Demonstrations.load(args.file), output, write_robomimic)
+    if output.suffix not in (suffixes := HDF5_SUFFIXES if is_npz else (".npz",)):
+        raise ValueError(f"--output {output} must end in {' or '.join(suffixes)}")
+    if is_npz:
+        for option in ("env", "obs", "filter_key"):
+            if getattr(args, option) is not None:
+                raise ValueError(f"--{option.replace('_', '-')} is for HDF5 files: leave it out")
+        return _save(Demonstrations.load(args.file), output, write_robomimic)
+    if args.env is None:
+        raise ValueError(f"--env is needed to convert {args.file}: give one of {', '.join(ROBOSUITE_IDS)}")
+    return _save(read_hdf5(args.file, args.env, args.obs or "paper", args.filter_key), output)
 
 
 def _download(args: argparse.Namespace) -> int:
@@ -249,9 +212,7 @@ def _download(args: argparse.Namespace) -> int:
     url = args.url or robomimic_url(args.env, args.kind)
     output = args.output or _default_output(args.env, f"_{args.kind}")
     if output.suffix in HDF5_SUFFIXES:
-        raise ValueError(
-            f"--output {output} must end in .npz: what is fetched goes beside it, as {output.with_suffix('.hdf5')}"
-        )
+        raise ValueError(f"--output {output} must end in .npz: what is fetched goes beside it, as an .hdf5 file")
     return _save(download_robomimic(args.env, output.with_suffix(".hdf5"), url, args.obs, _report), output)
 
 
@@ -261,9 +222,7 @@ def _info(args: argparse.Namespace) -> int:
     if not args.file.is_file():
         raise FileNotFoundError(f"no demonstration file {args.file}: make one with `sb3-actpc demos collect`")
     demonstrations = Demonstrations.load(args.file)
-    _report(f"env: {demonstrations.env_id}")
-    _report(f"episodes: {demonstrations.n_episodes}")
-    _report(f"transitions: {len(demonstrations)}")
+    _report(f"env: {demonstrations.env_id}\nepisodes: {demonstrations.n_episodes}\ntransitions: {len(demonstrations)}")
     _report(f"observations: {demonstrations.observations.shape[1:]}, actions: {demonstrations.actions.shape[1:]}")
     for name, returns in (("sparse", demonstrations.episode_returns), ("dense", demonstrations.dense_returns)):
         if returns is not None:

@@ -24,12 +24,9 @@ def run(args: argparse.Namespace) -> int:
 def _tasks() -> Iterator[tuple[str, str]]:
     from sb3_actpc import envs
 
-    kinds = (
-        (envs.SPARSE_MUJOCO_IDS, "a MuJoCo task with a sparse reward"),
-        (envs.GOAL_MUJOCO_IDS, "the same with a goal in the observation, for hindsight"),
-        (envs.ROBOSUITE_IDS, "an arm of robosuite (extra robosuite)"),
-    )
-    yield from ((env_id, about) for ids, about in kinds for env_id in ids)
+    yield from dict.fromkeys(envs.SPARSE_MUJOCO_IDS, "a MuJoCo task with a sparse reward").items()
+    yield from dict.fromkeys(envs.GOAL_MUJOCO_IDS, "the same with a goal in the observation, for hindsight").items()
+    yield from dict.fromkeys(envs.ROBOSUITE_IDS, "an arm of robosuite (extra robosuite)").items()
     yield "any other Gymnasium id", "with --demonstrations FILE or none, and --gym-packages where a module registers it"
 
 
@@ -38,19 +35,17 @@ def _algos() -> Iterator[tuple[str, str]]:
 
     for name in ALGORITHMS:
         try:
-            about = (load_algorithm(name).__doc__ or "").strip().partition("\n")[0]
+            yield name, (load_algorithm(name).__doc__ or "").strip().partition("\n")[0]
         except ImportError as error:  # an extra that is not installed
-            about = str(error)
-        yield name, about
+            yield name, str(error)
 
 
 def _variants() -> Iterator[tuple[str, str]]:
     from sb3_actpc.experiments.comparison import find_variant, variant_names
-    from sb3_actpc.experiments.runs.algorithms import ALGORITHMS
 
-    for name in variant_names():
-        if name not in ALGORITHMS:
-            yield name, f"{find_variant(name).algo}: {find_variant(name).about}"
+    for variant in map(find_variant, variant_names()):
+        if variant.about:
+            yield str(variant.name), f"{variant.algo}: {variant.about}"
 
 
 def _presets() -> Iterator[tuple[str, str]]:

@@ -10,20 +10,15 @@ from sb3_actpc.cli import add_run_options, given
 
 
 def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    parser = subparsers.add_parser(
-        "train",
-        help="train an agent on a sparse-reward task",
-        description="Train an agent; evaluate it as it goes; write the model, CSV files and a plot.",
-    )
+    about = "train an agent, evaluate it as it goes, and write the model, CSV files and a plot"
+    parser = subparsers.add_parser("train", help=about, description=about)
     task = parser.add_mutually_exclusive_group(required=True)
     task.add_argument("--env", help="Gymnasium id, such as SparseHalfCheetah-v5")
-    going_on = "go on with the run in this folder, with its settings; a finished one with --steps MORE"
-    task.add_argument("--resume", metavar="DIR", help=going_on)
+    task.add_argument("--resume", metavar="DIR", help="go on with the run in this folder; a finished one with --steps MORE")
     add = parser.add_argument
     add("--algo", help="algorithm, or MODULE:CLASS of your own (default: actpc)")
     add("--preset", metavar="NAME", help="file of hyperparams/, or a path ending in .yml (default: ALGO)")
-    setting = "replace a setting of the preset, such as gamma=0.98 or policy_kwargs.net_arch=[64,64]"
-    add("--set", action="append", metavar="KEY=VALUE", help=setting)
+    add("--set", action="append", metavar="KEY=VALUE", help="a setting, such as gamma=0.98 or policy_kwargs.net_arch=[64,64]")
     add("--env-kwarg", action="append", metavar="KEY=VALUE", help="keyword of the environment")
     add("--seed", type=int, help="seed (default: 0)")
     add("--output", metavar="DIR", help="run folder (default: runs/ENV/ALGO_PRESET_seedSEED)")
@@ -36,7 +31,7 @@ def run(args: argparse.Namespace) -> int:
     from sb3_actpc.checkpoints import EXIT_STOPPED, TrainingStopped
     from sb3_actpc.experiments.runs import Run, resume_run, train_run
     from sb3_actpc.experiments.runs.presets import parse_assignments
-    from sb3_actpc.experiments.runs.summary import result_table
+    from sb3_actpc.experiments.runs.run import result_table
 
     report = partial(print, flush=True)
     try:
@@ -48,10 +43,7 @@ def run(args: argparse.Namespace) -> int:
         else:
             others = set(vars(args)) - {"resume", "steps", "no_progress", "command", "debug"}
             if wrong := sorted(name for name in others if getattr(args, name) is not None):
-                option = "--" + wrong[0].replace("_", "-")
-                raise ValueError(
-                    f"{option} cannot be given with --resume: the run goes on with its own settings, leave it out"
-                )
+                raise ValueError(f"--{wrong[0].replace('_', '-')} cannot be given with --resume: leave it out")
             more_steps = Run(**given(args, ["steps"])).n_timesteps or 0
             result = resume_run(Path(args.resume), report, not args.no_progress, more_steps=more_steps)
     except TrainingStopped as stop:

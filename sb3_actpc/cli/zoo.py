@@ -34,7 +34,6 @@ def run(args: argparse.Namespace) -> int:
     parser = argparse.ArgumentParser(prog=f"sb3-actpc zoo {args.zoo_command}", add_help=False, allow_abbrev=False)
     parser.add_argument("-a", "--algo", default="actpc")
     parser.add_argument("-e", "--env", nargs="+", default=[])
-    parser.add_argument("-f", "--folder", "--log-folder", "--exp-folder", default="logs")
     parser.add_argument("--gym-packages", nargs="+", default=[])
     for options in (["-conf", "--conf-file"], ["--preset"], ["--demonstrations"], ["--output"]):
         parser.add_argument(*options)
@@ -70,11 +69,14 @@ def _arguments(command: str, ours: argparse.Namespace, rest: Sequence[str], fold
     if (ours.preset or ours.demonstrations) and (ours.conf_file or command in ("enjoy", "plot")):
         raise ValueError("--preset and --demonstrations are for training without --conf-file: leave them out")
     if command == "plot":
-        return _plotted_runs(ours, rest)
+        if ours.output is not None:
+            import_extra("matplotlib", "experiments").use("Agg")  # shows nothing
+        names = [env_id.rpartition(":")[2].replace("/", "-") for env_id in ours.env]  # of the run folders
+        return ["-a", ours.algo, "-f", "logs", "-e", *names, *rest]
     check_env_id(ours.env[0], ours.gym_packages)
     *modules, env_id = ours.env[0].split(":")
     packages = ["--gym-packages", *ours.gym_packages, *modules] if ours.gym_packages or modules else []
-    passed = [*packages, "--algo", ours.algo, "--env", env_id, "-f", ours.folder, *rest]
+    passed = [*packages, "--algo", ours.algo, "--env", env_id, *rest]
     if command == "enjoy":
         return passed
     if command == "optimize" and ours.algo not in OPTIMIZABLE:
@@ -83,17 +85,6 @@ def _arguments(command: str, ours: argparse.Namespace, rest: Sequence[str], fold
     if ours.conf_file is None:
         settings.write_text(yaml.safe_dump({env_id: _settings(env_id, ours)}, sort_keys=False), encoding="utf-8")
     return [*passed, "--conf-file", str(settings), *(["--optimize-hyperparameters"] if command == "optimize" else [])]
-
-
-def _plotted_runs(ours: argparse.Namespace, rest: Sequence[str]) -> list[str]:
-    """With ids as rl_zoo3 names run folders. FileNotFoundError where it would draw an empty figure."""
-    names = [env_id.rpartition(":")[2].replace("/", "-") for env_id in ours.env]
-    for name in names:
-        if not list(Path(ours.folder, ours.algo).glob(f"*{name}*/*monitor.csv")):
-            raise FileNotFoundError(f"no runs of {ours.algo} on {name} in {ours.folder}: make one with zoo train")
-    if ours.output is not None:
-        import_extra("matplotlib", "experiments").use("Agg")  # shows nothing
-    return ["-a", ours.algo, "-f", ours.folder, "-e", *names, *rest]
 
 
 def _sample_actpc(trial: Any, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> dict[str, Any]:
@@ -105,12 +96,12 @@ def _settings(env_id: str, ours: argparse.Namespace) -> dict[str, Any]:
     """The entry of rl_zoo3's settings file: the preset's, the demonstrations, and the log of successes."""
     from sb3_actpc.experiments.runs import Run, resolve
     from sb3_actpc.experiments.runs.environments import make_env
-    from sb3_actpc.experiments.runs.presets import RUN_KEYS, demonstrations_of, fitting_policy
+    from sb3_actpc.experiments.runs.presets import RUN_KEYS, find_demonstrations, fitting_policy, takes_demonstrations
 
     run = resolve(Run(env=env_id, algo=ours.algo, preset=ours.preset, demonstrations=ours.demonstrations or "shipped"))
     settings = {name: getattr(run, name) for name in RUN_KEYS if getattr(run, name)} | run.settings
     settings |= {} if run.normalize is None else {"normalize": run.normalize or True}
-    if (found := demonstrations_of(run)) is not None:
+    if takes_demonstrations(run) and (found := find_demonstrations(env_id, run.demonstrations)) is not None:
         settings["demonstrations"] = str(found.absolute()) if isinstance(found, Path) else found
     with closing(make_env(env_id, run.env_kwargs)) as env:
         settings["policy"] = fitting_policy(settings["policy"], env.observation_space)

@@ -16,7 +16,7 @@ from sb3_actpc.demonstrations.recording import Report, silent
 from sb3_actpc.envs import ROBOSUITE_IDS, SPARSE_MUJOCO_IDS, dense_env_id, sparse_env_id
 from sb3_actpc.experiments.runs.environments import check_env_id
 from sb3_actpc.experiments.runs.evaluation import Predictor
-from sb3_actpc.experiments.runs.record import read_run
+from sb3_actpc.experiments.runs.record import CONFIG, read_run
 from sb3_actpc.experiments.runs.run import finish_run, load_run
 from sb3_actpc.experiments.runs.schema import Run
 from sb3_actpc.utils.files import folder_lock
@@ -54,7 +54,6 @@ def demonstrator_run(
     :param target_return: stop at the first evaluation whose mean dense return reaches it, None for never
     :param gym_packages: modules that register the environment
     :param options: further fields of a :class:`~sb3_actpc.experiments.runs.schema.Run`
-    :return: the run
     :raises ValueError: for an unknown algorithm, a task of robosuite, or one without a time limit and ``n_timesteps``
     :raises gymnasium.error.Error: when the environment is unknown
     """
@@ -70,40 +69,23 @@ def demonstrator_run(
         if limit is None:
             raise ValueError(f"{learned_id} has no time limit: say with --steps how long to train")
         n_timesteps = N_TRAINING_EPISODES * limit
-    return Run(
-        env=learned_id,
-        algo=algo,
-        preset=DEMONSTRATOR_ALGORITHMS[algo],
-        n_timesteps=n_timesteps,
-        target_return=target_return,
-        demonstrations="none",
-        keep="best",
-        eval_episodes=N_EVALUATION_EPISODES,
-        gym_packages=tuple(gym_packages),
-        **options,
-    )
+    options |= {"preset": DEMONSTRATOR_ALGORITHMS[algo], "demonstrations": "none", "eval_episodes": N_EVALUATION_EPISODES}
+    options |= {"n_timesteps": n_timesteps, "target_return": target_return, "gym_packages": tuple(gym_packages)}
+    return Run(env=learned_id, algo=algo, keep="best", **options)
 
 
 def train_demonstrator(run: Run, folder: Path, report: Report = silent) -> Demonstrator:
     """Train a demonstrator (see :func:`demonstrator_run`), go on with a training that was stopped, or take the one that is
-    there: the agent of the best evaluation."""
+    there: the agent of the best evaluation. ValueError where that had more steps, and may have made a better demonstrator."""
     with folder_lock(folder):
-        _check_no_longer(folder, run)
+        stored = read_run(folder).n_timesteps if (folder / CONFIG).is_file() else None
+        if stored is not None and stored > (run.n_timesteps or 0):
+            raise ValueError(
+                f"{folder} holds a training of {stored} steps, not of {run.n_timesteps}: choose another --work-dir, or say "
+                f"--steps {stored}"
+            )
         result = finish_run(run.model_copy(update={"output": str(folder)}), report)
     return Demonstrator(load_run(folder)[1], result["timesteps"], result["dense_return"])
-
-
-def _check_no_longer(folder: Path, run: Run) -> None:
-    """:raises ValueError: where the training that is there had more steps, and may have made a better demonstrator"""
-    try:
-        stored = read_run(folder).n_timesteps or 0
-    except (FileNotFoundError, ValueError):  # none is there, or a damaged one, which is begun anew
-        return
-    if stored > (run.n_timesteps or 0):
-        raise ValueError(
-            f"{folder} holds a training of {stored} steps, not of {run.n_timesteps}: remove it, choose another --work-dir, or "
-            f"say --steps {stored}"
-        )
 
 
 def train_mixed(run: Run, folder: Path, report: Report = silent) -> list[Demonstrator]:
@@ -124,10 +106,8 @@ def share_of(reference: float, share: float) -> float:
 
 def reference_return(env_id: str) -> float:
     """Mean dense return of the demonstrations of a sparse MuJoCo task that come with the package."""
-    try:
-        returns = Demonstrations.load(shipped_demonstrations(sparse_env_id(env_id))).dense_returns
-    except FileNotFoundError:
-        returns = None
+    known = sparse_env_id(env_id)
+    returns = Demonstrations.load(shipped_demonstrations(known)).dense_returns if known in SPARSE_MUJOCO_IDS else None
     if returns is None:
         raise FileNotFoundError(f"no reference return of {env_id} comes with the package: give --target-return, not --quality")
     return float(returns.mean())

@@ -9,7 +9,6 @@ from typing import Any
 import torch as th
 from stable_baselines3 import TD3
 from stable_baselines3.common.logger import configure
-from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_actpc.actpc import ActPC
 from sb3_actpc.experiments.runs.presets import preset, with_changes
@@ -31,14 +30,12 @@ Entries = dict[str, Callable[[], object]]
 def measure(entries: Entries, rounds: int) -> dict[str, float]:
     """The median ratio, round by round, of every entry's time to that of ``BASE``; the entries take turns."""
     # with one thread the processor's time, which other programs hardly change
-    clock = time.process_time if th.get_num_threads() == 1 and not th.cuda.is_initialized() else time.perf_counter
+    clock = time.process_time if th.get_num_threads() == 1 else time.perf_counter
     times: dict[str, list[float]] = {name: [] for name in entries}
     for _ in range(rounds + N_WARM_UP):
         for name, entry in entries.items():
-            _synchronize()
             start = clock()
             entry()
-            _synchronize()
             times[name].append(clock() - start)
     return ratios({name: seconds[N_WARM_UP:] for name, seconds in times.items()})
 
@@ -49,44 +46,39 @@ def ratios(times: dict[str, list[float]]) -> dict[str, float]:
     return {name: statistics.median(a / b for a, b in zip(own, base, strict=True)) for name, own in times.items()}
 
 
-def updates(device: str) -> Entries:
+def updates() -> Entries:
     """Two updates of each learner (TD3 moves its actor every other time), on random transitions."""
-    return {name: _updater(model) for name, model in _learners(device).items()}
+
+    def entry(model: Any) -> Callable[[], object]:
+        model.learning_starts = 2 * N_FILLED
+        model.learn(N_FILLED)
+        return lambda: model.train(gradient_steps=2, batch_size=model.batch_size)
+
+    return {name: entry(model) for name, model in _learners().items()}
 
 
-def training(device: str) -> Entries:
+def training() -> Entries:
     """Steps of the environment, each with one update; SBX's SAC where ``sbx-rl`` is installed."""
-    learners: dict[str, Any] = _learners(device)
+    learners = _learners()
     if find_spec("sbx"):
         import sbx
 
         learners["SBX SAC"] = sbx.SAC("MlpPolicy", TASK, batch_size=BATCH_SIZE, learning_starts=2 * N_STEPS, seed=0)
-    return {name: _learner(model) for name, model in learners.items()}
+        learners["SBX SAC"].set_logger(configure(None, []))
+
+    def entry(model: Any) -> Callable[[], object]:
+        model.learn(2 * N_STEPS)
+        return lambda: model.learn(N_STEPS, reset_num_timesteps=False)
+
+    return {name: entry(model) for name, model in learners.items()}
 
 
-def _learners(device: str) -> dict[str, OffPolicyAlgorithm]:
+def _learners() -> dict[str, Any]:
     shared: dict[str, Any] = {"learning_starts": 2 * N_STEPS, "batch_size": BATCH_SIZE, "buffer_size": 100 * N_FILLED}
-    shared |= {"gradient_steps": 1, "device": device, "seed": 0}
-    td3 = TD3("MlpPolicy", TASK, policy_kwargs={"net_arch": [WIDTH, WIDTH]}, **shared)
-    models: dict[str, OffPolicyAlgorithm] = {BASE: td3}
+    shared |= {"gradient_steps": 1, "device": "cpu", "seed": 0}
+    models: dict[str, Any] = {BASE: TD3("MlpPolicy", TASK, policy_kwargs={"net_arch": [WIDTH, WIDTH]}, **shared)}
     for name, quick in QUICK.items():
         models[f"ActPC, {name}.yml"] = ActPC(env=TASK, **{**with_changes(preset(TASK, name), quick), **shared})
+    for model in models.values():
+        model.set_logger(configure(None, []))
     return models
-
-
-def _updater(model: OffPolicyAlgorithm) -> Callable[[], object]:
-    model.set_logger(configure(None, []))
-    model.learning_starts = 2 * N_FILLED
-    model.learn(N_FILLED)
-    return lambda: model.train(gradient_steps=2, batch_size=model.batch_size)
-
-
-def _learner(model: OffPolicyAlgorithm) -> Callable[[], object]:
-    model.set_logger(configure(None, []))
-    model.learn(2 * N_STEPS)
-    return lambda: model.learn(N_STEPS, reset_num_timesteps=False)
-
-
-def _synchronize() -> None:
-    if th.cuda.is_initialized():
-        th.cuda.synchronize()

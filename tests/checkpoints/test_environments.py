@@ -16,7 +16,7 @@ from gymnasium.wrappers import NormalizeObservation, NormalizeReward, TransformR
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_actpc.checkpoints.encoding import Decoder, Encoder
-from sb3_actpc.experiments.runs.episode_log import EpisodeLog
+from sb3_actpc.experiments.runs.evaluation import EpisodeLog
 from tests.actpc.envs import CountingEnv
 from tests.checkpoints.runs import assert_same, learn_in_two, learn_straight, log_rows, make_actpc
 

@@ -16,7 +16,6 @@ def line_task(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     if ENV_ID not in gym.registry:
         gym.register(ENV_ID, entry_point="tests.cli.line:LineEnv")
     monkeypatch.setitem(ALGORITHMS, "td3", "stable_baselines3:TD3")
-    monkeypatch.setitem(ALGORITHMS, "silent", "tests.cli.line:SilentTD3")
     monkeypatch.chdir(tmp_path)
     settings = {"n_timesteps": 60, "learning_starts": 20, "policy_kwargs": {"net_arch": [8]}}
     Path("small.yml").write_text(yaml.safe_dump({"default": settings}), encoding="utf-8")

@@ -6,7 +6,6 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from stable_baselines3 import TD3
 
 from sb3_actpc.cli import main
 
@@ -46,16 +45,6 @@ class LineEnv(gym.Env[np.ndarray, np.ndarray]):
 
     def _observation(self) -> np.ndarray:
         return np.array([self.drawn, self.n_steps], dtype=np.float32)
-
-
-class SilentTD3(TD3):
-    """TD3 with a keyword for demonstrations, which it only remembers."""
-
-    received: Any = None
-
-    def __init__(self, policy: Any, env: Any, demonstrations: Any = None, **options: Any) -> None:
-        SilentTD3.received = demonstrations
-        super().__init__(policy, env, **options)
 
 
 def train(*arguments: str) -> int:

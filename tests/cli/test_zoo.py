@@ -29,14 +29,10 @@ FEW = ["--demonstrations", "shown.npz", "--num-threads", "1", "--eval-episodes",
 TRAIN = ["--eval-freq", "60", "--seed", "1", *FEW]
 OPTIMIZE = ["--n-trials", "2", "--n-startup-trials", "1", "--n-evaluations", "1", "-n", "70", "--pruner", "none", *FEW]
 PLAY = ["--no-render", "-n", "60"]
-TRAINED = "logs/actpc/SparseReacher-v5_1/SparseReacher-v5.zip"
 SCRIPT = {
     "train": ["train", *ACTPC, "--preset", "actpc.yml", "--save-freq", "100", *TRAIN, "-params", "gamma:0.9"],
     "enjoy": ["enjoy", *ACTPC, *PLAY],
     "plot": ["plot", "-a", "actpc", "-e", "SparseReacher-v5", "-f", "logs", "-y", "success", "-w", "1", "--output", "s.png"],
-    "continue": ["train", *ACTPC, "--preset", "actpc.yml", *TRAIN, "-i", TRAINED, "-n", "20"],
-    "train in a namespace": ["train", "--env", "own_tasks:ns/Own-v0", "--preset", "actpc.yml", *TRAIN[:4], *FEW[2:]],
-    "plot in a namespace": ["plot", "-a", "actpc", "-e", "own_tasks:ns/Own-v0", "-w", "1", "--output", "ns.png"],
     "optimize": ["optimize", *ACTPC, "--preset", "actpc.yml", *OPTIMIZE],
     "train her": ["train", *HER, "--preset", "her.yml", *TRAIN],
     "enjoy her": ["enjoy", *HER, *PLAY],
@@ -46,7 +42,6 @@ SCRIPT = {
 MISTAKES = {
     "train --algo actpc": "--env is missing",
     "optimize --algo td3 --env SparseReacher-v5": "zoo optimize does not know what to vary for 'td3'",
-    "plot -e ns/Line-v0": "no runs of actpc on ns-Line-v0 in logs",
     "enjoy --env SparseReacher-v5 --preset td3": "--preset and --demonstrations are for training",
     "enjoy --env Mine-v0": "name that: MODULE:Mine-v0, or --gym-packages MODULE",
     "train --env SparseReacher-v5 --demonstrations no.npz": "no demonstrations file at no.npz",
@@ -62,10 +57,6 @@ for name, arguments in json.loads(sys.argv[1]).items():
     with contextlib.redirect_stderr(sys.stdout if name == " ".join(arguments) else sys.stderr):
         print("exit code", main(["zoo", *arguments]), flush=True)
 """
-OWN_TASKS = """
-import gymnasium
-gymnasium.register("ns/Own-v0", "gymnasium.envs.classic_control:PendulumEnv", max_episode_steps=20)
-"""
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +65,6 @@ def ran(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, str]]
     pytest.importorskip("rl_zoo3")
     folder = tmp_path_factory.mktemp("zoo")
     record("SparseReacher-v5").save(folder / "shown.npz")
-    (folder / "own_tasks.py").write_text(OWN_TASKS, encoding="utf-8")
     for name, settings in PRESETS.items():
         (folder / f"{name}.yml").write_text(yaml.safe_dump({"default": settings}), encoding="utf-8")
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT), "CUDA_VISIBLE_DEVICES": ""}
@@ -127,21 +117,11 @@ def test_trained_agents_are_played(ran: tuple[Path, dict[str, str]], command: st
     assert "Success rate" in ran[1][command]
 
 
-def test_runs_of_a_namespace_are_found_by_the_plot(ran: tuple[Path, dict[str, str]]) -> None:
-    """An id with a package and a namespace; rl_zoo3 names the run folder without the package."""
-    assert (ran[0] / "logs" / "actpc" / "ns-Own-v0_1" / "0.monitor.csv").is_file()
-    assert (ran[0] / "ns.png").read_bytes().startswith(b"\x89PNG")
-
-
 def test_help_is_rl_zoo3s_with_our_algorithms() -> None:
     pytest.importorskip("rl_zoo3")
     command = [sys.executable, "-m", "sb3_actpc", "zoo", "train", "--help"]
     shown = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=120, check=True).stdout
     assert "--optimize-hyperparameters" in shown and "actpc" in shown and "logo" in shown
-
-
-def test_a_run_can_be_continued(ran: tuple[Path, dict[str, str]]) -> None:
-    assert "Loading pretrained agent" in ran[1]["continue"]
 
 
 def test_a_search_tries_settings(ran: tuple[Path, dict[str, str]]) -> None:

@@ -56,13 +56,6 @@ def entries() -> list[tuple[str, str]]:
     ]
 
 
-def values(node: object) -> list[object]:
-    """The scalars of nested mappings and lists."""
-    if isinstance(node, dict):
-        return [value for part in node.values() for value in values(part)]
-    return [value for part in node for value in values(part)] if isinstance(node, list) else [node]
-
-
 @pytest.fixture(scope="module")
 def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Where the demonstrations of each task are, recorded once."""
@@ -122,17 +115,3 @@ def test_the_settings_of_a_task_are_the_constructors_defaults(recordings: Path) 
 def test_every_algorithm_has_settings_with_a_default() -> None:
     found = entries()
     assert {(algo, "default") for algo in ALGORITHMS} <= set(found)
-
-
-@pytest.mark.parametrize("path", sorted(FOLDER.glob("*.yml")), ids=lambda path: path.stem)
-def test_settings_are_plain_values(path: Path) -> None:
-    """No text that some reader would evaluate."""
-    for value in values(yaml.safe_load(path.read_text(encoding="utf-8"))):
-        assert value is None or isinstance(value, (bool, int, float, str))
-        assert not isinstance(value, str) or not set(value) & set("()[]{}= ")
-
-
-@pytest.mark.parametrize("preset", ["td3", "her", "logo", "ddpg"])
-def test_the_baselines_get_minus_one_for_a_miss_of_the_reacher(preset: str) -> None:
-    prefix = "Goal" if preset == "her" else "Sparse"
-    assert load_preset(preset, f"{prefix}Reacher-v5")["env_kwargs"] == {"miss_reward": -1.0}

@@ -1,25 +1,23 @@
-"""From tasks, algorithms and seeds to a list of runs, each with an id made from its content and a folder of its own."""
+"""From tasks, algorithms and seeds to a list of runs, each with an id made from its content and a folder of its own. Tasks and
+variants (named ways of running an algorithm) are parts of a :class:`~sb3_actpc.experiments.runs.Run`."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 from sb3_actpc.demonstrations import fit_demonstrations
-from sb3_actpc.experiments.comparison.variants import (
-    OF_TASKS,
-    OF_VARIANTS,
-    find_variant,
-    parse_variant,
-    part_of_run,
-)
-from sb3_actpc.experiments.runs import Run, resolve
+from sb3_actpc.experiments.runs import ALGORITHMS, Run, resolve
 from sb3_actpc.experiments.runs.environments import check_env_id, make_train_env
 from sb3_actpc.experiments.runs.presets import CAN_BE_NONE, read_yaml
 from sb3_actpc.experiments.runs.schema import MAX_SEED, Count, Schema, Seed, merged
+from sb3_actpc.utils.checks import nearest
 from sb3_actpc.utils.files import folder_name
 
 OWN_KEYS = ("envs", "algos", "seeds", "first_seed", "output")
+PLANNED = {"seed", "progress", "output"}  # what the comparison itself says of each of its runs
+OF_TASKS, OF_VARIANTS = {"env", "task"}, {"algo", "name", "task_prefix"}  # keys of an entry of envs, and of algos
+VARIANTS_FILE = Path(__file__).with_name("variants.yml")
 
 
 class Comparison(Schema):
@@ -35,28 +33,23 @@ class Comparison(Schema):
 
 def read_comparison(given: Mapping[str, Any]) -> Comparison:
     """:param given: ``envs`` (ids, or mappings with ``env`` and other keys of a :class:`~sb3_actpc.experiments.runs.Run`;
-        ``task`` names an entry, for an environment with several sets of demonstrations),
-        ``algos`` (names, or mappings: see :func:`~sb3_actpc.experiments.comparison.variants.parse_variant`), ``seeds``,
-        ``first_seed``, ``output``, and keys of a run that hold for all. Values of None count
-        as not given, but for ``noise_type`` and ``normalize``, where they leave the preset's out
+        ``task`` names an entry, for an environment with several sets of demonstrations), ``algos`` (names, or mappings: see
+        :func:`parse_variant`), ``seeds``, ``first_seed``, ``output``, and keys of a run that hold for all. None counts as not
+        given, but for ``noise_type`` and ``normalize``, where it leaves the preset's out
     :return: the comparison
     :raises ValueError: when a key is unknown or a value is wrong
     """
     given = {str(key): value for key, value in given.items() if value is not None or key in CAN_BE_NONE}
     own = {key: given.pop(key) for key in OWN_KEYS if key in given}
-    shared = part_of_run({"continuable": False, **given}, OWN_KEYS, (*OF_TASKS, *OF_VARIANTS))
+    shared = part_of_run({"continuable": False, **given}, {*OF_TASKS, *OF_VARIANTS}, OWN_KEYS)
     variants = [parse_variant(entry) for entry in _list(own, "algos")]
-    tasks = [_parse_task(entry) for entry in _list(own, "envs")]
-    if not tasks:
-        raise ValueError("no task to compare on: give at least one, such as --envs SparseHopper-v5")
-    if not variants:
-        raise ValueError("no algorithm to compare: give at least one, such as --algos actpc")
-    _check_names([task.task or task.env for task in tasks])
-    _check_names([str(variant.name) for variant in variants])
-    rest = {key: own[key] for key in ("seeds", "first_seed", "output") if key in own}
-    comparison = Comparison(tasks=tuple(tasks), variants=tuple(variants), shared=shared, **rest)
+    tasks = [part_of_run({"env": entry} if isinstance(entry, str) else entry, OF_VARIANTS) for entry in _list(own, "envs")]
+    for names in ([task.task or task.env for task in tasks], [str(variant.name) for variant in variants]):
+        if twice := sorted({name for name in names if names.count(name) > 1}):
+            raise ValueError(f"{twice[0]!r} is given twice: leave one out, or give it another name")
+    comparison = Comparison(tasks=tuple(tasks), variants=tuple(variants), shared=shared, **own)
     if (last := comparison.first_seed + comparison.seeds - 1) > MAX_SEED:
-        raise ValueError(f"the last seed, {last}, must be at most {MAX_SEED}: give fewer seeds, or a smaller first_seed")
+        raise ValueError(f"the last seed, {last}, must be at most {MAX_SEED}")
     return comparison
 
 
@@ -93,13 +86,6 @@ def plan_runs(comparison: Comparison, folder: Path | None = None) -> list[Run]:
     task is unknown."""
     folder = Path(comparison.output) if folder is None else folder
     filled = [_fill(comparison.shared, task, variant) for task in comparison.tasks for variant in comparison.variants]
-    names: dict[tuple[str | None, str], str | None] = {}
-    for run in filled:
-        other = names.setdefault((run.task, run.id), run.name)
-        if other != run.name:
-            raise ValueError(f"{run.task}: {other!r} and {run.name!r} have the same settings: leave one out")
-    for run in {(run.env, repr(run.env_kwargs), run.demonstrations, _limits(run)): run for run in filled}.values():
-        _check_environment(run)
     seeds = range(comparison.first_seed, comparison.first_seed + comparison.seeds)
     seeded = [run.model_copy(update={"seed": seed}) for seed in seeds for run in filled]
     own = [folder / folder_name(str(run.task)) / str(run.name) / f"seed{run.seed}_{run.id}" for run in seeded]
@@ -107,50 +93,70 @@ def plan_runs(comparison: Comparison, folder: Path | None = None) -> list[Run]:
 
 
 def _fill(shared: Run, task: Run, variant: Run) -> Run:
+    """One run, resolved. Keywords and demonstrations that were given for its environment are tried, too: wrong ones are to end
+    the command and not each of its runs."""
     module, colon, name = task.env.rpartition(":")
-    env = f"{module}{colon}{name.replace('Sparse', variant.task_prefix or 'Sparse', 1)}"
-    run = Run(**{**merged(shared, task, variant), "env": env, "task": task.task or task.env, "progress": False})
-    check_env_id(env, run.gym_packages)
+    env_id = f"{module}{colon}{name.replace('Sparse', variant.task_prefix or 'Sparse', 1)}"
+    run = Run(**{**merged(shared, task, variant), "env": env_id, "task": task.task or task.env, "progress": False})
+    check_env_id(env_id, run.gym_packages)
     try:
-        return resolve(run)
+        run = resolve(run)
+        own_demonstrations = run.demonstrations not in ("shipped", "none")
+        if own_demonstrations or run.env_kwargs:
+            with closing(make_train_env(run.env, run.env_kwargs, 1, run.seed)) as env:
+                if own_demonstrations:
+                    fit_demonstrations(run.demonstrations, env, env.observation_space, env.action_space, None, None)
+        return run
     except (ValueError, FileNotFoundError) as error:
-        raise type(error)(f"{task.env}, {variant.name}: {error}") from error
+        raise type(error)(f"{run.task}, {variant.name}: {error}") from error
 
 
-def _check_environment(run: Run) -> None:
-    """Keywords and demonstrations that were given for it: wrong ones are to end the command and not each of its runs."""
-    own_demonstrations = run.demonstrations not in ("shipped", "none")
-    if not (own_demonstrations or run.env_kwargs):
-        return
-    try:
-        with closing(make_train_env(run.env, run.env_kwargs, 1, run.seed)) as env:
-            if own_demonstrations:
-                fit_demonstrations(run.demonstrations, env, env.observation_space, env.action_space, *_limits(run))
-    except ValueError as error:
-        raise ValueError(f"{run.task}: {error}") from error
-
-
-def _limits(run: Run) -> tuple[Any, Any]:
-    return run.settings.get("n_demonstrations"), run.settings.get("n_demonstration_transitions")
-
-
-def _parse_task(entry: Any) -> Run:
-    entry = {"env": entry} if isinstance(entry, str) else entry
-    if not isinstance(entry, Mapping) or "env" not in entry:
-        raise ValueError(f"expected a Gymnasium id or a mapping with env, found {entry!r}")
-    given = {str(key): value for key, value in entry.items()}
-    label = given.pop("task", None)
-    return Run(**merged(part_of_run(given, ("task",), elsewhere=OF_VARIANTS), Run(task=label) if label else Run()))
-
-
-def _list(given: Mapping[str, Any], name: str) -> list[Any]:
-    entries = given.get(name, [])
-    if not isinstance(entries, (list, tuple)):
-        raise ValueError(f"{name} must be a list, found {entries!r}")
+def _list(given: dict[str, Any], name: str) -> list[Any]:
+    entries = given.pop(name, None)
+    if not isinstance(entries, (list, tuple)) or not entries:
+        raise ValueError(f"{name} must be a list of at least one, found {entries!r}: see sb3-actpc list tasks, or algos")
     return list(entries)
 
 
-def _check_names(names: Sequence[str]) -> None:
-    twice = sorted({name for name in names if names.count(name) > 1})
-    if twice:
-        raise ValueError(f"{twice[0]!r} is given twice: leave one out, or give it another name")
+# ---------------------------------------------------------------------- variants
+
+
+def parse_variant(entry: Any) -> Run:
+    """The variant of a name, or of a mapping with some of the keys of :class:`~sb3_actpc.experiments.runs.Run`, where ``base``
+    names the variant that it starts from; ValueError when it is neither, or has an unknown key or a wrong value."""
+    if isinstance(entry, str):
+        return find_variant(entry)
+    if not isinstance(entry, Mapping) or not {"algo", "base"} & entry.keys():
+        raise ValueError(f"expected the name of an algorithm, or a mapping with algo or base, found {entry!r}")
+    own = part_of_run({key: value for key, value in entry.items() if key != "base"}, OF_TASKS)
+    base = find_variant(str(entry["base"])) if "base" in entry else Run(name=own.algo.rpartition(":")[2])
+    return Run(**merged(base, own))
+
+
+def part_of_run(entry: Mapping[str, Any], elsewhere: Iterable[str], also: Sequence[str] = ()) -> Run:
+    """A part of a run from its keys; None counts as not given, but for ``CAN_BE_NONE``. ValueError for an unknown key, with
+    the nearest of the known ones and of ``also``, a wrong value, or a key that is given ``elsewhere`` or is PLANNED."""
+    if not isinstance(entry, Mapping):
+        raise ValueError(f"expected a name or a mapping, found {entry!r}")
+    known = sorted({*also, *Run.known_keys()} - {*PLANNED, *elsewhere})
+    for key, value in entry.items():
+        if key not in known:
+            raise ValueError(f"unknown key {key!r} (={value!r}) here{nearest(str(key), known)}: expected some of {known}")
+    return Run(**{key: value for key, value in entry.items() if value is not None or key in CAN_BE_NONE})
+
+
+def find_variant(name: str, also: Iterable[str] = ()) -> Run:
+    """The variant that goes by a name: of the shipped file, an algorithm's, or ``MODULE:CLASS``. ValueError for another one,
+    which names also those of ``also``."""
+    shipped = read_yaml(VARIANTS_FILE.read_bytes(), str(VARIANTS_FILE))["variants"]
+    if name in shipped:
+        return Run(name=name, **shipped[name])
+    if name in ALGORITHMS or ":" in name:
+        return Run(name=name.rpartition(":")[2], algo=name)
+    names = [*also, *variant_names()]
+    raise ValueError(f"unknown algorithm or variant {name!r}{nearest(name, names)}: expected one of {', '.join(names)}")
+
+
+def variant_names() -> list[str]:
+    """Every name that ``--algos`` takes."""
+    return sorted({*ALGORITHMS, *read_yaml(VARIANTS_FILE.read_bytes(), str(VARIANTS_FILE))["variants"]})

@@ -6,16 +6,15 @@ import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from sb3_actpc.experiments.comparison.execution import ERROR, FINISHED, read_error, run_status
-from sb3_actpc.experiments.report.references import reference_score
-from sb3_actpc.experiments.runs.episode_log import EPISODES
-from sb3_actpc.experiments.runs.evaluation import OF_ACTOR, PROGRESS
+from sb3_actpc.experiments.comparison.schedule import ERROR, FINISHED, read_error, run_status
+from sb3_actpc.experiments.runs.evaluation import EPISODES, OF_ACTOR, PROGRESS
 from sb3_actpc.experiments.runs.record import CONFIG, read_config
 from sb3_actpc.experiments.runs.schema import content_id
 from sb3_actpc.utils.files import atomic_write
@@ -25,7 +24,16 @@ RUN_FOLDER = re.compile(r"seed\d+_[0-9a-f]+")
 MEASURES = ("return", "dense_return", "success", *OF_ACTOR.values())  # columns of progress.csv
 SETTLED = 5000  # the worst evaluation is taken from this step on
 CHOSEN_STEPS = (10_000, 25_000, 50_000)
+# of random actions and of the shipped demonstrations; ``python benchmarks/reference_scores.py`` measures them again
+SCORES_FILE = Path(__file__).with_name("reference_scores.csv")
 _TEXTS = ["task", "env", "variant", "algorithm", "settings", "demonstrations", "status", "version", "commit", "error"]
+
+
+@cache
+def reference_score(env_id: str) -> Any:
+    """A row of ``SCORES_FILE``, of a task with or without a module in its id: ``random_score`` and ``demonstrators_score`` in
+    units of ``measure``, a column of ``progress.csv``; None where none were measured."""
+    return pd.read_csv(SCORES_FILE, index_col="env").dropna().T.get(env_id.rpartition(":")[2])
 
 
 @dataclass(frozen=True)
@@ -49,12 +57,6 @@ class Results:
         runs = self.finished[self.finished["task"] == task].sort_values("seed", kind="stable")
         return {str(name): rows for name, rows in runs.groupby("label")}
 
-    def measure(self, task: str) -> str:
-        """The column of ``curves`` by which a task is compared: dense return, or success where the task is scored so."""
-        env_id = str(self.runs.loc[self.runs["task"] == task, "env"].iloc[0])
-        reference = reference_score(env_id)
-        return "dense_return" if reference is None else reference.measure
-
 
 def load_results(folder: Path, chosen_steps: Sequence[int] = CHOSEN_STEPS) -> Results:
     """Read a comparison's run folders, or the two files that :func:`write_results` left where there are no run folders.
@@ -71,7 +73,7 @@ def load_results(folder: Path, chosen_steps: Sequence[int] = CHOSEN_STEPS) -> Re
     if not folders:
         raise FileNotFoundError(f"no runs in {folder}: make some with sb3-actpc compare --output {folder}")
     names = [path.relative_to(folder).as_posix() for path in folders]
-    curves = [read_rows(path / PROGRESS) for path in folders]
+    curves = [_read_rows(path / PROGRESS) for path in folders]
     rows = [_run_row(path, own, chosen_steps) for path, own in zip(folders, curves, strict=True)]
     named = [own.assign(run=name) for name, own in zip(names, curves, strict=True) if len(own)]
     joined = pd.concat(named, ignore_index=True) if named else pd.DataFrame(columns=["run", "timesteps", *MEASURES])
@@ -81,9 +83,8 @@ def load_results(folder: Path, chosen_steps: Sequence[int] = CHOSEN_STEPS) -> Re
 def _with_steps(runs: pd.DataFrame, curves: pd.DataFrame, chosen_steps: Sequence[int]) -> pd.DataFrame:
     """Add the measures at steps that the file was not written for."""
     columns = [f"{name}_at_{step}" for step in chosen_steps for name in MEASURES]
-    missing = [column for column in columns if column not in runs]
     values = [run_measures(env, curves[curves["run"] == run], chosen_steps) for run, env in runs["env"].items()]
-    return runs.assign(**{column: [one[column] for one in values] for column in missing})
+    return runs.assign(**{column: [one[column] for one in values] for column in columns if column not in runs})
 
 
 def write_results(results: Results, folder: Path) -> list[Path]:
@@ -96,14 +97,11 @@ def write_results(results: Results, folder: Path) -> list[Path]:
     return [folder / RESULTS, folder / CURVES]
 
 
-def read_rows(path: Path) -> pd.DataFrame:
-    """The rows of a CSV file of numbers, NaN where empty. Rows that were not written to their end are left out."""
+def _read_rows(path: Path) -> pd.DataFrame:
+    """The rows of a CSV file of numbers, NaN where empty; one that is not yet written to its end is left out."""
     text = path.read_text(encoding="utf-8") if path.is_file() else ""
     whole = text[: text.rfind("\n") + 1]
-    if not whole.strip():
-        return pd.DataFrame()
-    rows = pd.read_csv(io.StringIO(whole), on_bad_lines="skip").apply(pd.to_numeric, errors="coerce")
-    return rows[rows["timesteps"].notna()] if "timesteps" in rows else rows
+    return pd.read_csv(io.StringIO(whole)).apply(pd.to_numeric, errors="coerce") if whole else pd.DataFrame()
 
 
 def run_measures(env_id: str, curve: pd.DataFrame, chosen_steps: Sequence[int] = CHOSEN_STEPS) -> dict[str, float]:
@@ -116,17 +114,15 @@ def run_measures(env_id: str, curve: pd.DataFrame, chosen_steps: Sequence[int] =
     steps = curve["timesteps"] if len(curve) else pd.Series(dtype=float)
     for name in MEASURES:
         column = curve[name] if name in curve else pd.Series(math.nan, index=curve.index)
-        values[name] = float(column.iloc[-1]) if len(column) else math.nan
-        for step in chosen_steps:
-            at_step = column[steps == step]
-            values[f"{name}_at_{step}"] = float(at_step.iloc[-1]) if len(at_step) else math.nan
+        chosen = {name: column, **{f"{name}_at_{step}": column[steps == step] for step in chosen_steps}}
+        values |= {key: float(rows.iloc[-1]) if len(rows) else math.nan for key, rows in chosen.items()}
         values[f"{name}_worst"] = column[steps >= SETTLED].min()
         values[f"{name}_area"] = area(steps.to_numpy(), column.to_numpy())
     reference = reference_score(env_id)
-    if reference is not None:
-        values["normalized"] = float(reference.normalize(values[reference.measure]))
-    else:
-        values["normalized"] = values["success"]
+    values["normalized"] = values["success"]
+    if reference is not None:  # random actions have 0, the demonstrators 1
+        span = reference.demonstrators_score - reference.random_score
+        values["normalized"] = float((values[reference.measure] - reference.random_score) / span)
     last: Any = curve.iloc[-1] if len(curve) else {}
     values["updates"] = last.get("updates", math.nan)
     values["seconds"] = last.get("seconds", math.nan) - last.get("evaluation_seconds", math.nan)
@@ -143,13 +139,11 @@ def area(steps: np.ndarray, values: np.ndarray) -> float:
 
 def _run_row(folder: Path, curve: pd.DataFrame, chosen_steps: Sequence[int]) -> dict[str, Any]:
     """A row of :class:`Results`' runs. A run that failed before it wrote its settings has little more than a name."""
-    try:
-        config, error = read_config(folder), read_error(folder)
-    except (FileNotFoundError, ValueError) as problem:
-        config, error = {}, read_error(folder) or str(problem)
+    config = read_config(folder) if (folder / CONFIG).is_file() else {}
     task = config.get("task") or folder.parent.parent.name
     env_id = config.get("env") or task
     reference = config.get("demonstrators_return")
+    episodes = _read_rows(folder / EPISODES)
     return {
         "task": task,
         "env": env_id,
@@ -163,12 +157,12 @@ def _run_row(folder: Path, curve: pd.DataFrame, chosen_steps: Sequence[int]) -> 
         "planned_steps": config.get("n_timesteps", 0),
         "eval_episodes": config.get("eval_episodes", 0),
         **run_measures(env_id if reference_score(task) is None else task, curve, chosen_steps),
-        "episodes": len(read_rows(folder / EPISODES)),
+        "episodes": len(episodes),
         "demonstrators_return": math.nan if reference is None else reference,
         "version": dict(config.get("versions", {})).get("sb3-actpc", ""),
         "commit": (config.get("git_commit") or "")[:10],
         "dirty": bool(config.get("dirty")),
-        "error": error,
+        "error": read_error(folder),
     }
 
 

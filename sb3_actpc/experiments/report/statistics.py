@@ -75,3 +75,15 @@ def mean_interval(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarra
         return mean, np.full_like(mean, np.nan), np.full_like(mean, np.nan)
     half = t.ppf((1.0 + CONFIDENCE) / 2.0, n - 1) * values.std(axis=0, ddof=1) / math.sqrt(n)
     return mean, mean - half, mean + half
+
+
+def r_stability(returns: np.ndarray, window: int = 100) -> float:
+    """R-stability of the returns (or successes) of all training episodes in order, (N,): how far the smoothed ones stay from
+    the best, 1/K Σ_i |(W^μ_i - max W) / max W| (arXiv 2209.09174, appendix). W are the last K = ``window``, W^μ_i the mean of
+    the K before the i-th. 0 is perfect; NaN with fewer than 2 K episodes, where one is NaN, and where the best is 0."""
+    last = np.asarray(returns[-2 * window :], dtype=np.float64)
+    best = last[window:].max() if len(last) == 2 * window else 0.0
+    if best == 0.0:
+        return math.nan
+    smoothed = np.lib.stride_tricks.sliding_window_view(last, window)[:-1].mean(axis=1)
+    return float(np.mean(np.abs((smoothed - best) / best)))

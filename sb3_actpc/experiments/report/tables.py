@@ -1,29 +1,32 @@
-"""``report.md``: tables from ``results.csv``, with figures from ``curves.csv.gz``."""
+"""``report.md``: tables from ``results.csv``, and figures: learning curves of each task, and a summary over all of them."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import combinations
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
+from matplotlib.figure import Figure
 
-from sb3_actpc.experiments.report import figures, statistics
-from sb3_actpc.experiments.report.results import CHOSEN_STEPS, MEASURES, Results, load_results, write_results
+from sb3_actpc.experiments.report import statistics
+from sb3_actpc.experiments.report.results import CHOSEN_STEPS, MEASURES, Results, load_results, reference_score, write_results
+from sb3_actpc.experiments.report.statistics import Scores
 from sb3_actpc.utils.files import atomic_write, folder_name
 
 UNDEFINED = "n/a"
+# Okabe and Ito's color-blind safe palette; markers tell curves apart without color
+COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
+MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 
 
-def write_report(
-    folder: Path, target: Path | None = None, steps: Sequence[int] = CHOSEN_STEPS, curves: Sequence[str] = ()
-) -> list[Path]:
+def write_report(folder: Path, target: Path | None = None, steps: Sequence[int] = CHOSEN_STEPS) -> list[Path]:
     """Write ``results.csv``, ``curves.csv.gz``, ``report.md`` and the figures of a comparison.
 
     :param folder: of the comparison, or one that holds its two CSV files
     :param target: where the files go, by default the same folder
     :param steps: the environment steps whose evaluations the tables show
-    :param curves: the variants to draw, at most six; by default the best ones, ActPC among them
     :raises FileNotFoundError: when there are no runs
     """
     target = folder if target is None else target
@@ -32,17 +35,15 @@ def write_report(
     text = [f"# Comparison {folder.name}\n\n{_overview(results.runs)}"]
     for task in results.finished["task"].unique():
         picture = target / f"curves_{folder_name(task)}.png"
-        left_out = figures.draw_curves(results, task, picture, curves)
-        note = f"\n\nNot drawn: {', '.join(left_out)}." if left_out else ""
-        text.append(f"## {task}\n\n![{task}]({picture.name}){note}")
+        draw_curves(results, task, picture)
+        files.append(picture)
+        text.append(f"## {task}\n\n![{task}]({picture.name})")
         for measure, table in task_tables(results, task, steps).items():
             text.append(f"### {measure.replace('_', ' ').capitalize()}\n\n{markdown(table)}")
-        files.append(picture)
-    scores = normalized_scores(results)
-    if scores:
-        figures.draw_summary(scores, target / "summary.png")
+    if scores := _on_every_task(results.finished, "normalized"):
+        draw_summary(scores, target / "summary.png")
         files.append(target / "summary.png")
-        text.append(f"## Across tasks\n\n{markdown(aggregate_table(scores))}\n\n![Across tasks](summary.png)")
+        text.append(f"## Across tasks\n\n{markdown(_aggregate_table(scores))}\n\n![Across tasks](summary.png)")
     improvement = improvement_table(results, steps)
     if len(improvement):
         text.append(f"## Probability of improvement\n\nOf the return on a task drawn at random.\n\n{markdown(improvement)}")
@@ -67,45 +68,30 @@ def task_tables(results: Results, task: str, steps: Sequence[int]) -> dict[str, 
             cells = {title: mean_and_deviation(runs[column].to_numpy(), form) for title, column in columns.items()}
             if any(cell != UNDEFINED for cell in cells.values()):
                 rows.append({"variant": label, **cells})
-        table = pd.DataFrame(rows)
-        tables[measure] = table.loc[:, (table != UNDEFINED).any()]
-    rows = []
-    for label, runs in groups.items():
-        rows.append(
-            {
-                "variant": f"{label} †" if runs["dirty"].any() else label,
-                "seeds": str(len(runs)),
-                "evaluation episodes": ", ".join(str(n) for n in sorted(runs["eval_episodes"].unique())),
-                "seconds": mean_and_deviation(runs["seconds"].to_numpy(), ".0f"),
-            }
-        )
-    return {**{name: table for name, table in tables.items() if len(table)}, "runs": pd.DataFrame(rows)}
-
-
-def normalized_scores(results: Results) -> dict[str, list[np.ndarray]]:
-    """Variant -> its normalized scores, (n_runs,) for each task; only variants that have runs on every scored task."""
-    return _on_every_task(results.finished, "normalized")
-
-
-def returns_at(results: Results, step: int) -> dict[str, list[np.ndarray]]:
-    """Variant -> its returns at a step, (n_runs,) for each task; a run that ended before counts with its last evaluation."""
-    runs = results.finished
-    ended = runs["return"].where(runs["steps"] < step)
-    return _on_every_task(runs.assign(at_step=runs[f"return_at_{step}"].fillna(ended)), "at_step")
+        if rows:
+            table = pd.DataFrame(rows)
+            tables[measure] = table.loc[:, (table != UNDEFINED).any()]
+    tables["runs"] = pd.DataFrame(
+        {
+            "variant": f"{label} †" if runs["dirty"].any() else label,
+            "seeds": str(len(runs)),
+            "evaluation episodes": ", ".join(str(n) for n in sorted(runs["eval_episodes"].unique())),
+            "seconds": mean_and_deviation(runs["seconds"].to_numpy(), ".0f"),
+        }
+        for label, runs in groups.items()
+    )
+    return tables
 
 
 def _on_every_task(runs: pd.DataFrame, column: str) -> dict[str, list[np.ndarray]]:
+    """Variant -> its scores, (n_runs,) for each task; only variants that have runs on every scored task."""
     scored = runs.dropna(subset=[column])
     tasks = sorted(scored["task"].unique())
-    whole = {}
-    for label, own in scored.groupby("label"):
-        parts = [own.loc[own["task"] == task, column].to_numpy() for task in tasks]
-        if all(len(part) for part in parts):
-            whole[str(label)] = parts
-    return whole
+    own = {str(label): rows for label, rows in scored.groupby("label") if rows["task"].nunique() == len(tasks)}
+    return {label: [rows.loc[rows["task"] == task, column].to_numpy() for task in tasks] for label, rows in own.items()}
 
 
-def aggregate_table(scores: dict[str, list[np.ndarray]]) -> pd.DataFrame:
+def _aggregate_table(scores: dict[str, list[np.ndarray]]) -> pd.DataFrame:
     """Interquartile means with 95 % stratified bootstrap intervals."""
     rows = []
     for name, parts in scores.items():
@@ -115,11 +101,12 @@ def aggregate_table(scores: dict[str, list[np.ndarray]]) -> pd.DataFrame:
 
 
 def improvement_table(results: Results, steps: Sequence[int]) -> pd.DataFrame:
-    """Probability that a run of the first variant has a higher return than one of the second, for every pair and step."""
-    rows = []
-    longest = results.finished["steps"].max()
-    for step in sorted({step for step in steps if step <= longest}):
-        scores = returns_at(results, step)
+    """Probability that a run of the first variant has a higher return than one of the second on a task drawn at random, for
+    every pair and step; a run that ended before counts with its last evaluation."""
+    rows, runs = [], results.finished
+    for step in sorted({step for step in steps if step <= runs["steps"].max()}):
+        ended = runs["return"].where(runs["steps"] < step)
+        scores = _on_every_task(runs.assign(at_step=runs[f"return_at_{step}"].fillna(ended)), "at_step")
         for name, other in combinations(scores, 2):
             value, low, high = statistics.probability_of_improvement(scores[name], scores[other])
             rows.append([f"{name} over {other}", f"{step:,}", f"{value:.2f}", interval(low, high, ".2f")])
@@ -154,3 +141,52 @@ def markdown(table: pd.DataFrame) -> str:
     names = [str(name) for name in table.columns]
     lines = [names, ["---"] * len(names), *table.astype(str).to_numpy().tolist()]
     return "\n".join("| " + " | ".join(text.replace("|", "\\|") for text in line) + " |" for line in lines)
+
+
+# ---------------------------------------------------------------------- figures
+
+
+def draw_curves(results: Results, task: str, path: Path) -> None:
+    """Draw means and 95 % intervals over environment steps, at the steps that all seeds of a variant have."""
+    figure = Figure(figsize=(8.0, 4.2), layout="constrained")
+    axes, measure = figure.subplots(), "dense_return"
+    if (reference := reference_score(results.runs.loc[results.runs["task"] == task, "env"].iloc[0])) is not None:
+        measure = reference.measure
+    for index, (label, runs) in enumerate(results.groups(task).items()):
+        rows = results.curves[results.curves["run"].isin(runs.index)]
+        table = rows.pivot(index="timesteps", columns="run", values=measure).dropna()
+        if len(table):
+            _band(axes, table.index.to_numpy(), statistics.mean_interval(table.to_numpy().T), label, index)
+    axes.set(title=task, xlabel="environment steps", ylabel=measure.replace("_", " "))
+    figure.legend(fontsize="small", loc="outside right upper")
+    _save(figure, path)
+
+
+def draw_summary(scores: Mapping[str, Scores], path: Path) -> None:
+    """Interquartile means with 95 % intervals, and performance profiles, of normalized scores."""
+    figure = Figure(figsize=(11.0, 4.2), layout="constrained")
+    bars, profiles = figure.subplots(1, 2)
+    everything = np.concatenate([part for parts in scores.values() for part in parts])
+    thresholds = np.linspace(min(0.0, everything.min()) - 0.05, max(1.0, everything.max()) + 0.05, 60)
+    for index, (name, parts) in enumerate(scores.items()):
+        value, low, high = statistics.interquartile_mean(parts)
+        bars.barh(index, value, height=0.6, color=COLORS[index % len(COLORS)], alpha=0.7)
+        bars.plot([low, high], [index, index], color="black", linewidth=2)
+        _band(profiles, thresholds, statistics.performance_profile(parts, thresholds), name, index)
+    bars.set_yticks(range(len(scores)), list(scores))
+    bars.invert_yaxis()
+    bars.set(xlabel="interquartile mean of the normalized score")
+    profiles.set(xlabel="normalized score", ylabel="fraction of runs above it", ylim=(-0.02, 1.02))
+    _save(figure, path)
+
+
+def _band(axes: Any, x: np.ndarray, values: Any, label: str, index: int) -> None:
+    """A line, and the band between two others around it: (3, n)."""
+    color, marker = COLORS[index % len(COLORS)], MARKERS[index % len(MARKERS)]
+    axes.plot(x, values[0], label=label, color=color, marker=marker, markevery=max(1, len(x) // 8))
+    axes.fill_between(x, values[1], values[2], color=color, alpha=0.15, linewidth=0)
+
+
+def _save(figure: Figure, path: Path) -> None:
+    with atomic_write(path) as image:
+        figure.savefig(image, format="png", dpi=110)

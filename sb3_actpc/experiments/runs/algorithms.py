@@ -31,10 +31,7 @@ ALGORITHMS = {
 }
 # constructor keywords that have an option of their own, or another name
 _OPTION_OF = {
-    "env": "--env",
-    "seed": "--seed",
-    "device": "--device",
-    "demonstrations": "--demonstrations",
+    **{name: f"--{name}" for name in ("env", "seed", "device", "demonstrations")},
     "action_noise": "--set noise_type=normal --set noise_std=0.1",
 }
 
@@ -68,12 +65,10 @@ def default_preset(name: str) -> str | None:
     """The algorithm's own preset; of ``MODULE:CLASS`` that of the class it extends, None where that has none."""
     if name in ALGORITHMS:
         return name
-    bases = [(base.__module__, base.__name__) for base in load_algorithm(name).__mro__]
-    for known, target in ALGORITHMS.items():
-        module, _, class_name = target.partition(":")
-        if any(own.startswith(module) and base == class_name for own, base in bases):
-            return known
-    return None
+    targets = {known: re.split("[.:]", target) for known, target in ALGORITHMS.items()}
+    known_classes = {(parts[0], parts[-1]): known for known, parts in targets.items()}
+    bases = [(base.__module__.partition(".")[0], base.__name__) for base in load_algorithm(name).__mro__]
+    return next((known_classes[base] for base in bases if base in known_classes), None)
 
 
 def check_keywords(algorithm: type[BaseAlgorithm], settings: Mapping[str, Any]) -> None:

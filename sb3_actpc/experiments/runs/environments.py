@@ -2,21 +2,17 @@
 
 import contextlib
 import importlib
-import inspect
 import io
-import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import gymnasium as gym
-from gymnasium.envs.registration import load_env_creator
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecNormalize
 
-from sb3_actpc.envs import ROBOSUITE_IDS, register_envs, sparse_env_id
+from sb3_actpc.envs import ROBOSUITE_IDS, register_envs
 from sb3_actpc.experiments.runs.algorithms import find_in_working_folder
-from sb3_actpc.utils.checks import nearest
-from sb3_actpc.utils.constructors import constructor_keywords
+from sb3_actpc.utils.checks import named_in_errors, nearest
 
 MAX_EVALUATION_ENVS = 10
 
@@ -28,19 +24,7 @@ def make_env(env_id: str, env_kwargs: Mapping[str, Any], render_mode: str | None
     try:
         return gym.make(env_id, **options)
     except TypeError as error:
-        unknown = re.search(r"unexpected keyword argument '(\w+)'", str(error))
-        if unknown is None or unknown[1] not in env_kwargs:
-            raise ValueError(f"{env_id}: {error}") from error
-        known = _keywords(sparse_env_id(env_id.rpartition(":")[2]))
-        hint = f"{nearest(unknown[1], known)}: choose from {', '.join(known)}"
-        raise ValueError(f"{env_id} has no keyword {unknown[1]!r}{hint}") from error
-
-
-def _keywords(env_id: str) -> list[str]:
-    """Of a registered environment: those of its class, or of the function that makes it."""
-    entry: Any = gym.spec(env_id).entry_point
-    made_by: Any = load_env_creator(entry) if isinstance(entry, str) else entry
-    return constructor_keywords(made_by) if isinstance(made_by, type) else list(inspect.signature(made_by).parameters)
+        raise ValueError(f"{env_id}: {error}") from error
 
 
 def make_eval_envs(env_id: str, env_kwargs: Mapping[str, Any], n_episodes: int) -> list[gym.Env[Any, Any]]:
@@ -61,7 +45,8 @@ def make_train_env(
     kind: type[VecEnv] = SubprocVecEnv if in_processes else DummyVecEnv
     arguments = {"env_id": env_id, "env_kwargs": env_kwargs}
     env = make_vec_env(make_env, n_envs=n_envs, seed=seed, env_kwargs=arguments, vec_env_cls=kind)  # type: ignore[arg-type]
-    return env if normalize is None else VecNormalize(env, **normalize)
+    with named_in_errors(f"normalize={normalize}"):
+        return env if normalize is None else VecNormalize(env, **normalize)
 
 
 def register_tasks(env_id: str) -> None:
@@ -76,24 +61,15 @@ def register_tasks(env_id: str) -> None:
 
 def check_env_id(env_id: str, gym_packages: Sequence[str] = ()) -> None:
     """Check that an environment is registered; ids with a module (``module:Name-v0``) are left to ``gymnasium.make``.
-    Modules that register environments are imported first; the working folder is looked in, too. gymnasium.error.Error where
-    it is not, ModuleNotFoundError where a module is missing."""
+    Modules that register environments are imported first, also from the working folder. gymnasium.error.Error where the id is
+    unknown, ModuleNotFoundError where a module is missing."""
     find_in_working_folder()
     for module in [*gym_packages, *env_id.split(":")[:-1]]:
-        try:
-            importlib.import_module(module)
-        except ModuleNotFoundError as error:
-            if error.name != module.partition(".")[0]:  # one that it imports itself
-                raise
-            fix = "run the command in the folder that holds it, or put that into PYTHONPATH"
-            raise ModuleNotFoundError(f"{error}, which is to register an environment: {fix}", name=error.name) from error
+        importlib.import_module(module)
     register_tasks(env_id)
     if ":" not in env_id:
-        own = f"; if a module of yours registers it, name that: MODULE:{env_id}, or --gym-packages MODULE"
-        hint = "" if gym_packages else own
         try:
             gym.spec(env_id)
-        except gym.error.UnregisteredEnv as error:  # it names others itself
-            raise type(error)(f"{error}{hint}") from error
         except gym.error.Error as error:
-            raise gym.error.Error(f"{error}{nearest(env_id, gym.registry)}{hint}") from error
+            hint = f"{nearest(env_id, gym.registry)}; if a module of yours registers it, give MODULE:{env_id}"
+            raise gym.error.Error(f"{error}{hint}") from error

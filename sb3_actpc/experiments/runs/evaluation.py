@@ -1,22 +1,30 @@
-"""Playing whole episodes with a trained policy, and doing so every so often while it is trained."""
+"""Playing whole episodes with a trained policy, and what a training writes as it goes: ``progress.csv``, where it is evaluated
+every so often, and ``episodes.csv``, every episode of the training."""
 
+import csv
+import math
+import pickle
 import time
+import zlib
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from io import BufferedIOBase
 from pathlib import Path
-from typing import Any, Protocol, cast
+from typing import Any, ClassVar, Protocol, cast
 
 import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_actpc.experiments.runs.episode_log import CsvCallback, dense_reward
+from sb3_actpc.experiments.runs.schema import Run
 from sb3_actpc.utils.files import atomic_write
 
 UNTRAINED_EPISODES = 5
-PROGRESS = "progress.csv"
+EVALUATION_SEED_OFFSET = 1_000_000  # the episodes start from other states than the training's
+PROGRESS, EPISODES = "progress.csv", "episodes.csv"
+SUMMARY = ("dense_return", "dense_return_std", "return", "return_std", "success", "episode_length")  # of n episodes
 OF_ACTOR = {"return": "actor_return", "dense_return": "actor_dense_return", "success": "actor_success"}  # columns
 
 
@@ -33,7 +41,7 @@ class NormalizedPredictor:
     """A policy that learned from the observations of SB3's ``VecNormalize``, for those of the bare environment: ``normalize``
     is a function of n of them, (n, obs_dim), or of a dictionary of such."""
 
-    FILE = "normalization.npz"  # in a run's folder
+    FILE = "vecnormalize.pkl"  # in a run's folder, as ``VecNormalize.save`` writes it
 
     def __init__(self, model: Predictor, normalize: Callable[[Any], Any]) -> None:
         self.model, self.normalize = model, normalize
@@ -53,32 +61,17 @@ class NormalizedPredictor:
     def save(cls, model: BaseAlgorithm, folder: Path) -> None:
         """Write the statistics, where there are any, into the run's folder."""
         wrapper = model.get_vec_normalize_env()
-        if wrapper is None or not wrapper.norm_obs:
-            return
-        found: Any = wrapper.obs_rms
-        arrays = {"limit": np.array(wrapper.clip_obs)}
-        for key, statistics in (found if isinstance(found, dict) else {"": found}).items():
-            arrays |= {f"mean{key}": statistics.mean, f"spread{key}": np.sqrt(statistics.var + wrapper.epsilon)}
-        with atomic_write(folder / cls.FILE) as file:
-            np.savez(file, **arrays)
+        if wrapper is not None and wrapper.norm_obs:
+            with atomic_write(folder / cls.FILE) as file:
+                pickle.dump(wrapper, file)
 
     @classmethod
     def wrap_saved(cls, model: Predictor, folder: Path) -> Predictor:
-        """The agent itself, or with the statistics that :meth:`save` wrote into the run's folder."""
+        """The agent itself, or with the statistics that :meth:`save` wrote into the run's folder, which are unpickled."""
         if not (folder / cls.FILE).is_file():
             return model
-        with np.load(folder / cls.FILE, allow_pickle=False) as file:
-            stored = dict(file)
-
-        def normalize(rows: Any, key: str = "") -> Any:
-            if isinstance(rows, dict):
-                return {name: normalize(part, name) for name, part in rows.items()}
-            if f"mean{key}" not in stored:  # VecNormalize was given some of the parts alone
-                return rows
-            limit = stored["limit"]
-            return np.clip((rows - stored[f"mean{key}"]) / stored[f"spread{key}"], -limit, limit).astype(np.float32)
-
-        return cls(model, normalize)
+        with open(folder / cls.FILE, "rb") as file:
+            return cls(model, pickle.load(file).normalize_obs)
 
 
 @dataclass(frozen=True)
@@ -93,15 +86,9 @@ class EpisodeStatistics:
 
     def summary(self) -> dict[str, float | None]:
         """Means and standard deviations over the episodes; ``success`` is None where it is not reported."""
-        success = float(self.successes.mean())
-        return {
-            "dense_return": float(self.dense_returns.mean()),
-            "dense_return_std": float(self.dense_returns.std()),
-            "return": float(self.returns.mean()),
-            "return_std": float(self.returns.std()),
-            "success": None if np.isnan(success) else success,
-            "episode_length": float(self.lengths.mean()),
-        }
+        dense, own = self.dense_returns, self.returns
+        values = (dense.mean(), dense.std(), own.mean(), own.std(), self.successes.mean(), self.lengths.mean())
+        return {name: None if np.isnan(value) else float(value) for name, value in zip(SUMMARY, values, strict=True)}
 
     def failed_after(self) -> dict[str, int]:
         """Farthest stage of the episodes without success -> how many; empty where stages are not reported."""
@@ -137,7 +124,7 @@ def _play_side_by_side(
     playing, episode_start = np.ones((2, len(envs)), dtype=bool)
     state = None
     while playing.any():
-        actions, state = model.predict(stacked(observations), state=state, episode_start=episode_start, deterministic=True)
+        actions, state = model.predict(_stacked(observations), state=state, episode_start=episode_start, deterministic=True)
         episode_start = np.zeros(len(envs), dtype=bool)
         for i in np.flatnonzero(playing):
             observations[i], reward, terminated, truncated, info = envs[i].step(actions[i])
@@ -149,62 +136,129 @@ def _play_side_by_side(
             playing[i] = not (terminated or truncated)
 
 
-def stacked(observations: Sequence[Any]) -> Any:
+def _stacked(observations: Sequence[Any]) -> Any:
     """n observations as one batch: (n, ...), or a dictionary of such."""
     if isinstance(observations[0], dict):
         return {key: np.stack([observation[key] for observation in observations]) for key in observations[0]}
     return np.stack(observations)
 
 
+def dense_reward(info: Mapping[str, Any], otherwise: Any) -> float:
+    """What an environment reports beside its reward; ``otherwise`` where it reports nothing.
+
+    :raises ValueError: for NaN and infinity, of which no mean could be made
+    """
+    reward = info.get("dense_reward", otherwise)
+    if not math.isfinite(reward):
+        name = "info['dense_reward']" if "dense_reward" in info else "reward"
+        raise ValueError(f"environment: {name} is {float(reward)}: check the environment")
+    return float(reward)
+
+
+class CsvCallback(BaseCallback):
+    """Writes rows into a CSV file; a checkpoint keeps those written so far, and the attributes ``kept``."""
+
+    columns: ClassVar[tuple[str, ...]]
+    kept: ClassVar[tuple[str, ...]]
+
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        self.path = path
+
+    def begin_file(self) -> None:
+        """Start the file; not called for a run that goes on from a checkpoint."""
+        with atomic_write(self.path, "w") as file:
+            csv.writer(file, lineterminator="\n").writerow(self.columns)
+
+    def append(self, row: Mapping[str, Any]) -> None:
+        """Write a row, by the names of the columns."""
+        with open(self.path, "a", newline="", encoding="utf-8") as file:
+            csv.DictWriter(file, self.columns, lineterminator="\n").writerow(row)
+
+    def checkpoint_state(self) -> dict[str, Any]:
+        """What a checkpoint keeps."""
+        return {**{name: getattr(self, name) for name in self.kept}, "rows": self.path.read_text(encoding="utf-8")}
+
+    def restore_checkpoint_state(self, state: dict[str, Any]) -> None:
+        """Go on where the checkpoint was taken; rows written after it are dropped, they will be written again."""
+        for name in self.kept:
+            setattr(self, name, state[name])
+        with atomic_write(self.path, "w") as file:
+            file.write(state["rows"])
+
+
+class EpisodeLog(CsvCallback):
+    """Appends a row to ``episodes.csv`` when a training episode ends, exploration noise and all.
+
+    ``return`` is the sum of the environment's rewards, ``dense_return`` that of ``info["dense_reward"]`` (the
+    same again where the environment does not report it), ``success`` is ``info["is_success"]`` at the end (empty where it is
+    not reported), ``timesteps`` and ``seconds`` are those of the training until then. ``actions_crc32`` is the CRC-32 of all
+    actions of the training so far: two runs that have the same number have taken the same actions. ``clock`` gives the seconds
+    that the training has taken so far.
+    """
+
+    columns = ("episode", "timesteps", "seconds", "length", "return", "dense_return", "success", "actions_crc32")
+    kept = ("n_episodes", "dense_returns", "actions")
+
+    def __init__(self, folder: Path, clock: Callable[[], float]) -> None:
+        super().__init__(folder / EPISODES)
+        self.clock = clock
+        self.n_episodes = self.actions = 0
+        self.dense_returns: list[float] = []  # of the running episode of each environment
+
+    def _on_training_start(self) -> None:
+        self.dense_returns = [0.0] * self.training_env.num_envs
+
+    def cut_running_episodes(self) -> None:
+        """The episodes begun will not be finished: a resumed run starts them again."""
+        self.dense_returns = [0.0] * len(self.dense_returns)
+
+    def _on_step(self) -> bool:
+        self.actions = zlib.crc32(np.ascontiguousarray(self.locals["actions"]).tobytes(), self.actions)
+        for index, info in enumerate(self.locals["infos"]):
+            self.dense_returns[index] += dense_reward(info, 0.0)
+            if self.locals["dones"][index]:
+                self._end(info, self.dense_returns[index] if "dense_reward" in info else info["episode"]["r"])
+                self.dense_returns[index] = 0.0
+        return True
+
+    def _end(self, info: dict[str, Any], dense_return: float) -> None:
+        self.n_episodes += 1
+        success = info.get("is_success")
+        row = {
+            "episode": self.n_episodes,
+            "timesteps": self.num_timesteps,
+            "seconds": round(self.clock(), 2),
+            "length": info["episode"]["l"],  # of SB3's Monitor, as the next: before any normalisation
+            "return": round(info["episode"]["r"], 6),
+            "dense_return": round(dense_return, 6),
+            "success": None if success is None else float(success),
+            "actions_crc32": self.actions,
+        }
+        self.append(row)
+
+
 class EvaluationCallback(CsvCallback):
     """Evaluates before the first step (offline methods excepted), then every ``eval_freq`` steps, and at the end.
 
-    Each evaluation starts its episodes from the same seeds, appends a row to ``progress.csv`` and saves
-    ``model.zip`` (written under another name and renamed, so that a stopped run leaves a whole one), where the agent of the
-    best evaluation is to be kept only when no dense return before was higher. ``seconds`` are those
-    since :meth:`begin`, the evaluations' own (``evaluation_seconds``) among them; ``updates`` are the agent's. Where the
-    deployed policy is not the one that learns (ActPC with its gate), the columns ``OF_ACTOR`` are of its moving average.
+    Each evaluation starts its episodes from the same seeds, appends a row to ``progress.csv`` and saves ``model.zip`` (with
+    ``keep="best"`` only where no dense return before was higher). ``seconds`` are those since :meth:`begin`, the evaluations'
+    own (``evaluation_seconds``) among them; ``updates`` are the agent's. Where the deployed policy is not the one that learns
+    (ActPC with its gate), the columns ``OF_ACTOR`` are of its moving average.
 
     :param envs: environments that only this callback uses, closed by their owner
-    :param eval_freq: environment steps between two evaluations, of ``eval_episodes`` each; their first episode is of ``seed``
+    :param run: says when, how long and in which folder
     :param report: given one line of text after each evaluation
-    :param keeps_best: keep the agent of the best evaluation, not that of the last
-    :param target_return: end the training at the first evaluation whose mean dense return reaches it; None for never
     """
 
-    columns = (
-        "timesteps",
-        "updates",
-        "seconds",
-        "evaluation_seconds",
-        "dense_return",
-        "dense_return_std",
-        "return",
-        "return_std",
-        "success",
-        "episode_length",
-        *OF_ACTOR.values(),
-    )
-    kept = ("evaluation_seconds", "best_return", "last_summary", "last_timesteps")
+    columns = ("timesteps", "updates", "seconds", "evaluation_seconds", *SUMMARY, *OF_ACTOR.values())
+    kept = ("evaluation_seconds", "best_return", "last_timesteps")
 
-    def __init__(
-        self,
-        envs: Sequence[gym.Env[Any, Any]],
-        folder: Path,
-        eval_freq: int,
-        eval_episodes: int,
-        seed: int,
-        report: Callable[[str], None],
-        keeps_best: bool = False,
-        target_return: float | None = None,
-    ) -> None:
-        super().__init__(folder / PROGRESS)
-        self.envs, self.folder, self.seed, self.report = envs, folder, seed, report
-        self.eval_freq, self.eval_episodes, self.keeps_best = eval_freq, eval_episodes, keeps_best
-        self.target_return = target_return
+    def __init__(self, envs: Sequence[gym.Env[Any, Any]], run: Run, report: Callable[[str], None]) -> None:
+        super().__init__(run.folder / PROGRESS)
+        self.envs, self.run, self.report = envs, run, report
         self.best_return = -np.inf
         self.evaluation_seconds = 0.0
-        self.last_summary: dict[str, float | None] = {}
         self.last_timesteps = -1
         self._started = time.perf_counter()
 
@@ -218,7 +272,7 @@ class EvaluationCallback(CsvCallback):
         if getattr(model, "is_offline", False):
             self.last_timesteps = 0
         elif not getattr(model, "imitates_first", False):
-            self._evaluate(min(self.eval_episodes, UNTRAINED_EPISODES))
+            self._evaluate(min(self.run.eval_episodes, UNTRAINED_EPISODES))
 
     @property
     def wall_seconds(self) -> float:
@@ -226,7 +280,7 @@ class EvaluationCallback(CsvCallback):
         return time.perf_counter() - self._started
 
     def checkpoint_state(self) -> dict[str, Any]:
-        """What a checkpoint keeps: timers, the last evaluation and the rows written so far."""
+        """What a checkpoint keeps: timers, the best return and the rows written so far."""
         return {**super().checkpoint_state(), "wall_seconds": self.wall_seconds}
 
     def restore_checkpoint_state(self, state: dict[str, Any]) -> None:
@@ -237,36 +291,34 @@ class EvaluationCallback(CsvCallback):
     def _on_rollout_start(self) -> None:
         """Step 0 is what an agent can do before its first one, after its warm start."""
         if self.last_timesteps < 0 and not self.num_timesteps:  # a resumed run has its rows by now
-            self._evaluate()
+            self._evaluate(self.run.eval_episodes)
 
     def _on_step(self) -> bool:
         # at the last step, the update that belongs to it is still to come
         is_last = self.num_timesteps >= self.model._total_timesteps
-        if not is_last and self.num_timesteps - self.last_timesteps >= self.eval_freq:
-            self._evaluate()
-        return self.target_return is None or self.best_return < self.target_return
+        if not is_last and self.num_timesteps - self.last_timesteps >= (self.run.eval_freq or 1):
+            self._evaluate(self.run.eval_episodes)
+        return self.run.target_return is None or self.best_return < self.run.target_return
 
     def _on_training_end(self) -> None:
         if self.last_timesteps != self.num_timesteps:
-            self._evaluate()
+            self._evaluate(self.run.eval_episodes)
 
-    def _evaluate(self, n_episodes: int | None = None) -> None:
+    def _evaluate(self, n_episodes: int) -> None:
         started = time.perf_counter()
-        n_episodes = self.eval_episodes if n_episodes is None else n_episodes
-        statistics = play_episodes(NormalizedPredictor.wrap(self.model), self.envs, n_episodes, self.seed)
-        self.last_summary = statistics.summary()
-        of_actor = self._evaluate_actor(n_episodes)
-        dense_return = float(statistics.dense_returns.mean())
-        if not self.keeps_best or dense_return >= self.best_return:
-            NormalizedPredictor.save(self.model, self.folder)
-            with atomic_write(self.folder / "model.zip") as file:
+        seed = self.run.seed + EVALUATION_SEED_OFFSET
+        summary = play_episodes(NormalizedPredictor.wrap(self.model), self.envs, n_episodes, seed).summary()
+        of_actor = self._evaluate_actor(n_episodes, seed)
+        dense_return = summary["dense_return"] or 0.0
+        if self.run.keep == "last" or dense_return >= self.best_return:
+            NormalizedPredictor.save(self.model, self.run.folder)
+            with atomic_write(self.run.folder / "model.zip") as file:
                 self.model.save(cast(BufferedIOBase, file))
         self.best_return = max(self.best_return, dense_return)
-        now = time.perf_counter()
-        self.evaluation_seconds += now - started
+        self.evaluation_seconds += time.perf_counter() - started
         self.last_timesteps = self.num_timesteps
         row: dict[str, Any] = {
-            **self.last_summary,
+            **summary,
             **of_actor,
             "timesteps": self.num_timesteps,
             "updates": getattr(self.model, "_n_updates", 0),
@@ -275,22 +327,21 @@ class EvaluationCallback(CsvCallback):
         }
         self.append(row)
         for name in ("dense_return", "return", "success"):
-            if self.last_summary[name] is not None:
-                self.logger.record(f"eval/{name}", self.last_summary[name])
+            if summary[name] is not None:
+                self.logger.record(f"eval/{name}", summary[name])
         self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
         self.logger.dump(self.num_timesteps)  # a row of the agent's own figures beside each evaluation
-        summary, success = self.last_summary, self.last_summary["success"]
-        shown = [f"return {summary['dense_return']:9.1f} ± {summary['dense_return_std']:<7.1f}"]
+        shown = f"return {summary['dense_return']:9.1f} ± {summary['dense_return_std']:<7.1f}"
         if not says_one_return(summary):
-            shown = [f"dense {shown[0]}", f"sparse return {summary['return']:7.1f} "]
-        shown += [] if success is None else [f"success {success:.2f}"]
-        self.report(f"step {self.num_timesteps:>8}  {' '.join(shown)}")
+            shown = f"dense {shown} sparse return {summary['return']:7.1f} "
+        success = "" if summary["success"] is None else f" success {summary['success']:.2f}"
+        self.report(f"step {self.num_timesteps:>8}  {shown}{success}")
 
-    def _evaluate_actor(self, n_episodes: int) -> dict[str, float | None]:
+    def _evaluate_actor(self, n_episodes: int, seed: int) -> dict[str, float | None]:
         """The columns ``OF_ACTOR``; none without a deployment gate."""
         agent: Any = self.model
         if getattr(getattr(agent, "actor", None), "deployed", None) is None:
             return {}
         learning = NormalizedPredictor.wrap(agent, agent.actor_policy)
-        summary = play_episodes(learning, self.envs, n_episodes, self.seed).summary()
+        summary = play_episodes(learning, self.envs, n_episodes, seed).summary()
         return {column: summary[name] for name, column in OF_ACTOR.items()}

@@ -12,7 +12,6 @@ import numpy as np
 import yaml
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.utils import LinearSchedule
-from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 
 from sb3_actpc.checkpoints import why_no_checkpoints
@@ -23,7 +22,7 @@ from sb3_actpc.experiments.runs.algorithms import check_keywords, default_preset
 from sb3_actpc.experiments.runs.environments import make_env
 from sb3_actpc.experiments.runs.schema import Run, merged
 from sb3_actpc.utils.arguments import check_settings
-from sb3_actpc.utils.checks import Settings, check_kind, nearest
+from sb3_actpc.utils.checks import Settings, check_kind
 from sb3_actpc.utils.constructors import constructor_keywords
 from sb3_actpc.utils.files import file_hash
 from sb3_actpc.utils.preset_files import preset_path
@@ -35,15 +34,7 @@ _ACTIVATIONS: dict[str, type[nn.Module]] = {"relu": nn.ReLU, "tanh": nn.Tanh, "e
 
 
 class _PlainLoader(yaml.SafeLoader):
-    """YAML 1.1 of plain values, in which ``1e-3`` is a number and no key is given twice, as in YAML 1.2."""
-
-    def compose_mapping_node(self, anchor: Any) -> yaml.MappingNode:
-        node = super().compose_mapping_node(anchor)
-        keys = [(key.tag, key.value) for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
-        for tag, name in keys:
-            if keys.count((tag, name)) > 1:
-                raise ValueError(f"{name!r} is given twice: leave one out")
-        return node
+    """YAML 1.1 of plain values, in which ``1e-3`` is a number, as in YAML 1.2."""
 
 
 _PlainLoader.add_implicit_resolver(
@@ -84,7 +75,6 @@ def resolve(run: Run) -> Run:
     if not run.env:
         raise ValueError("env is missing: give a Gymnasium id, such as SparseHopper-v5")
     algorithm = load_algorithm(run.algo)
-    is_noise_chosen = "noise_type" in {*run.settings, *run.model_fields_set}
     preset_name = run.preset or default_preset(run.algo)
     settings = with_changes({} if preset_name is None else load_preset(preset_name, run.env), run.settings)
     entries = {name: settings.pop(name, None) for name in RUN_KEYS}
@@ -97,21 +87,13 @@ def resolve(run: Run) -> Run:
     check_keywords(algorithm, settings)
     check_settings(algorithm, _parsed(settings))
     getattr(algorithm, "check_installed", lambda: None)()
-    if run.noise_std is not None and run.noise_type is None and not is_noise_chosen:
-        raise ValueError(f"noise_std={run.noise_std} is of no noise: give noise_type=normal too, or leave it out")
-    _check_noise(run, constructor_keywords(algorithm))
+    if run.noise_type is not None and run.noise_std is None:
+        raise ValueError(f"noise_type={run.noise_type!r} needs a standard deviation: give noise_std, such as 0.1")
     eval_freq = run.eval_freq or max(1, run.n_timesteps // 10)
     without = why_no_checkpoints(algorithm)
     if without and run.checkpoint_freq:
         raise ValueError(f"{run.algo} {without}: leave --checkpoint-freq out, or give 0")
     normalize = run.normalize
-    known = [name for name in constructor_keywords(VecNormalize) if name != "venv"]
-    if wrong := sorted(set(normalize or ()) - set(known)):
-        hint = f"{nearest(wrong[0], known)}: choose from {', '.join(known)}"
-        raise ValueError(f"normalize={normalize!r}: VecNormalize has no keyword {wrong[0]!r}{hint}")
-    for name, value in (normalize or {}).items():
-        if name in ("clip_obs", "clip_reward", "gamma", "epsilon") and value != float("inf"):
-            check_kind(f"normalize.{name}", value, float)
     if normalize is not None and "gamma" in settings:
         normalize = {"gamma": settings["gamma"], **normalize}
     filled = {
@@ -156,8 +138,8 @@ def agent_keywords(run: Run, observation_space: gym.Space[Any], action_space: gy
         if activation not in _ACTIVATIONS:
             raise ValueError(f"activation_fn={activation!r} is unknown: choose one of {', '.join(_ACTIVATIONS)}")
         keywords["policy_kwargs"]["activation_fn"] = _ACTIVATIONS[activation]
-    if (demonstrations := demonstrations_of(run)) is not None:
-        keywords["demonstrations"] = demonstrations
+    if takes_demonstrations(run) and (found := find_demonstrations(run.env, run.demonstrations)) is not None:
+        keywords["demonstrations"] = found
     if run.noise_type is not None:
         size = int(np.prod(action_space.shape or (1,)))
         kind = NormalActionNoise if run.noise_type == "normal" else OrnsteinUhlenbeckActionNoise
@@ -184,14 +166,10 @@ def parse_schedule(value: float | str) -> float | LinearSchedule:
     """A learning rate, or as in rl-zoo3 ``"lin_3e-4"``: falling linearly to zero at the end of training."""
     if not isinstance(value, str):
         return value
-    prefix, _, number = value.rpartition("_")
     try:
-        start = float(number)
-    except ValueError:
-        prefix = "wrong"
-    if prefix not in ("", "lin"):
-        raise ValueError(f"learning_rate={value!r} must be a number or lin_<number>, such as lin_3e-4")
-    return LinearSchedule(start, 0.0, 1.0) if prefix else start
+        return LinearSchedule(float(value.removeprefix("lin_")), 0.0, 1.0) if value.startswith("lin_") else float(value)
+    except ValueError as error:
+        raise ValueError(f"learning_rate={value!r} must be a number or lin_<number>, such as lin_3e-4") from error
 
 
 def parse_assignments(assignments: Iterable[str]) -> dict[str, Any]:
@@ -237,16 +215,15 @@ def find_demonstrations(env_id: str, choice: str) -> Path | str | None:
     return shipped_demonstrations(env_id) if env_id.rpartition(":")[2].startswith("Sparse") else None
 
 
-def demonstrations_of(run: Run) -> Path | str | None:
-    """What :func:`find_demonstrations` finds for a run; None for an algorithm without a keyword for demonstrations."""
-    takes_some = "demonstrations" in constructor_keywords(load_algorithm(run.algo))
-    return find_demonstrations(run.env, run.demonstrations) if takes_some else None
+def takes_demonstrations(run: Run) -> bool:
+    """Whether the run's algorithm has a keyword for them."""
+    return "demonstrations" in constructor_keywords(load_algorithm(run.algo))
 
 
 def missing_demonstrations(run: Run) -> str:
     """A sentence where the algorithm would take shipped demonstrations and the task has none, else an empty string."""
-    takes_some = "demonstrations" in constructor_keywords(load_algorithm(run.algo))
-    if run.demonstrations != "shipped" or not takes_some or demonstrations_of(run) is not None:
+    has_some = run.demonstrations != "shipped" or find_demonstrations(run.env, "shipped") is not None
+    if has_some or not takes_demonstrations(run):
         return ""
     return f"{run.env}: no demonstrations are shipped for it, so there are none (--demonstrations FILE gives some)"
 
@@ -255,12 +232,3 @@ def demonstrations_hash(run: Run) -> str | None:
     """SHA-256 of what a run's demonstrations hold, None for none; FileNotFoundError when they are not there."""
     found = find_demonstrations(run.env, run.demonstrations)
     return None if found is None else file_hash(*(minari_files(found) if isinstance(found, str) else [found]))
-
-
-def _check_noise(run: Run, keywords: list[str]) -> None:
-    if run.noise_type is None:
-        return
-    if run.noise_std is None:
-        raise ValueError(f"noise_type={run.noise_type!r} needs a standard deviation: give noise_std, such as 0.1")
-    if "action_noise" not in keywords:
-        raise ValueError(f"{load_algorithm(run.algo).__name__} takes no action noise: leave noise_type and noise_std out")

@@ -7,6 +7,7 @@ A part of a run (an entry of a comparison's file, say) is a :class:`Run` too; :f
 
 import hashlib
 import json
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -20,33 +21,11 @@ VERSION = 2  # of config.json
 MAX_SEED = 2**31 - 1  # other generators get a seed derived from it, which must be below 2**32
 # what decides the outcome of a run, apart from its seed
 CONTENT = (
-    "algo",
-    "env",
-    "env_kwargs",
-    "policy",
-    "n_timesteps",
-    "n_envs",
-    "noise_type",
-    "noise_std",
-    "normalize",
-    "settings",
-    "demonstrations_sha256",
-    "eval_freq",
-    "eval_episodes",
-    "target_return",
-    "keep",
-)
+    "algo env env_kwargs policy n_timesteps n_envs noise_type noise_std normalize settings demonstrations_sha256 eval_freq "
+    "eval_episodes target_return keep"
+).split()
 # what resolve() and the beginning of the training fill in
 FILLED = ("is_resolved", "demonstrations_sha256", "demonstrators_return", "versions", "git_commit", "dirty")
-_MESSAGES = {
-    "greater_than_equal": "must be at least {ge}",
-    "less_than_equal": "must be at most {le}",
-    **dict.fromkeys(("int_type", "int_parsing", "int_from_float"), "must be a whole number"),
-    "finite_number": "must be a finite number",
-    "string_type": "must be a text",
-    "dict_type": "must be a mapping",
-    "literal_error": "must be {expected}",
-}
 
 
 def _number(value: Any) -> Any:
@@ -85,9 +64,7 @@ class Schema(BaseModel):
     @classmethod
     def known_keys(cls) -> list[str]:
         """Every name that a value can be given by."""
-        aliases = [field.validation_alias for field in cls.model_fields.values()]
-        choices = [name for alias in aliases if isinstance(alias, AliasChoices) for name in map(str, alias.choices)]
-        return sorted({*cls.model_fields, *choices} - set(FILLED))
+        return sorted({*cls.model_fields, "steps"} - set(FILLED))
 
 
 class Run(Schema):
@@ -168,15 +145,12 @@ def merged(*parts: Run) -> dict[str, Any]:
     return said
 
 
-def content(record: Mapping[str, Any]) -> dict[str, Any]:
-    """As much of a run's ``config.json`` as decides the outcome; ``keep`` where it is not the default, as ids are older."""
-    known = {name: record[name] for name in CONTENT if record.get(name) is not None}
-    return {name: value for name, value in known.items() if (name, value) != ("keep", "last")}
-
-
 def content_id(record: Mapping[str, Any], seed: int | None = None) -> str:
-    """Ten hex digits from the :func:`content` of a run's ``config.json``; without a seed, an id that all seeds share."""
-    text = json.dumps({**content(record), "seed": seed}, sort_keys=True)
+    """Ten hex digits from what decides the outcome in a run's ``config.json``, ``keep`` where it is not the default; without a
+    seed, an id that all seeds share."""
+    known = {name: record[name] for name in CONTENT if record.get(name) is not None}
+    content = {name: value for name, value in known.items() if (name, value) != ("keep", "last")}
+    text = json.dumps({**content, "seed": seed}, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:10]
 
 
@@ -184,13 +158,7 @@ def _describe(error: ValidationError, known: list[str]) -> str:
     """The first mistake, in one line."""
     first = error.errors()[0]
     key = ".".join(str(part) for part in first["loc"])
-    if first["type"] == "extra_forbidden" and key in known:
-        return f"{key}={first['input']!r} is given under another name too (steps and n_timesteps are one key): leave one out"
     if first["type"] == "extra_forbidden":
         return f"unknown key {key!r}{nearest(key, known)}: expected some of {', '.join(known)}"
-    if first["type"] == "string_pattern_mismatch":
-        return f"{key}={first['input']!r} must be letters, digits and . _ + -: it becomes a folder's"
-    context = first.get("ctx", {})
-    message = _MESSAGES.get(first["type"], first["msg"].removeprefix("Value error, ")).format(**context)
-    names_itself = first["type"] == "value_error" and message.partition("=")[0].isidentifier()  # one of ours
-    return message if names_itself else f"{key}={first['input']!r} {message}"
+    message = re.sub("^(Input|String) should", "must", first["msg"].removeprefix("Value error, "))
+    return message if message.startswith(f"{key}=") else f"{key}={first['input']!r} {message}"

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from sb3_actpc.demonstrations.dataset import Demonstrations
 from sb3_actpc.experiments.runs.evaluation import play_episodes
 from sb3_actpc.utils.extras import import_extra
 
@@ -35,10 +34,10 @@ def choose_gl_backend() -> str | None:
     since MuJoCo cannot be imported with a name that does not work."""
     chosen = os.environ.get("MUJOCO_GL", "")
     for backend in dict.fromkeys(filter(None, (chosen, *GL_BACKENDS))):
-        variables = {"MUJOCO_GL": backend}
-        if backend in GL_BACKENDS:
-            variables["PYOPENGL_PLATFORM"] = backend
-        if _probe(variables):
+        variables = dict.fromkeys(("MUJOCO_GL", *(["PYOPENGL_PLATFORM"] if backend in GL_BACKENDS else [])), backend)
+        with contextlib.suppress(subprocess.SubprocessError):
+            command = [sys.executable, "-c", _PROBE]
+            subprocess.run(command, env={**os.environ, **variables}, capture_output=True, timeout=60, check=True)
             os.environ.update(variables)
             return backend
     os.environ.pop("MUJOCO_GL", None)
@@ -51,30 +50,27 @@ def check_video_path(path: Path) -> None:
         raise ValueError(f"the video must end in .mp4, .gif or .png, found {str(path)!r}")
 
 
+def video_note(*arguments: Any) -> str:
+    """What became of :func:`record_video`, in one line: a machine that cannot render is no error."""
+    try:
+        return f"video of {record_video(*arguments)} frames written to {arguments[3]}"
+    except RenderingUnavailable as error:
+        return f"no video: rendering is not available here ({' '.join(str(error).split())})"
+
+
 def record_video(
-    model: Any,
-    env_id: str,
-    env_kwargs: dict[str, Any],
-    path: Path,
-    seed: int,
-    n_frames: int = MAX_FRAMES,
-    demonstrations: Demonstrations | None = None,
+    model: Any, env_id: str, env_kwargs: dict[str, Any], path: Path, seed: int, n_frames: int = MAX_FRAMES
 ) -> int:
     """Write a video of the first steps, at most ``n_frames``, of an episode with the deterministic policy: the number of
     frames, each (height, width, 3) uint8. The path ends in ``.mp4``, ``.gif``, or ``.png`` for ``STRIP_LENGTH`` pictures side
-    by side, at half the size; ``env_kwargs`` are the environment's, ``width`` and ``height`` in pixels where it takes them. On
-    the right of the agent the first episode of the demonstrations is drawn, where they are given. RenderingUnavailable when
-    rendering does not work here, ValueError when the path has another suffix, or the environment cannot draw demonstrations.
-    """
+    by side, at half the size; ``env_kwargs`` are the environment's, ``width`` and ``height`` in pixels where it takes them.
+    RenderingUnavailable when rendering does not work here, ValueError when the path has another suffix."""
     check_video_path(path)
     imageio = import_extra("imageio.v2", "experiments")
     if path.suffix.lower() == ".mp4":
         import_extra("imageio_ffmpeg", "experiments")
     with _rendering(env_id, env_kwargs) as env:
-        frames: list[Any] = _play(model, env, seed, n_frames)
-        if demonstrations is not None:
-            right = _replay(demonstrations, env, n_frames)
-            frames = [np.hstack(pair) for pair in zip(frames, right, strict=False)]
+        frames = _play(model, env, seed, n_frames)
         frames_per_second = float(env.metadata.get("render_fps", 30))
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}{path.suffix}")  # the suffix tells imageio the format
@@ -129,37 +125,12 @@ def _follow_robot(simulator: Any) -> None:
         renderer.default_cam_config = {"type": mujoco.mjtCamera.mjCAMERA_TRACKING, "trackbodyid": 1}
 
 
-def _replay(demonstrations: Demonstrations, env: Any, n_frames: int) -> list[Any]:
-    """Frames of the first demonstrated episode."""
-    simulator = env.unwrapped
-    if not hasattr(simulator, "demonstrated_positions"):
-        raise ValueError(f"{env.spec.id} cannot draw demonstrations: leave --beside-demonstrator out")
-    end = min(n_frames, int(demonstrations.episode_bounds[0, 1]))
-    frames = []
-    for position in simulator.demonstrated_positions(demonstrations)[:end]:
-        simulator.set_state(position, np.zeros(simulator.model.nv))
-        frames.append(_checked(env.render()))
-    return frames
-
-
 def _play(model: Any, env: Any, seed: int, n_frames: int) -> list[np.ndarray]:
     from gymnasium.wrappers import RenderCollection, TimeLimit
 
     collection = RenderCollection(TimeLimit(env, max(1, n_frames - 1)))
     play_episodes(model, [collection], 1, seed)
-    return [_checked(frame) for frame in collection.render()[:n_frames]]
-
-
-def _checked(frame: Any) -> np.ndarray:
-    if not isinstance(frame, np.ndarray):
-        raise NotImplementedError(f"the environment renders {type(frame).__name__}, not an image")
-    return frame
-
-
-def _probe(variables: dict[str, str]) -> bool:
-    command = [sys.executable, "-c", _PROBE]
-    try:
-        process = subprocess.run(command, env={**os.environ, **variables}, capture_output=True, timeout=60, check=False)
-    except subprocess.TimeoutExpired:
-        return False
-    return process.returncode == 0
+    frames: list[Any] = collection.render()[:n_frames]
+    if not all(isinstance(frame, np.ndarray) for frame in frames):
+        raise NotImplementedError(f"the environment renders {type(frames[0]).__name__}, not an image")
+    return frames

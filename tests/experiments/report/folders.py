@@ -32,18 +32,8 @@ def write_run(
     """A run of 10,000 steps with the given dense returns at ``STEPS``; 12 seconds, 2 of them evaluations."""
     folder = out / folder_name(task) / variant / f"seed{seed}_{abs(hash((variant, seed, str(settings)))):010x}"
     folder.mkdir(parents=True)
-    config = {
-        "algo": "actpc",
-        "env": task,
-        "task": task,
-        "env_kwargs": {},
-        "seed": seed,
-        "n_timesteps": STEPS[-1],
-        "eval_episodes": 20,
-        "settings": settings,
-        "demonstrators_return": 2000.0,
-        "versions": {"sb3-actpc": "0.5.0"},
-    }
+    config = {"algo": "actpc", "env": task, "task": task, "env_kwargs": {}, "seed": seed, "n_timesteps": STEPS[-1]}
+    config |= {"eval_episodes": 20, "settings": settings, "demonstrators_return": 2000.0, "versions": {"sb3-actpc": "0.5.0"}}
     (folder / "config.json").write_text(json.dumps(config), encoding="utf-8")
     progress = {
         "timesteps": STEPS,

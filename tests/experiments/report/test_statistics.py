@@ -1,4 +1,4 @@
-"""Statistics over tasks against hand-worked values, scipy's bootstrap and, where it can be imported, rliable."""
+"""Statistics over tasks against hand-worked values and scipy's bootstrap."""
 
 import math
 
@@ -7,24 +7,16 @@ import pytest
 from scipy import stats
 
 from sb3_actpc.experiments.report import statistics
-from sb3_actpc.experiments.report.references import ReferenceScore, reference_score
 
 SCORES = [np.array([0.1, 0.9, 0.5, 0.3]), np.array([0.7, 0.2, 1.1, 0.6])]
-OTHERS = [np.array([0.2, 0.4, 0.5, 0.1]), np.array([0.9, 0.3, 0.8, 0.7])]
 
 
-def test_the_interquartile_mean_leaves_out_a_quarter_at_either_end() -> None:
-    """Sorted: 0.1 0.2 | 0.3 0.5 0.6 0.7 | 0.9 1.1."""
+def test_estimates_worked_by_hand() -> None:
+    """Sorted: 0.1 0.2 | 0.3 0.5 0.6 0.7 | 0.9 1.1. [1, 2] against [0, 2]: wins 1>0, 2>0, tie 2=2, loss 1<2: 2.5 of 4; [5]
+    against [1, 2]: 2 of 2."""
     assert statistics.interquartile_mean(SCORES)[0] == pytest.approx((0.3 + 0.5 + 0.6 + 0.7) / 4)
-
-
-def test_the_profile_is_the_share_of_runs_above_each_threshold() -> None:
     shares, *_ = statistics.performance_profile(SCORES, np.array([0.0, 0.5, 2.0]))
     assert shares.tolist() == [1.0, 4 / 8, 0.0]
-
-
-def test_probability_of_improvement_counts_pairs_within_a_task_and_ties_by_half() -> None:
-    """[1, 2] against [0, 2]: wins 1>0, 2>0, tie 2=2, loss 1<2: 2.5 of 4. [5] against [1, 2]: 2 of 2. Mean of both."""
     value, *_ = statistics.probability_of_improvement(
         [np.array([1.0, 2.0]), np.array([5.0])], [np.array([0.0, 2.0]), np.array([1.0, 2.0])]
     )
@@ -44,13 +36,9 @@ def test_the_interval_is_that_of_scipys_bootstrap_of_several_samples() -> None:
     assert statistics.interquartile_mean(scores)[1:] == pytest.approx((theirs.low, theirs.high), abs=0.01)
 
 
-def test_the_resampling_keeps_to_each_task() -> None:
+def test_intervals_are_stratified_and_seeded() -> None:
     """Tasks whose runs are all alike leave nothing to resample, however different the tasks."""
-    _, low, high = statistics.interquartile_mean([np.full(4, 0.0), np.full(4, 1.0)])
-    assert low == high == 0.5
-
-
-def test_intervals_are_the_same_every_time_and_follow_the_seed() -> None:
+    assert statistics.interquartile_mean([np.full(4, 0.0), np.full(4, 1.0)])[1:] == (0.5, 0.5)
     assert statistics.interquartile_mean(SCORES) == statistics.interquartile_mean(SCORES)
     assert statistics.interquartile_mean(SCORES) != statistics.interquartile_mean(SCORES, seed=1)
 
@@ -68,30 +56,19 @@ def test_the_interval_over_seeds_is_students() -> None:
     assert (mean[0], low[0], high[0]) == pytest.approx((1.0, 1.0 - 12.706, 1.0 + 12.706), abs=1e-3)
 
 
-def test_against_rliable() -> None:
-    pytest.importorskip("rliable.metrics", exc_type=Exception)
-    from rliable import library, metrics
-
-    joined, others = np.stack(SCORES, axis=1), np.stack(OTHERS, axis=1)  # (n_runs, n_tasks)
-    assert statistics.interquartile_mean(SCORES)[0] == pytest.approx(metrics.aggregate_iqm(joined))
-    assert statistics.probability_of_improvement(SCORES, OTHERS)[0] == pytest.approx(
-        metrics.probability_of_improvement(joined, others)
-    )
-    thresholds = np.linspace(-0.1, 1.2, 14)
-    theirs = [library.run_score_deviation(joined, threshold) for threshold in thresholds]
-    assert statistics.performance_profile(SCORES, thresholds)[0] == pytest.approx(theirs)
-    many = np.random.default_rng(3).normal(0.5, 0.2, (12, 3))
-    _, bounds = library.get_interval_estimates(
-        {"a": many}, lambda scores: np.array([metrics.aggregate_iqm(scores)]), reps=4000, random_state=np.random.RandomState(0)
-    )
-    assert statistics.interquartile_mean(list(many.T))[1:] == pytest.approx(bounds["a"].ravel(), abs=0.015)
-
-
-def test_random_actions_score_nothing_and_the_demonstrators_one() -> None:
-    score = ReferenceScore(random=-10.0, demonstrators=30.0)
-    assert score.normalize(np.array([-10.0, 30.0, 10.0])).tolist() == [0.0, 1.0, 0.5]
-    for task in ("HalfCheetah", "Hopper", "Reacher", "Swimmer", "Walker2d"):
-        committed = reference_score(f"Sparse{task}-v5")
-        assert committed is not None and committed.demonstrators > committed.random
-        assert reference_score(f"sb3_actpc.envs:Sparse{task}-v5") == committed
-    assert reference_score("Unknown-v0") is None
+@pytest.mark.parametrize(
+    ("returns", "expected"),
+    [
+        (np.full(350, -4.0), 0.0),  # always the same
+        (np.tile([0.0, 10.0], 100), 0.5),  # every window has the mean 5, the best is 10: |(5 - 10) / 10|
+        (np.r_[np.full(77, 1e6), np.tile([0.0, 10.0], 100)], 0.5),  # only the last 200 count
+        (np.tile([-8.0, -2.0], 100), 1.5),  # every mean is -5, the best is -2
+        # before the i-th of the last (i = 0 ... 99) lie i ones: the mean of 1 - i / 100
+        (np.r_[np.zeros(100), np.ones(100)], 1.0 - 99 / 200),
+        (np.zeros(300), math.nan),  # the formula divides by the best
+        (np.ones(199), math.nan),
+        (np.full(200, math.nan), math.nan),
+    ],
+)
+def test_r_stability_follows_the_papers_formula(returns: np.ndarray, expected: float) -> None:
+    assert statistics.r_stability(returns) == pytest.approx(expected, nan_ok=True)
