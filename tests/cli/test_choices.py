@@ -17,8 +17,7 @@ from sb3_actpc.checkpoints import TrainingStopped
 from sb3_actpc.cli import main
 from sb3_actpc.demonstrations import Demonstrations
 from sb3_actpc.experiments.runs import Run, finish_run
-from sb3_actpc.experiments.runs.evaluation import dense_reward
-from tests.cli.line import ENV_ID, RUN, rows_of, train
+from tests.cli.line import ENV_ID, rows_of, train
 from tests.experiments.comparison.tasks import StopAt
 from tests.recordings import write_minari
 

@@ -4,6 +4,7 @@ machine or as tasks of a Ray cluster (extra ``ray``)."""
 import json
 import multiprocessing
 import os
+import signal
 import socket
 import threading
 import traceback
@@ -15,7 +16,6 @@ from functools import partial
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from pathlib import Path
-from signal import SIGTERM
 from typing import Any
 
 from sb3_actpc.checkpoints import StopSignals, TrainingStopped
@@ -179,7 +179,7 @@ def _stop_with_the_command() -> None:
     command = multiprocessing.parent_process()
     assert command is not None
     command.join()
-    os.kill(os.getpid(), SIGTERM)
+    os.kill(os.getpid(), signal.SIGTERM)
 
 
 def run_on_ray(
@@ -190,7 +190,9 @@ def run_on_ray(
     node dies goes on elsewhere. ImportError without Ray, ConnectionError when no cluster answers."""
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # sends nothing unless the user asks for it
     ray = import_extra("ray", "ray")
+    handler = signal.getsignal(signal.SIGTERM)  # Ray would put its own in the place of the command's
     ray.init(address=address or "local", log_to_driver=False, include_dashboard=None if address else False)
+    signal.signal(signal.SIGTERM, handler)
     work = ray.remote(num_cpus=threads, max_retries=MAX_LOSSES - 1)(_work_on_node)
     for run in runs:
         run.folder.mkdir(parents=True, exist_ok=True)
