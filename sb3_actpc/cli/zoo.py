@@ -76,7 +76,7 @@ def _arguments(command: str, ours: argparse.Namespace, rest: Sequence[str], fold
     check_env_id(ours.env[0], ours.gym_packages)
     *modules, env_id = ours.env[0].split(":")
     packages = ["--gym-packages", *ours.gym_packages, *modules] if ours.gym_packages or modules else []
-    passed = [*packages, "--algo", ours.algo, "--env", env_id, *rest]
+    passed = [*packages, "--algo", ours.algo, "--env", env_id, "-f", "logs", *rest]
     if command == "enjoy":
         return passed
     if command == "optimize" and ours.algo not in OPTIMIZABLE:
