@@ -8,6 +8,7 @@ their names, and objects by their attributes: the program that reads must have t
 import copyreg
 import functools
 import random
+import sys
 import types
 from collections import Counter, OrderedDict, deque
 from collections.abc import Callable, Mapping, Sequence
@@ -73,8 +74,10 @@ def _name_of(thing: Any) -> str:
 
 
 def _is_plain(value: Any) -> bool:
-    """Whether an object holds nothing but its attributes, by what Python's ``copy`` would do."""
-    if not hasattr(value, "__dict__") or hasattr(value, "__setstate__"):
+    """Whether an object holds nothing but its attributes, by what Python's ``copy`` would do. Those of Python's own library
+    may stand for processes or files."""
+    is_of_python = type(value).__module__.partition(".")[0] in sys.stdlib_module_names
+    if is_of_python or not hasattr(value, "__dict__") or hasattr(value, "__setstate__"):
         return False
     try:
         make, arguments, state, *items = value.__reduce_ex__(2)
