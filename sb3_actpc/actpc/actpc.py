@@ -1,5 +1,6 @@
 """ActPC: active predictive coding as a Stable-Baselines3 algorithm (Ororbia & Mali, arXiv 2209.09174, Algorithm 1)."""
 
+import warnings
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -12,18 +13,12 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
-from sb3_actpc.actpc.base import ActPCBase
+from sb3_actpc.actpc.base import NEED_DEMONSTRATIONS, ActPCBase
+from sb3_actpc.actpc.batches import Batch
 from sb3_actpc.actpc.buffers import SignalReplay, relabels
-from sb3_actpc.actpc.environments import last_observations
-from sb3_actpc.actpc.features import Batch
-from sb3_actpc.actpc.policies import POLICIES, ActPCPolicy
+from sb3_actpc.actpc.policies import POLICIES, ActPCPolicy, check_policy
 from sb3_actpc.actpc.reward_signals import InternalSignals
-from sb3_actpc.actpc.validation import (
-    check_own_learning_rates,
-    check_policy,
-    check_step,
-    warn_of_endless_episodes,
-)
+from sb3_actpc.actpc.validation import check_own_learning_rates, check_step
 from sb3_actpc.demonstrations.dataset import Demonstrations
 from sb3_actpc.demonstrations.recording import ENDLESS
 from sb3_actpc.guidance import ActorGuidance
@@ -43,6 +38,7 @@ from sb3_actpc.utils.arguments import (
     checked,
 )
 from sb3_actpc.utils.checks import Settings, check_finite
+from sb3_actpc.utils.nested import map_observations
 
 # the mean absolute action-value that divides the critic term is at least this: before any reward was seen, the critic's
 # noise must not be scaled up to full strength
@@ -231,16 +227,13 @@ class ActPC(ActPCBase):
         self.guidance = guidance
         self.guidance_kwargs = guidance_kwargs
         self.signals = InternalSignals()
-        self.expert = None
-        self._used_demonstrations: tuple[Any, ...] = ()
-        self._rollout_state = None  # the working memory of the running episodes
-        self._rollout_starts = np.ones(1, dtype=bool)  # (n_envs,), where an episode begins with the next step
-        self._is_stepping = False  # between a choice of actions and the storage of what followed
-        self._described = ""  # what ``learn`` has said
-        self.only_acts = False  # a bundled agent, whose critic is not trained
         if _init_setup_model:
             self._setup_model()
-            check_own_learning_rates(self.policy.kwargs_of, self.lr_schedule(1.0))
+            check_own_learning_rates(self.policy, self.lr_schedule(1.0))
+            needing = [name for name in NEED_DEMONSTRATIONS if getattr(self, name)]
+            if not has_demonstrations and (needing or observation_normalization == "demonstrations"):
+                raise ValueError(f"{' and '.join(needing) or 'observation_normalization'} need demonstrations=")
+            self._setup_demonstrations()
 
     # ------------------------------------------------------------------ collecting (Algorithm 1, lines 8 to 16)
 
@@ -249,16 +242,14 @@ class ActPC(ActPCBase):
     ) -> tuple[np.ndarray, np.ndarray]:
         """As in SB3: actions for the environments, and the same in [-1, 1]."""
         self._restart_if_disturbed()
-        self._is_stepping = True
         is_random = self.num_timesteps < learning_starts
         context = self._context()
         # a_t = f_proj(o_t): the actor, or a circuit that guidance evaluates. The working memory follows random actions too
         if self.policy.memory_history or not is_random:
             assert self._last_obs is not None
-            circuits = self.actor_guidance.acting_circuits(context)
-            actions, self._rollout_state = self.actor.roll_out(
-                self._last_obs, self._rollout_state, self._rollout_starts, circuits
-            )
+            observations, circuits = self.actor.obs_to_tensor(self._last_obs)[0], self.actor_guidance.acting_circuits(context)
+            state, starts = self._rollout_state, self._rollout_starts
+            actions, self._rollout_state = self.actor.roll_out(observations, state, starts, circuits)
         if is_random:
             actions = self.policy.scale_action(np.array([self.action_space.sample() for _ in range(n_envs)]))
         check_finite("actor", "actions", actions, self.num_timesteps)
@@ -291,25 +282,33 @@ class ActPC(ActPCBase):
         if normalize is None:
             observations = self._last_obs
         else:
-            next_observations = normalize.get_original_obs()
-            rewards = normalize.get_original_reward()
-        last = last_observations(next_observations, dones, infos, normalize)
+            next_observations, rewards = normalize.get_original_obs(), normalize.get_original_reward()
+        last: Any = map_observations(np.array, next_observations)
+        for env in np.flatnonzero(dones):
+            terminal = infos[env].get("terminal_observation")
+            if terminal is not None and normalize is not None:
+                terminal = normalize.unnormalize_obs(terminal)
+            if isinstance(terminal, dict):
+                for key in last:
+                    last[key][env] = terminal[key]
+            elif terminal is not None:
+                last[env] = terminal
         # Store (o_t, a_t, r_t, o_t+1), then its signals
         replay_buffer.add(observations, last, buffer_action, rewards, dones, infos)
         if any(self.reward_weights[1:]):
             replay_buffer.store_signals(*self.score_newest())
-        self._last_obs = new_obs
-        self._last_original_obs = next_observations
-        starts = self._rollout_starts
-        self._rollout_starts = np.array(dones, dtype=bool)
-        self._is_stepping = False
+        self._last_obs, self._last_original_obs = new_obs, next_observations
+        starts, self._rollout_starts = self._rollout_starts, np.array(dones, dtype=bool)
         # Guidance counts steps of policies, not random ones
         if self.num_timesteps >= self.learning_starts + self.n_envs:
             self.actor_guidance.on_step(self._context(starts), rewards, dones, self._n_updates)
-        if self.expert is not None and np.any(dones):
-            self.expert.check_scale(replay_buffer.rewards[: replay_buffer.size()])
-        if ENDLESS in replay_buffer.running_lengths:
-            warn_of_endless_episodes(ENDLESS, self.actor_guidance.has_gate, isinstance(replay_buffer, HerReplayBuffer))
+        waits = self.actor_guidance.has_gate or isinstance(replay_buffer, HerReplayBuffer)
+        if waits and ENDLESS in replay_buffer.running_lengths:
+            warnings.warn(
+                f"an episode has gone on for {ENDLESS} steps: the deployment gate and hindsight wait for its end, so set one "
+                "with gymnasium.wrappers.TimeLimit",
+                stacklevel=2,
+            )
 
     # ------------------------------------------------------------------ learning (Algorithm 1, lines 17 to 26)
 

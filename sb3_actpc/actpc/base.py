@@ -1,53 +1,52 @@
-"""What stands between SB3 and Algorithm 1: the agent's parts, demonstrations, batches and what is said of them."""
+"""What stands between SB3 and Algorithm 1: the agent's parts, its demonstrations, its batches, and its files."""
 
-import sys
 import time
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
+from os import PathLike
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.callbacks import BaseCallback, ProgressBarCallback
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import VectorizedActionNoise
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
+from sb3_actpc.actpc.batches import Batch, minibatches, normalized, to_device
 from sb3_actpc.actpc.buffers import SignalReplay, combined_buffer_class
 from sb3_actpc.actpc.demonstration_replay import DemonstrationReplay
 from sb3_actpc.actpc.diagnostics import Diagnostics
-from sb3_actpc.actpc.features import Batch, CircuitInputs, minibatches
-from sb3_actpc.actpc.persistence import NEED_DEMONSTRATIONS, Persistent
 from sb3_actpc.actpc.policies import ActPCActor, ActPCPolicy
 from sb3_actpc.actpc.reward_signals import InternalSignals
 from sb3_actpc.actpc.self_imitation import Episodes, sample_union
-from sb3_actpc.actpc.transfer import to_device
 from sb3_actpc.actpc.validation import (
     check_agreement,
-    check_buffer_kwargs,
-    check_goal_env,
+    check_loaded_buffer,
     check_observations,
     check_own_learning_rates,
-    check_policy_kwargs,
     finite_bounds,
-    warn_of_idle_settings,
 )
+from sb3_actpc.checkpoints import Restored, load_checkpoint
 from sb3_actpc.demonstrations.mixin import LearnsFromDemonstrations
 from sb3_actpc.guidance import ActorGuidance, BehaviorGuidance, GuidanceConfig, GuidanceContext
 from sb3_actpc.guidance.base import ImitationBatch
-from sb3_actpc.utils.arguments import Between
-from sb3_actpc.utils.checks import Settings, check_finite, check_kind, named_in_errors, nearest
-from sb3_actpc.utils.extras import import_extra
+from sb3_actpc.utils.checks import Settings, check_finite, named_in_errors
+from sb3_actpc.utils.rollouts import StoresLastTransition
+from sb3_actpc.utils.weights import load_weights, save_weights
 
 SelfBase = TypeVar("SelfBase", bound="ActPCBase")
 RESCORING_INTERVAL = 1000  # updates between two evaluations of the demonstrations' signals
+NEED_DEMONSTRATIONS = ("demonstration_fraction", "n_demonstrations", "n_demonstration_transitions")
+_OF_POLICY = ("actor", "critic", "generator", "prior", "actor_target", "critic_target")
+_DERIVED = ("expert", "diagnostics", "epistemic", "instrumental", "actor_guidance", "_used_demonstrations", "_described")
 
 
-class ActPCBase(LearnsFromDemonstrations, Persistent):
+class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
     """
-    What stands between SB3 and Algorithm 1: the agent's parts, its demonstrations, and the batches that it learns from.
+    What stands between SB3 and Algorithm 1: the agent's parts, its demonstrations, its batches, and its files.
 
     The attributes are :class:`~sb3_actpc.actpc.actpc.ActPC`'s, whose constructor documents them.
     """
@@ -56,6 +55,7 @@ class ActPCBase(LearnsFromDemonstrations, Persistent):
     policy: ActPCPolicy
     actor: ActPCActor
     replay_buffer: SignalReplay
+    signals: InternalSignals
     settling: str
     guidance: ActorGuidance | str
     guidance_kwargs: Settings | None
@@ -70,10 +70,12 @@ class ActPCBase(LearnsFromDemonstrations, Persistent):
     demonstration_fraction: float
     observation_normalization: str
     prior_updates: int
-    _used_demonstrations: tuple[Any, ...]
-    _described: str
-    _is_stepping: bool
-    only_acts: bool
+    only_acts = False  # a bundled agent, whose critic is not trained
+    expert: DemonstrationReplay | None = None  # the demonstrations, fitted to the environment
+    _used_demonstrations: tuple[Any, ...] = ()
+    _described = ""  # what ``learn`` has said
+    _rollout_state: tuple[np.ndarray, ...] | None = None  # the working memory of the running episodes
+    _rollout_starts: np.ndarray  # (n_envs,), where an episode begins with the next step
 
     @property
     def is_pretrained(self) -> bool:
@@ -92,11 +94,6 @@ class ActPCBase(LearnsFromDemonstrations, Persistent):
         return self.actor.with_circuit(self.actor_guidance.candidate(self._context()))
 
     @property
-    def inputs(self) -> CircuitInputs:
-        """Turns observations into what the circuits see."""
-        return CircuitInputs(self.actor, self._vec_normalize_env)
-
-    @property
     def reward_weights(self) -> tuple[float, float, float]:
         """(α_ext, α_ep, α_in) as used: without demonstrations there is no prior."""
         return self.alpha_ext, self.alpha_ep, 0.0 if self.demonstrations is None else self.alpha_in
@@ -107,50 +104,45 @@ class ActPCBase(LearnsFromDemonstrations, Persistent):
         if self.action_space is None:
             raise ValueError("env=None: an environment or the id of one is needed, such as 'Pendulum-v1'")
         self._check_actions()
-        self._check_agreement()
+        check_agreement(self.alpha_ep, self.optimize_memory_usage, self.bootstrap, self.n_steps)
         self.actor_guidance = make_guidance(self.guidance, self.guidance_kwargs)
         self._setup_lr_schedule()
         self.set_random_seed(self.seed)
         self.policy = self._make_policy().to(self.device)
-        self.actor = self.policy.actor
-        self.critic = self.policy.critic
-        self.generator = self.policy.generator
-        self.prior = self.policy.prior
-        self.actor_target = self.policy.actor_target
-        self.critic_target = self.policy.critic_target
+        self.actor, self.actor_target = self.policy.actor, self.policy.actor_target
+        self.critic, self.critic_target = self.policy.critic, self.policy.critic_target
+        self.generator, self.prior = self.policy.generator, self.policy.prior
         self.diagnostics = Diagnostics(self.policy)
-        self._setup_signals()
-        if self.replay_buffer is None:
-            self.replay_buffer = self._make_replay_buffer()
-        self._convert_train_freq()
-        self._setup_demonstrations()
-
-    def _check_agreement(self) -> None:
-        every = self.train_freq
-        check_agreement(self.alpha_ep, self.optimize_memory_usage, self.bootstrap, self.n_steps, self.n_envs, every)
-
-    def _make_policy(self) -> ActPCPolicy:
-        kwargs = check_policy_kwargs(self.policy_class, self.policy_kwargs, self.settling, self.actor_guidance.has_gate)
-        policy = self.policy_class(self.observation_space, self.action_space, self.lr_schedule, **kwargs)
-        assert isinstance(policy, ActPCPolicy)
-        return policy
-
-    def _setup_signals(self) -> None:
-        """A loaded agent may be given other signals; of the same ones it keeps what their normalizers have seen."""
+        # A loaded agent may be given other signals; of the same ones it keeps what their normalizers have seen
         with named_in_errors(f"signal_kwargs={self.signal_kwargs!r}"):
             signals = InternalSignals(**(self.signal_kwargs or {}))
         if signals.settings != self.signals.settings:
             self.signals = signals
         self.epistemic = signals.epistemic_class(self.policy.generator, self.diagnostics, signals.errors)
         self.instrumental = signals.instrumental_class(self.policy.prior, self.diagnostics, signals.errors)
+        if self.replay_buffer is None:
+            self.replay_buffer = self._make_replay_buffer()
+        self._convert_train_freq()
+
+    def _make_policy(self) -> ActPCPolicy:
+        if "activation_fn" in self.policy_kwargs:
+            raise ValueError(
+                "policy_kwargs has activation_fn: name one, policy_kwargs=dict(circuit_kwargs=dict(activation=...))"
+            )
+        with named_in_errors(f"policy_kwargs={self.policy_kwargs!r}", ValueError):
+            circuit_kwargs = {"settling": self.settling, **(self.policy_kwargs.get("circuit_kwargs") or {})}
+            if circuit_kwargs["settling"] != self.settling:
+                raise ValueError(f"circuit_kwargs has settling={circuit_kwargs['settling']!r}: give settling= to the agent")
+            own = {"circuit_kwargs": circuit_kwargs, "is_gated": self.actor_guidance.has_gate}
+            observed, acted = self.observation_space, self.action_space
+            policy = self.policy_class(observed, acted, self.lr_schedule, **{**self.policy_kwargs, **own})
+        assert isinstance(policy, ActPCPolicy)
+        return policy
 
     def _make_replay_buffer(self) -> SignalReplay:
-        kind = combined_buffer_class(self.replay_buffer_class, self.observation_space, self.n_steps)
+        kind = combined_buffer_class(self.replay_buffer_class, self.observation_space, self.env)
         kwargs: dict[str, Any] = {"history": self.policy.memory_history, "n_steps": self.n_steps, "gamma": self.gamma}
-        check_buffer_kwargs(kind, self.replay_buffer_kwargs, kwargs)
         if issubclass(kind, HerReplayBuffer):
-            assert self.env is not None, "You must pass an environment when using `HerReplayBuffer`"  # as SB3 does
-            check_goal_env(kind, self.env, self.observation_space)
             kwargs["env"] = self.env
         # SB3 checks by assertion what does not go together
         where = f"buffer_size={self.buffer_size}, replay_buffer_kwargs={self.replay_buffer_kwargs!r}"
@@ -167,15 +159,15 @@ class ActPCBase(LearnsFromDemonstrations, Persistent):
             )
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
-        """As in SB3. Returns of another environment are dropped; ValueError where demonstrations do not fit."""
+        """As in SB3. Returns of another environment are dropped; the next ``learn`` fits the demonstrations to it."""
         super().set_env(env, force_reset)
         self.actor_guidance.forget_returns()
+        self.expert = None
         if self.replay_buffer is not None:
             self.replay_buffer.forget_own_episodes()
         if isinstance(self.replay_buffer, HerReplayBuffer):
             assert self.env is not None
             self.replay_buffer.env = self.env  # whose rewards relabelled transitions get
-        self._setup_demonstrations()
 
     # ------------------------------------------------------------------ demonstrations
 
@@ -183,104 +175,58 @@ class ActPCBase(LearnsFromDemonstrations, Persistent):
         """
         Fit the demonstrations to the environment, and the observation normalizer to them or to the bounds.
 
-        :raises ValueError: for demonstrations that do not fit, for settings that need some
+        :raises ValueError: for demonstrations that do not fit
         """
-        self.expert = None
         self._used_demonstrations = self.demonstrations, self.n_demonstrations, self.n_demonstration_transitions
-        is_trained = self.is_pretrained or self.num_timesteps > 0
-        if self.demonstrations is None:
-            self._drop_demonstrations(is_trained)
-        elif self.env is not None or not isinstance(self.observation_space, spaces.Dict):  # a goal task: in ``set_env``
-            try:
-                demonstrations = self._fitted_demonstrations()
-                self.expert = DemonstrationReplay(
-                    demonstrations, self.observation_space, self.action_space, self.policy.memory_history
-                )
-            except (FileNotFoundError, ImportError, ValueError) as error:
-                if not is_trained:
-                    raise
-                # a trained agent acts without them; ``learn`` says what is missing
-                if self.env is not None and not isinstance(error, FileNotFoundError):
-                    kind = ImportError if isinstance(error, ImportError) else ValueError
-                    raise kind(f"{error}. A trained agent can do without: demonstrations=None") from error
-        self._fit_normalizer()
-
-    def _drop_demonstrations(self, is_trained: bool) -> None:
-        """A trained agent keeps what it has learned from demonstrations; another one needs them for its settings."""
-        needing = [name for name in NEED_DEMONSTRATIONS if getattr(self, name)]
-        if self.observation_normalization == "demonstrations":
-            needing.append("observation_normalization")
-        if needing and not is_trained:
-            raise ValueError(f"{' and '.join(needing)} need demonstrations=; pass a file or leave them out")
-        self.demonstration_fraction = 0.0
-        self.n_demonstrations = None
-        self.n_demonstration_transitions = None
-
-    def _fit_normalizer(self) -> None:
-        """An actor that has imitated keeps the statistics of its demonstrations."""
-        normalizer = self.actor.normalizer
-        inputs = self.inputs
+        self.expert = None
+        if self.demonstrations is not None:
+            observed, acted = self.observation_space, self.action_space
+            self.expert = DemonstrationReplay(self._fitted_demonstrations(), observed, acted, self.policy.memory_history)
+        # An actor that has imitated keeps the statistics of its demonstrations
+        normalizer, extractor = self.actor.normalizer, self.actor.features_extractor
+        is_normalised = self._vec_normalize_env is not None and bool(self._vec_normalize_env.norm_obs)
+        parts: Any = ()
         if self.observation_normalization == "bounds":
-            bounds = finite_bounds(self.observation_space, inputs.are_normalised)
-            normalizer.begin()
-            normalizer.fit(inputs.features(inputs.observations(bounds)))
+            parts = [finite_bounds(self.observation_space, is_normalised)]
         elif self.observation_normalization == "demonstrations" and self.expert is not None and not self.is_pretrained:
-            normalizer.begin()
-            if not inputs.are_normalised:
-                normalizer.fit(self.expert.features(inputs))
+            parts = [] if is_normalised else self.expert.parts()
+        if not isinstance(parts, tuple):
+            seen = [self.actor.extract_features(to_device(part, self.device), extractor) for part in parts]
+            normalizer.fit(th.cat(seen) if seen else None)
 
     def _update_demonstrations(self) -> None:
-        """
-        Use demonstrations that were set since. A prior and a normalizer that have learned stay as they are.
-
-        :raises ValueError: when they do not fit, or are not there
-        """
-        if isinstance(self.demonstrations, Path):  # which one system could not unpickle from another
-            self.demonstrations = str(self.demonstrations)
-        if self.demonstrations is not None and self._used_demonstrations[0] is None and self.guidance == "none":
-            warnings.warn(
-                "demonstrations were set after the agent was made without: guidance='none' "
-                f"(no BC pre-training), n_steps={self.n_steps} and demonstration_fraction={self.demonstration_fraction:g} "
-                "stay. For the defaults with demonstrations, pass demonstrations= to the constructor",
-                stacklevel=5,
-            )
+        """Use demonstrations that were set since. A prior and a normalizer that have learned stay as they are."""
         now = self.demonstrations, self.n_demonstrations, self.n_demonstration_transitions
-        if self.expert is None or any(mine is not used for mine, used in zip(now, self._used_demonstrations, strict=True)):
+        if self.expert is None or any(mine is not used for mine, used in zip(now, self._used_demonstrations, strict=False)):
             self._setup_demonstrations()
-        if self.expert is None and self.demonstrations is not None:
-            raise ValueError(
-                f"no demonstrations file at {self.demonstrations}, and learning needs it: put it back, or set "
-                "agent.demonstrations"
-            )
         # one discount and one length of returns for what is replayed and what is demonstrated, of a loaded buffer too
         self.replay_buffer.set_returns(self.n_steps, self.gamma)
-        memory = self.replay_buffer.self_imitation
-        if memory is not None:
+        if (memory := self.replay_buffer.self_imitation) is not None:
             memory.takes_all = self.actor_guidance.stores == "positive" and self.expert is not None
-        imitates = self.is_pretrained and self.refresh_weight > 0
-        warn_of_idle_settings(self.demonstrations is not None, imitates, (self.alpha_ext, self.alpha_ep, self.alpha_in))
+        if self.demonstrations is None:
+            self.demonstration_fraction, self.n_demonstrations, self.n_demonstration_transitions = 0.0, None, None
+        if self.demonstrations is None and self.is_pretrained and self.refresh_weight:
+            warnings.warn(
+                "the agent was taught by demonstrations and goes on without them: pass demonstrations=", stacklevel=5
+            )
+        if self.demonstrations is None and self.alpha_in:
+            warnings.warn(f"alpha_in={self.alpha_in:g} has no effect without demonstrations=", stacklevel=5)
 
-    def pretrain(self, progress_bar: bool = False) -> None:
+    def pretrain(self) -> None:
         """
         Train the prior on the demonstrations and let guidance start, once; ``learn`` calls this.
-
-        :param progress_bar: show one
         """
-        expert = self.expert
+        expert, env = self.expert, self._vec_normalize_env
         if expert is not None:
-            if not self.is_pretrained:
-                self._fit_normalizer()
+            if not self.is_pretrained and env is not None and env.norm_obs:
+                warnings.warn("VecNormalize's statistics drift while the circuits learn: use norm_obs=False", stacklevel=3)
                 self._show_to_vec_normalize(expert)
             # without a weight the prior has no role
             n_updates = self.prior_updates - int(self.policy.n_prior_updates) if self.alpha_in else 0
             batch_size = self.policy.batch_sizes(self.batch_size)["prior"]
             self.policy.set_learning_rate(self.lr_schedule(1.0))
-            seconds = 0.1 if sys.stderr.isatty() else 5.0  # between two drawings: a file or a notebook keeps them all
-            updates: Iterable[int] = range(n_updates)
-            if progress_bar and n_updates > 0:
-                updates = import_extra("tqdm", "experiments").tqdm(updates, "prior", mininterval=seconds)
-            for _ in updates:
-                batch = expert.sample(batch_size, self.inputs, self.reward_weights, self.gamma)
+            for _ in range(n_updates):
+                batch = expert.sample(batch_size, self.actor, env, self.reward_weights, self.gamma)
                 self.instrumental.update(batch.features, batch.actions, batch.next_features, batch.memory)
                 self.policy.n_prior_updates.add_(1)
         # BC is of demonstrations: an agent without does not imitate its own episodes first
@@ -291,14 +237,7 @@ class ActPCBase(LearnsFromDemonstrations, Persistent):
     def _show_to_vec_normalize(self, expert: DemonstrationReplay) -> None:
         """VecNormalize's statistics take in the demonstrations: they have seen one observation else."""
         normalize = self._vec_normalize_env
-        if normalize is None or not normalize.norm_obs:
-            return
-        warnings.warn(
-            "VecNormalize's observation statistics drift under what is learned now, and those of the demonstrations "
-            "(observation_normalization) are not used: use VecNormalize(norm_obs=False)",
-            stacklevel=3,
-        )
-        if normalize.training:
+        if normalize is not None and normalize.training:
             expert.show_to(normalize)
             if self._last_original_obs is not None:
                 self._last_obs = normalize.normalize_obs(self._last_original_obs)
@@ -314,19 +253,15 @@ class ActPCBase(LearnsFromDemonstrations, Persistent):
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
     ) -> SelfBase:
-        """As in SB3, after BC pre-training (:meth:`pretrain`) where there are demonstrations; ValueError for a bad number of
-        environment steps, and where something that was set since does not fit."""
+        """As in SB3, after BC pre-training (:meth:`pretrain`) where there are demonstrations; ValueError where something that
+        was set since does not fit."""
         if self.only_acts:
             raise ValueError("a bundled agent comes without its critic and only acts: train a new agent, ActPC(...)")
-        check_kind("total_timesteps", total_timesteps, float)
-        Between(0)("total_timesteps", total_timesteps)
         try:
-            super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+            return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
         except BaseException:
-            if self._is_stepping:  # a transition was lost: the next ``learn`` resets the environments
-                self._last_obs = None
+            self._last_obs = None  # a transition may be lost: the next ``learn`` resets the environments
             raise
-        return self
 
     def _setup_learn(
         self,
@@ -336,9 +271,15 @@ class ActPCBase(LearnsFromDemonstrations, Persistent):
         tb_log_name: str = "run",
         progress_bar: bool = False,
     ) -> tuple[int, BaseCallback]:
-        self._check_agreement()
-        check_own_learning_rates(self.policy.kwargs_of, self.lr_schedule(1.0))
-        self._continue_episodes(reset_num_timesteps)
+        check_agreement(self.alpha_ep, self.optimize_memory_usage, self.bootstrap, self.n_steps)
+        check_own_learning_rates(self.policy, self.lr_schedule(1.0))
+        # Running episodes are cut where SB3 resets the environments, or someone else has stepped in them since
+        if self.is_disturbed:
+            self._last_obs = None
+        if isinstance(self.action_noise, VectorizedActionNoise) and self.action_noise.n_envs != self.n_envs:
+            self.action_noise = self.action_noise.base_noise  # of a loaded agent; SB3 makes it one for each environment
+        if reset_num_timesteps or self._last_obs is None:
+            self._cut_running_episodes()
         total_timesteps, callback = super()._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )
@@ -347,7 +288,7 @@ class ActPCBase(LearnsFromDemonstrations, Persistent):
         if self.verbose and self._described != self.describe():
             self._described = self.describe()
             print(self._described, flush=True)
-        self.pretrain(has_progress_bar(callback))
+        self.pretrain()
         self.start_time = time.time_ns()  # of the frames per second: pre-training has none
         return total_timesteps, callback
 
@@ -357,15 +298,6 @@ class ActPCBase(LearnsFromDemonstrations, Persistent):
         self._rollout_starts = np.ones(self.n_envs, dtype=bool)
         self.replay_buffer.cut_running_episodes()
         self.actor_guidance.on_reset()
-
-    def _continue_episodes(self, reset_num_timesteps: bool) -> None:
-        """Running episodes are cut where SB3 resets the environments, or someone else has stepped in them since."""
-        if self.is_disturbed:
-            self._last_obs = None
-        if isinstance(self.action_noise, VectorizedActionNoise) and self.action_noise.n_envs != self.n_envs:
-            self.action_noise = self.action_noise.base_noise  # of a loaded agent; SB3 makes it one for each environment
-        if reset_num_timesteps or self._last_obs is None:
-            self._cut_running_episodes()
 
     def _context(self, episode_starts: np.ndarray | None = None) -> GuidanceContext:
         """What guidance may use of this agent."""
@@ -380,60 +312,55 @@ class ActPCBase(LearnsFromDemonstrations, Persistent):
 
     def imitated_episodes(self) -> list[Episodes]:
         """What refresh draws from: the demonstrations and the self-imitation memory M^actor."""
-        parts: list[Episodes] = []
+        memory, parts = self.replay_buffer.self_imitation, []
         if self.expert is not None:
             parts.append(self.expert.episodes)
-        memory = self.replay_buffer.self_imitation
         if memory is not None and memory.episodes is not None:
             parts.append(memory.episodes)
         return parts
 
     def sample_imitated(self, n: int) -> ImitationBatch:
         """Features (n, n_features), actions (n, A) and working memory of ``n`` imitated steps."""
-        inputs = self.inputs
         samples = sample_union(self.imitated_episodes(), n, self.policy.memory_history, self.actor_guidance.weighting)
-        arrays = inputs.normalized(samples.observations), samples.actions.astype(np.float32, copy=False)
-        observations, actions = to_device(arrays, inputs.device)
-        memory = inputs.memory(*inputs.past(samples.history, samples.history_mask))
-        return inputs.features(observations), actions, memory
+        seen, past = (normalized(part, self._vec_normalize_env) for part in (samples.observations, samples.history))
+        arrays = seen, samples.actions.astype(np.float32, copy=False), past, samples.history_mask
+        observations, actions, history, mask = to_device(arrays, self.device)
+        past = self.actor.past_features(history, mask)
+        memory = None if past is None or self.actor.memory is None else self.actor.memory(past)
+        return self.actor.features(observations), actions, memory
 
     def score_newest(self) -> tuple[np.ndarray, np.ndarray]:
         """Generator and prior settle on the newest transitions: r^ep and r^in as they are stored (lines 10, 12 and 13),
         (n_envs,) each."""
-        newest = self.replay_buffer.newest_transitions()
-        inputs = self.inputs
-        features = inputs.features(inputs.observations(newest.observations))
-        next_features = inputs.features(inputs.observations(newest.next_observations))
-        memory = inputs.memory(*inputs.past(newest.history, newest.history_mask))
-        raw = self.raw_signals(features, inputs.tensor(newest.actions), next_features, memory)
+        newest = self.replay_buffer.sample(self.n_envs, self._vec_normalize_env, None, n_newest=self.n_envs)
+        raw = self.raw_signals(Batch.of(newest, newest.rewards, self.actor))
         epistemic, instrumental = self.signals.score(*raw, *self.reward_weights[1:])
         check_finite("generator", "signals", epistemic, self.num_timesteps)
         check_finite("prior", "signals", instrumental, self.num_timesteps)
         self.diagnostics.follow(epistemic_signal=epistemic.mean(), instrumental_signal=instrumental.mean())
         return raw if self.signals.normalization == "sampled" else (epistemic, instrumental)
 
-    def raw_signals(
-        self, features: th.Tensor, actions: th.Tensor, next_features: th.Tensor, memory: th.Tensor | None
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def raw_signals(self, batch: Batch) -> tuple[np.ndarray, np.ndarray]:
         """r̂^ep and r̂^in of transitions, (B,) each; zeros where the signal has no weight."""
         _, alpha_ep, alpha_in = self.reward_weights
-        epistemic, instrumental = np.zeros((2, len(features)), dtype=np.float32)
+        scored = batch.features, batch.actions, batch.next_features, batch.memory
+        epistemic, instrumental = np.zeros((2, len(batch.features)), dtype=np.float32)
         if alpha_ep:
-            epistemic = self.epistemic.score(features, actions, next_features, memory).cpu().numpy()
+            epistemic = self.epistemic.score(*scored).cpu().numpy()
         if alpha_in:
-            instrumental = self.instrumental.score(features, actions, next_features, memory).cpu().numpy()
+            instrumental = self.instrumental.score(*scored).cpu().numpy()
         return epistemic, instrumental
 
     def sample_batches(self, n_batches: int, batch_size: int) -> Iterator[Batch]:
         """Minibatches of replayed transitions, the newest in each, then the share that comes from the demonstrations."""
         if n_batches < 1:
             return iter(())
-        expert, inputs, weights = self.expert, self.inputs, self.reward_weights
+        expert, actor, env = self.expert, self.actor, self._vec_normalize_env
+        weights, normalizers = self.reward_weights, self.signals.replayed if any(self.reward_weights[1:]) else None
         # Now and then the signals of demonstrated transitions are computed anew, by the present generator
-        has_signals = any(weights[1:])
-        if expert is not None and self.demonstration_fraction and has_signals:
+        if expert is not None and self.demonstration_fraction and normalizers is not None:
             if self._n_updates % RESCORING_INTERVAL == 1 or not expert.has_signals:
-                expert.rescore(self.raw_signals, inputs, self.signals.rescored)
+                expert.rescore(self.raw_signals, self.signals.rescored, actor, env)
         # Replayed transitions of all minibatches at once
         sizes = self.policy.batch_sizes(batch_size)
         del sizes["prior"]
@@ -441,14 +368,17 @@ class ActPCBase(LearnsFromDemonstrations, Persistent):
         n_demonstrated = 0 if expert is None else round(self.demonstration_fraction * largest)
         n_newest = self.replay_buffer.n_newest(largest - n_demonstrated)
         n_drawn = n_newest + n_batches * (largest - n_demonstrated - n_newest)
-        normalizers = self.signals.replayed if has_signals else None
-        samples = self.replay_buffer.sample(n_drawn, self._vec_normalize_env, normalizers, n_newest)
-        replayed = inputs.replayed(samples, weights, self.gamma)
+        samples = self.replay_buffer.sample(n_drawn, env, normalizers, n_newest)
+        if not weights[1]:  # nobody predicts one step
+            samples = samples._replace(following_observations=None)
+        signals = weights[1] * samples.epistemic + weights[2] * samples.instrumental
+        replayed = Batch.of(samples, weights[0] * samples.rewards + signals, actor)
         self.diagnostics.rewards(self._n_updates, n_batches, self.policy_delay, replayed.rewards, samples.rewards, weights[0])
         # Demonstrated transitions likewise
         demonstrated = None
         if expert is not None and n_demonstrated:
-            demonstrated = expert.sample(n_demonstrated * n_batches, inputs, weights, self.gamma, self.n_steps, normalizers)
+            how = actor, env, weights, self.gamma, self.n_steps, normalizers
+            demonstrated = expert.sample(n_demonstrated * n_batches, *how)
         # circuits with a smaller batch take its first rows: the newest, then a fair mixture of the rest
         is_shuffled = min(sizes.values()) < largest
         return minibatches(replayed, demonstrated, n_batches, n_newest, is_shuffled)
@@ -485,31 +415,127 @@ class ActPCBase(LearnsFromDemonstrations, Persistent):
             f"demonstrations: {demonstrations}\n{self.actor_guidance.describe()}\noff: {off}"
         )
 
+    # ------------------------------------------------------------------ files
+
+    def set_parameters(self, *args: Any, **kwargs: Any) -> None:
+        """As in SB3. Returns of the deployed policy say nothing of another one, and a circuit's own learning
+        rate is a setting, not a parameter."""
+        groups = [group for circuit in self.policy.circuits().values() for group in circuit.optimizer.param_groups]
+        scales = [group["lr_scale"] for group in groups]
+        super().set_parameters(*args, **kwargs)
+        groups = [group for circuit in self.policy.circuits().values() for group in circuit.optimizer.param_groups]
+        for group, scale in zip(groups, scales, strict=True):
+            group["lr_scale"] = scale
+        self.actor_guidance.forget_returns()
+
+    def checkpoint_state(self) -> dict[str, Any]:
+        """What a checkpoint (:mod:`sb3_actpc.checkpoints`) keeps beside SB3's state: plain values and arrays."""
+        expert = self.expert
+        return {
+            "rollout_state": self._rollout_state,
+            "rollout_starts": self._rollout_starts,
+            "signals": self.signals.checkpoint_state(),
+            "expert_signals": None if expert is None else [expert.epistemic, expert.instrumental, expert.has_signals],
+            "diagnostics": dict(self.diagnostics.values),
+            "guidance": self.actor_guidance.state_dict(),
+        }
+
+    def restore_checkpoint_state(self, state: dict[str, Any]) -> None:
+        """
+        :param state: what :meth:`checkpoint_state` returned
+        :raises ValueError: when it was taken with other demonstrations
+        """
+        stored = state["expert_signals"]
+        n_stored, n_present = 0 if stored is None else len(stored[0]), 0 if self.expert is None else len(self.expert)
+        if n_stored != n_present:
+            raise ValueError(
+                f"the checkpoint's agent has {n_stored} demonstrated transitions, this one {n_present}: pass the same "
+                "demonstrations="
+            )
+        if self.expert is not None:
+            self.expert.epistemic, self.expert.instrumental, self.expert.has_signals = stored
+        self._rollout_state, self._rollout_starts = state["rollout_state"], state["rollout_starts"]
+        self.signals.restore_checkpoint_state(state["signals"])
+        self.diagnostics.values = dict(state["diagnostics"])
+        self.actor_guidance.load_state_dict(state["guidance"])
+
+    @classmethod
+    def load_checkpoint(cls, path: str | PathLike[str], env: GymEnv | str, **keywords: Any) -> Restored:
+        """
+        Go on from a checkpoint: see :func:`sb3_actpc.checkpoints.load_checkpoint` and ``continue_learning`` there.
+
+        :param path: a checkpoint, or the folder of several: the newest whole one is taken
+        :param env: an environment made as the stopped run's
+        :param keywords: constructor keywords that replace the stored ones, such as ``demonstrations``
+        """
+        return load_checkpoint(cls, path, env, **keywords)
+
+    @classmethod
+    def pretrained(cls, env_id: str, env: GymEnv | None = None, **keywords: Any) -> "ActPCBase":
+        """
+        A trained agent that comes with the package, to act: see :func:`sb3_actpc.pretrained.load_pretrained`.
+
+        :param env_id: the environment that it was trained on, such as ``SparseReacher-v5``
+        :param env: an environment with the same spaces; by default one is made from the id
+        :param keywords: constructor keywords that replace the stored ones
+        :raises ValueError: when no agent comes with the package for this environment
+        """
+        from sb3_actpc.pretrained import load_pretrained  # it imports the agent
+
+        return load_pretrained(env_id, env, **keywords)
+
+    def load_replay_buffer(self, path: Any, truncate_last_traj: bool = True) -> None:
+        """
+        As in SB3, which unpickles: load files that you trust.
+
+        :raises ValueError: for a buffer of another algorithm, number of environments or shapes; the agent keeps its own
+        """
+        given = self.replay_buffer
+        super().load_replay_buffer(path, truncate_last_traj)
+        loaded, self.replay_buffer = self.replay_buffer, given
+        check_loaded_buffer(path, loaded, isinstance(loaded, SignalReplay), self)
+        loaded.history = self.policy.memory_history
+        self.replay_buffer = loaded
+        self._last_obs = None  # its running episodes are not the agent's: the next ``learn`` resets the environments
+
+    def save_weights(self, path: str | PathLike[str]) -> Path:
+        """
+        Write weights and settings into a file that cannot run code: see :func:`sb3_actpc.utils.weights.save_weights`.
+
+        :param path: file to write; ``.safetensors`` is added where it is missing
+        :return: the file
+        """
+        return save_weights(self, path)
+
+    @classmethod
+    def from_weights(cls: type[SelfBase], path: str | PathLike[str], env: GymEnv | str, **keywords: Any) -> SelfBase:
+        """
+        An agent from a file of :meth:`save_weights`: see :func:`sb3_actpc.utils.weights.load_weights`.
+
+        :param path: the file
+        :param env: the environment, or its id
+        :param keywords: constructor keywords that replace the stored ones; ``demonstrations`` are not in the file
+        """
+        without = () if keywords.get("demonstrations") is not None else (*NEED_DEMONSTRATIONS, "observation_normalization")
+        return load_weights(cls, path, env, without=without, **keywords)
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), *_OF_POLICY, *_DERIVED]
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        names = [name if name != "actor" else "actor.circuit" for name in self.policy.circuits()]
+        learned = [name for name in ("epistemic", "instrumental") if isinstance(getattr(self, name), th.nn.Module)]
+        return ["policy", *(f"policy.{name}.optimizer" for name in names), *learned], []
+
 
 def make_guidance(given: ActorGuidance | str, settings: Settings | None) -> ActorGuidance:
     """:raises ValueError: for another name, or keywords that the guidance has not"""
-    if isinstance(given, ActorGuidance):
-        if settings:
-            raise ValueError(f"guidance_kwargs={settings!r} are for guidance='default': set up the ActorGuidance itself")
-        return given
-    if given not in ("default", "none"):
+    if given not in ("default", "none") and not isinstance(given, ActorGuidance):
         raise ValueError(f"guidance={given!r} must be None, 'default', 'none' or an ActorGuidance")
-    known = GuidanceConfig.names()
-    for name in settings or {}:
-        if name not in known:
-            raise ValueError(f"guidance_kwargs has {name!r}{nearest(name, known)}; choose from {known}")
-    config = GuidanceConfig(**(settings or {}))
-    if given == "default":
-        return BehaviorGuidance(config)
-    if settings:
-        warnings.warn(
-            f"guidance_kwargs={settings!r} have no effect without guidance, which is on with demonstrations= or "
-            "guidance='default'",
-            stacklevel=4,
-        )
-    return ActorGuidance()
-
-
-def has_progress_bar(callback: BaseCallback) -> bool:
-    """Whether a progress bar is among them, asked for by ``progress_bar`` or given."""
-    return isinstance(callback, ProgressBarCallback) or any(map(has_progress_bar, getattr(callback, "callbacks", ())))
+    with named_in_errors(f"guidance_kwargs={settings!r}", ValueError):
+        config = GuidanceConfig(**(settings or {}))
+    if settings and given != "default":
+        warnings.warn(f"guidance_kwargs={settings!r} have no effect without guidance='default'", stacklevel=4)
+    if isinstance(given, ActorGuidance):
+        return given
+    return BehaviorGuidance(config) if given == "default" else ActorGuidance()

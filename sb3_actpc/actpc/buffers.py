@@ -1,76 +1,23 @@
 """Replay buffers: combined experience replay, the two internal signals, self-imitation and rebuilt working memory."""
 
 import warnings
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
-from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
+from sb3_actpc.actpc.batches import Observations, SignalReplaySamples, to_device
 from sb3_actpc.actpc.reward_signals import STORED, Normalize
-from sb3_actpc.actpc.self_imitation import Observations, SelfImitationMemory, TensorObservations
-from sb3_actpc.actpc.transfer import to_device
-from sb3_actpc.actpc.validation import check_buffer_class, check_n_steps
+from sb3_actpc.actpc.self_imitation import SelfImitationMemory
 from sb3_actpc.utils.arguments import Between, Share, Size, checked
 from sb3_actpc.utils.checks import LARGEST_SIZE
 from sb3_actpc.utils.nested import map_observations
 
 OWN_TRANSITIONS = 100_000  # that the self-imitation memory keeps, of a buffer that keeps more
-
-
-class NewestTransitions(NamedTuple):
-    """The last transition of every environment, in numpy and not normalised.
-
-    :param observations: (n_envs, *obs_shape), or a dict of such
-    :param actions: (n_envs, A), scaled to [-1, 1]
-    :param next_observations: as ``observations``
-    :param history: the observations before, (n_envs, H, *obs_shape), oldest first; None without a working memory
-    :param history_mask: (n_envs, H), 1 where there was such an observation, or None
-    """
-
-    observations: Observations
-    actions: np.ndarray
-    next_observations: Observations
-    history: Observations | None
-    history_mask: np.ndarray | None
-
-
-class SignalReplaySamples(NamedTuple):
-    """SB3's replay samples with what ActPC keeps beside them. B transitions, the newest of every environment first.
-
-    :param observations: (B, *obs_shape), or a dict of such
-    :param actions: (B, A), scaled to [-1, 1]
-    :param next_observations: as ``observations``; with n-step returns those at the end of the n steps
-    :param dones: (B, 1), 1 where the episode truly ended (a time limit does not count)
-    :param rewards: (B, 1), the task's part alone (normalised or relabelled where asked for)
-    :param discounts: (B, 1) with n-step returns, else None
-    :param epistemic: (B, 1), the generator's signal, summed over n steps like the rewards
-    :param instrumental: (B, 1), the prior's signal, likewise
-    :param history: the observations before each transition in its episode, (B, H, *obs_shape), oldest first; None without
-        a working memory
-    :param history_mask: (B, H), 1 where there was such an observation, or None
-    :param following_observations: with n-step returns, those one step on; None where that is ``next_observations``
-    :param next_history: with n-step returns and a working memory, the observations before ``next_observations``, as
-        ``history``; else None
-    :param next_history_mask: likewise
-    """
-
-    observations: TensorObservations
-    actions: th.Tensor
-    next_observations: TensorObservations
-    dones: th.Tensor
-    rewards: th.Tensor
-    discounts: th.Tensor | None
-    epistemic: th.Tensor
-    instrumental: th.Tensor
-    history: TensorObservations | None
-    history_mask: th.Tensor | None
-    following_observations: TensorObservations | None = None
-    next_history: TensorObservations | None = None
-    next_history_mask: th.Tensor | None = None
 
 
 class SignalReplay(ReplayBuffer):
@@ -111,7 +58,7 @@ class SignalReplay(ReplayBuffer):
         if self_imitation_size is None:
             self_imitation_size = min(OWN_TRANSITIONS, self.buffer_size * self.n_envs)
         self.self_imitation = SelfImitationMemory(self_imitation_size) if self_imitation_size else None
-        self._lengths = np.zeros(self.n_envs, dtype=np.int64)  # of the running episodes
+        self.running_lengths = np.zeros(self.n_envs, dtype=np.int64)  # (n_envs,), steps of the running episodes
 
     # ------------------------------------------------------------------ storing
 
@@ -121,20 +68,10 @@ class SignalReplay(ReplayBuffer):
         """As SB3's: store a transition of every environment. Its signals are 0 until :meth:`store_signals`."""
         super().add(obs, next_obs, action, reward, done, infos)
         self.store_signals(0.0, 0.0)
-        self._lengths += 1
+        self.running_lengths += 1
         for env in np.flatnonzero(done):
             self._offer_episode(int(env))
-            self._lengths[env] = 0
-
-    def newest_transitions(self) -> NewestTransitions:
-        """The last transition of every environment, as it is stored: n_envs rows of each part."""
-        envs = np.arange(self.n_envs)
-        rows = np.full(self.n_envs, self.newest)
-        past, mask = self._past_at(rows, envs)
-        observations = self._observations_at(rows, envs, None)
-        return NewestTransitions(
-            observations, self.actions[rows, envs], self._next_observations_at(rows, envs, None), past, mask
-        )
+            self.running_lengths[env] = 0
 
     def store_signals(self, epistemic: np.ndarray | float, instrumental: np.ndarray | float) -> None:
         """Both signals of the newest transitions, (n_envs,) each."""
@@ -143,7 +80,7 @@ class SignalReplay(ReplayBuffer):
 
     def _offer_episode(self, env: int) -> None:
         """Copy the episode that has just ended into the self-imitation memory, if it is good enough and all there."""
-        length = int(self._lengths[env])
+        length = int(self.running_lengths[env])
         if self.self_imitation is None or length > self.buffer_size - int(self.optimize_memory_usage):
             return
         rows = (self.newest + 1 + np.arange(-length, 0)) % self.buffer_size
@@ -151,11 +88,6 @@ class SignalReplay(ReplayBuffer):
         if self.self_imitation.takes(length, episode_return):
             observations = map_observations(lambda ring: ring[rows, env], self.observations)
             self.self_imitation.store(observations, self.actions[rows, env].astype(np.float32), episode_return)
-
-    @property
-    def running_lengths(self) -> np.ndarray:
-        """(n_envs,), steps of the running episodes."""
-        return self._lengths
 
     @property
     def can_sample(self) -> bool:
@@ -169,7 +101,7 @@ class SignalReplay(ReplayBuffer):
 
     def cut_running_episodes(self) -> None:
         """The environments were reset in mid-episode: nothing bootstraps, sums or remembers across the cut."""
-        self._lengths[:] = 0
+        self.running_lengths[:] = 0
         if self.full or self.pos > 0:
             cut = self.dones[self.newest] == 0
             self.dones[self.newest, cut] = 1.0
@@ -177,15 +109,14 @@ class SignalReplay(ReplayBuffer):
 
     def reset(self) -> None:
         super().reset()
-        self._lengths[:] = 0
+        self.running_lengths[:] = 0
 
     def set_returns(self, n_steps: int, gamma: float) -> None:
-        """
-        :param n_steps: length of the returns that are sampled
-        :param gamma: their discount
-        :raises ValueError: for several steps where they cannot be had
-        """
-        check_n_steps(n_steps, relabels(type(self)), self.optimize_memory_usage)
+        """Length and discount of the returns that are sampled; ValueError for several steps where they cannot be had."""
+        if n_steps > 1 and (relabels(type(self)) or self.optimize_memory_usage):
+            raise ValueError(
+                f"n_steps={n_steps} does not work with hindsight relabelling or optimize_memory_usage=True: use 1"
+            )
         self.n_steps, self.gamma = n_steps, gamma
 
     def forget_own_episodes(self) -> None:
@@ -198,11 +129,11 @@ class SignalReplay(ReplayBuffer):
     def checkpoint_state(self) -> dict[str, Any]:
         """What a checkpoint keeps beside the arrays with a row per step: episodes begun and the self-imitation memory."""
         memory = None if self.self_imitation is None else self.self_imitation.checkpoint_state()
-        return {"lengths": self._lengths.copy(), "self_imitation": memory}
+        return {"lengths": self.running_lengths.copy(), "self_imitation": memory}
 
     def restore_checkpoint_state(self, state: dict[str, Any]) -> None:
         """:param state: what :meth:`checkpoint_state` returned"""
-        self._lengths[:] = state["lengths"]
+        self.running_lengths[:] = state["lengths"]
         if self.self_imitation is not None and state["self_imitation"] is not None:
             self.self_imitation.restore_checkpoint_state(state["self_imitation"])
 
@@ -229,10 +160,11 @@ class SignalReplay(ReplayBuffer):
         newest = np.arange(self.n_newest(batch_size) if n_newest is None else n_newest)
         if 0 < len(newest) < self.n_envs:
             newest = np.random.permutation(self.n_envs)[: len(newest)]
-        rows, envs = self._draw(batch_size - len(newest))
-        rows = np.concatenate([np.full(len(newest), self.newest), rows])
-        envs = np.concatenate([newest, envs])
-        return self._relabel(self._gather(rows, envs, env, rewards_of), rows, envs, len(newest), env)
+        rows, envs = np.full(len(newest), self.newest), newest
+        if len(newest) < batch_size:
+            drawn = self._draw(batch_size - len(newest))
+            rows, envs = np.concatenate([rows, drawn[0]]), np.concatenate([envs, drawn[1]])
+        return self._relabel(self.gather(rows, envs, env, rewards_of), rows, envs, len(newest), env)
 
     def _relabel(
         self, batch: SignalReplaySamples, rows: np.ndarray, envs: np.ndarray, n_newest: int, env: VecNormalize | None
@@ -249,24 +181,24 @@ class SignalReplay(ReplayBuffer):
         ages = np.random.randint(skipped, self.buffer_size, size=n)
         return (self.pos + ages) % self.buffer_size, np.random.randint(0, self.n_envs, size=n)
 
-    def _gather(
+    def gather(
         self,
         rows: np.ndarray,
         envs: np.ndarray,
-        env: VecNormalize | None,
+        env: VecNormalize | None = None,
         rewards_of: tuple[Normalize, Normalize] | None = STORED,
     ) -> SignalReplaySamples:
-        window, last, mask = rows[:, None], rows, None
+        """The transitions at (B,) rows and environments; the others as for :meth:`sample`."""
+        window, last, mask = self._n_step_window(rows, envs)
         history, history_mask = self._history_at(rows, envs, env)
-        next_history: tuple[Any, Any] = (None, None)
-        if self.n_steps > 1:
-            window, last, mask = self._n_step_window(rows, envs)
-            next_history = self._history_at(last, envs, env, including=True)
+        next_history, next_history_mask = (
+            self._history_at(last, envs, env, including=True) if self.n_steps > 1 else (None, None)
+        )
         epistemic = instrumental = np.zeros((len(rows), 1), dtype=np.float32)
         if rewards_of is not None:
             epistemic = self._summed(self.epistemic, window, envs, mask, rewards_of[0])
             instrumental = self._summed(self.instrumental, window, envs, mask, rewards_of[1])
-        one_step_on = mask is not None and rewards_of is not None
+        one_step_on = self.n_steps > 1 and rewards_of is not None
         samples: Any = SignalReplaySamples  # of arrays
         arrays = samples(
             observations=self._observations_at(rows, envs, env),
@@ -274,14 +206,14 @@ class SignalReplay(ReplayBuffer):
             next_observations=self._next_observations_at(last, envs, env),
             dones=(self.dones[last, envs] * (1 - self.timeouts[last, envs])).reshape(-1, 1),
             rewards=self._summed(self.rewards, window, envs, mask, lambda rewards: self._normalize_reward(rewards, env)),
-            discounts=None if mask is None else self.gamma ** mask.sum(1, keepdims=True),
+            discounts=self.gamma ** mask.sum(1, keepdims=True),
             epistemic=epistemic,
             instrumental=instrumental,
             history=history,
             history_mask=history_mask,
             following_observations=self._next_observations_at(rows, envs, env) if one_step_on else None,
-            next_history=next_history[0],
-            next_history_mask=next_history[1],
+            next_history=next_history,
+            next_history_mask=next_history_mask,
         )
         return to_device(arrays, th.device(self.device))
 
@@ -293,8 +225,8 @@ class SignalReplay(ReplayBuffer):
             return self._observations_at((rows + 1) % self.buffer_size, envs, env)
         return self._normalize_obs(map_observations(lambda array: array[rows, envs], self.next_observations), env)
 
-    def _past_at(
-        self, rows: np.ndarray, envs: np.ndarray, including: bool = False
+    def _history_at(
+        self, rows: np.ndarray, envs: np.ndarray, env: VecNormalize | None, including: bool = False
     ) -> tuple[Observations | None, np.ndarray | None]:
         """The ``history`` observations before each row in its episode, (B, H, *obs_shape), oldest first, and which of them
         exist, (B, H); None and None without a history.
@@ -310,17 +242,7 @@ class SignalReplay(ReplayBuffer):
         earlier = (rows[:, None] - steps_back) % self.buffer_size
         unbroken = exists & ((steps_back == 0) | (self.dones[earlier, envs[:, None]] == 0))
         mask = np.flip(np.logical_and.accumulate(np.flip(unbroken, axis=1), axis=1), axis=1).astype(np.float32)
-        return map_observations(lambda ring: ring[earlier, envs[:, None]], self.observations), mask
-
-    def _history_at(
-        self, rows: np.ndarray, envs: np.ndarray, env: VecNormalize | None, including: bool = False
-    ) -> tuple[Observations | None, np.ndarray | None]:
-        """:meth:`_past_at`, normalised."""
-        past, mask = self._past_at(rows, envs, including)
-        if past is None or mask is None:
-            return None, None
-        flat = map_observations(lambda array: array.reshape(-1, *array.shape[2:]), past)
-        return map_observations(lambda one: one.reshape(*mask.shape, *one.shape[1:]), self._normalize_obs(flat, env)), mask
+        return self._observations_at(earlier, envs[:, None], env), mask
 
     def _n_step_window(self, rows: np.ndarray, envs: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The rows of each n-step window, the last that counts, and which do, (B, n_steps), (B,) and (B, n_steps)."""
@@ -331,26 +253,15 @@ class SignalReplay(ReplayBuffer):
         return window, window[np.arange(len(rows)), mask.sum(1).astype(int) - 1], mask
 
     def _summed(
-        self,
-        values: np.ndarray,
-        window: np.ndarray,
-        envs: np.ndarray,
-        mask: np.ndarray | None,
-        normalize: Normalize,
+        self, values: np.ndarray, window: np.ndarray, envs: np.ndarray, mask: np.ndarray, normalize: Normalize
     ) -> np.ndarray:
-        """``values`` at a window's one row, or their discounted sum over longer ones, each normalised first, (B, 1)."""
+        """The discounted sum of ``values`` over each window, each normalised first, (B, 1)."""
         normalized = normalize(values[window, envs[:, None]])
-        if mask is None:
-            return normalized
         return (normalized * mask * self.gamma ** np.arange(self.n_steps, dtype=np.float32)).sum(1, keepdims=True)
 
 
 class CombinedReplayBuffer(SignalReplay):
     """ActPC's replay buffer for Box observations; see :class:`SignalReplay`."""
-
-
-class CombinedNStepReplayBuffer(SignalReplay, NStepReplayBuffer):
-    """The same as SB3's n-step class: chosen for ``n_steps`` above 1."""
 
 
 class CombinedDictReplayBuffer(SignalReplay, DictReplayBuffer):  # type: ignore[misc]
@@ -402,7 +313,7 @@ class CombinedHerReplayBuffer(SignalReplay, HerReplayBuffer):  # type: ignore[mi
         return goals
 
     def cut_running_episodes(self) -> None:
-        self._lengths[:] = 0
+        self.running_lengths[:] = 0
         if (self._current_ep_start != self.pos).any():
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # SB3 recommends an option that ``learn`` does not have
@@ -428,7 +339,7 @@ class CombinedHerReplayBuffer(SignalReplay, HerReplayBuffer):  # type: ignore[mi
 
 _COUNTERPARTS: dict[type[ReplayBuffer], type[SignalReplay]] = {
     ReplayBuffer: CombinedReplayBuffer,
-    NStepReplayBuffer: CombinedNStepReplayBuffer,
+    NStepReplayBuffer: CombinedReplayBuffer,
     DictReplayBuffer: CombinedDictReplayBuffer,
     HerReplayBuffer: CombinedHerReplayBuffer,
 }
@@ -442,24 +353,27 @@ def relabels(given: Any) -> bool:
 
 
 def combined_buffer_class(
-    given: type[ReplayBuffer] | str | None, observation_space: spaces.Space, n_steps: int = 1
+    given: type[ReplayBuffer] | str | None, observation_space: spaces.Space, env: VecEnv | None
 ) -> type[SignalReplay]:
-    """ActPC's counterpart of ``given``: a class of SB3's, its name, or None; ValueError for a class without one."""
-    if isinstance(given, str):
-        if given not in _BY_NAME:
-            raise ValueError(f"replay_buffer_class={given!r} is unknown; choose one of {list(_BY_NAME)}")
-        given = _BY_NAME[given]
-    check_n_steps(n_steps, relabels(given))
-    check_buffer_class(given, observation_space)
-    if given is None and isinstance(observation_space, spaces.Dict):
-        return CombinedDictReplayBuffer
-    if given is None:
-        return CombinedNStepReplayBuffer if n_steps > 1 else CombinedReplayBuffer
-    if issubclass(given, SignalReplay):
-        return given
-    if given in _COUNTERPARTS:
-        return _COUNTERPARTS[given]
-    raise ValueError(
-        f"replay_buffer_class={given.__name__} does not keep ActPC's signals; pass None, one of "
-        f"{[c.__name__ for c in _COUNTERPARTS]} or a subclass of {[c.__name__ for c in set(_COUNTERPARTS.values())]}"
-    )
+    """
+    ActPC's counterpart of a class of SB3's.
+
+    :param given: a class, its name, or None
+    :param observation_space: the environment's
+    :param env: the environment
+    :raises ValueError: for a class without a counterpart, or for other observations
+    """
+    has_parts = isinstance(observation_space, spaces.Dict)
+    kind: Any = _BY_NAME.get(given, given) if isinstance(given, str) else given
+    if kind is None:
+        kind = DictReplayBuffer if has_parts else ReplayBuffer
+    if isinstance(kind, type):
+        kind = _COUNTERPARTS.get(kind, kind)
+    if not (isinstance(kind, type) and issubclass(kind, SignalReplay)):
+        raise ValueError(f"replay_buffer_class={given!r} must be None, one of {list(_BY_NAME)} or a subclass of ActPC's own")
+    if issubclass(kind, DictReplayBuffer) != has_parts:
+        raise ValueError(f"replay_buffer_class={given!r} does not keep observations of {observation_space}: leave it out")
+    has_goals = isinstance(observation_space, spaces.Dict) and "desired_goal" in observation_space.spaces
+    if relabels(kind) and not (has_goals and env is not None and env.has_attr("compute_reward")):
+        raise ValueError(f"replay_buffer_class={given!r} needs a goal environment with compute_reward (GoalEnv)")
+    return kind

@@ -5,7 +5,7 @@ from typing import Any
 import torch as th
 
 from sb3_actpc.actpc.policies import ActPCPolicy
-from sb3_actpc.ngc import CoupledState, HebbianChanges, NGCCircuit, SettledState, policy_gradient
+from sb3_actpc.ngc import CoupledState, HebbianChanges, SettledState, policy_gradient
 
 INTERVAL = 100  # updates between two measurements, or the next multiple of the actor's delay
 
@@ -17,7 +17,7 @@ class Diagnostics:
     """
 
     def __init__(self, policy: ActPCPolicy) -> None:
-        self.circuits: dict[str, NGCCircuit] = dict(policy.named_circuits())
+        self.circuits = policy.circuits()
         self.active = False
         self.values: dict[str, float] = {}
 

@@ -2,7 +2,6 @@
 
 import copy
 import inspect
-import warnings
 from typing import Annotated, Any
 
 import numpy as np
@@ -28,6 +27,7 @@ from sb3_actpc.utils.arguments import (
 )
 from sb3_actpc.utils.checks import LARGEST_SIZE, Settings, named_in_errors
 from sb3_actpc.utils.constructors import constructor_keywords
+from sb3_actpc.utils.nested import map_observations
 
 # what circuit_kwargs, actor_kwargs and so on may set; sizes follow from the task
 _SIZES = {"self", "n_inputs", "n_outputs", "hidden", "output_activation", "n_memory", "n_feedback_inputs", "n_members"}
@@ -36,6 +36,7 @@ OBSERVATION_CLIP = 10.0
 # standard deviations at least, of a feature that has changed: of its largest size, and at all; a smaller one may be rounding
 SMALLEST_CHANGE, SMALLEST_DEVIATION = 1e-4, 1e-7
 PRIOR_NET_ARCH = (512, 256)  # paper: prior of all MuJoCo tasks
+NOT_OF_CIRCUITS = ("net_arch", "learning_rate", "batch_size")  # of a circuit's own settings
 
 
 def check_circuit_class(name: str, given: Any) -> None:
@@ -61,14 +62,14 @@ class ObservationNormalizer(nn.Module):
         self.register_buffer("scale", th.ones(n_features))
         self.register_buffer("clip", th.full((), float("inf")))
 
-    def begin(self) -> None:
-        """As before the first fit: features come as they are."""
-        self.mean.zero_()
-        self.scale.fill_(1.0)
-        self.clip.fill_(float("inf"))
-
-    def fit(self, features: th.Tensor) -> None:
-        """:param features: (N, n_features), not normalised, whose mean and standard deviation are used from now on"""
+    def fit(self, features: th.Tensor | None) -> None:
+        """:param features: (N, n_features), not normalised, whose mean and standard deviation are used from now on; None for
+        the identity"""
+        if features is None:
+            self.mean.zero_()
+            self.scale.fill_(1.0)
+            self.clip.fill_(float("inf"))
+            return
         self.mean.copy_(features.mean(0))
         std = features.std(0, correction=0)
         has_changed = std > (SMALLEST_CHANGE * features.abs().amax(0)).clamp_min(SMALLEST_DEVIATION)
@@ -88,10 +89,8 @@ class ActPCActor(BasePolicy):
     :param observation_space: Observation space
     :param action_space: Box with finite bounds
     :param features_extractor: fixed (it is never trained)
-    :param net_arch: hidden sizes
-    :param circuit_kwargs: keywords of :class:`~sb3_actpc.ngc.NGCCircuit`
-    :param circuit_class: the class of the circuit
-    :param memory_history: H observations in the working memory; 0 for none
+    :param memory: working memory, or None
+    :param circuit: the motor-action circuit
     :param is_gated: keep a second circuit, the deployed one, which acts
     :param normalize_images: divide image observations by 255
     """
@@ -103,12 +102,10 @@ class ActPCActor(BasePolicy):
         observation_space: spaces.Space,
         action_space: spaces.Box,
         features_extractor: BaseFeaturesExtractor,
-        net_arch: list[int],
-        circuit_kwargs: dict[str, Any],
-        circuit_class: type[NGCCircuit] = NGCCircuit,
-        memory_history: int = 0,
-        is_gated: bool = False,
-        normalize_images: bool = True,
+        memory: WorkingMemory | None,
+        circuit: NGCCircuit,
+        is_gated: bool,
+        normalize_images: bool,
     ) -> None:
         super().__init__(
             observation_space,
@@ -118,35 +115,10 @@ class ActPCActor(BasePolicy):
             squash_output=True,
         )
         features_extractor.eval()  # dropout and running statistics would go on under a finished actor
-        n_features = features_extractor.features_dim
-        self.net_arch = list(net_arch)
-        self.circuit_kwargs = circuit_kwargs
-        self.circuit_class = circuit_class
-        self.memory_history = memory_history
-        self.normalizer = ObservationNormalizer(n_features)
-        self.memory = WorkingMemory(n_features, memory_history) if memory_history else None
-        self.circuit = circuit_class(
-            n_features,
-            int(np.prod(action_space.shape)),
-            self.net_arch,
-            output_activation="tanh",
-            n_memory=self.memory.size if self.memory else 0,
-            **circuit_kwargs,
-        )
-        self.deployed = self.circuit.projection_copy() if is_gated else None
-        self._warned_of_empty_memory = False
-
-    def _get_constructor_parameters(self) -> dict[str, Any]:
-        data = super()._get_constructor_parameters()
-        data.update(
-            features_extractor=self.features_extractor,
-            net_arch=self.net_arch,
-            circuit_kwargs=self.circuit_kwargs,
-            circuit_class=self.circuit_class,
-            memory_history=self.memory_history,
-            is_gated=self.deployed is not None,
-        )
-        return data
+        self.normalizer = ObservationNormalizer(features_extractor.features_dim)
+        self.memory = memory
+        self.circuit = circuit
+        self.deployed = circuit.projection_copy() if is_gated else None
 
     @property
     def acting(self) -> NGCCircuit:
@@ -171,20 +143,25 @@ class ActPCActor(BasePolicy):
         with th.no_grad():
             return self.normalizer(self.extract_features(observations, self.features_extractor))
 
-    def forward(self, observations: PyTorchObs, history: th.Tensor | None = None) -> th.Tensor:
+    def past_features(self, history: PyTorchObs | None, mask: th.Tensor | None) -> th.Tensor | None:
+        """:param history: (B, H, *obs_shape) or a dict of such, the observations before each row, oldest first; or None
+        :param mask: (B, H), 1 where there was one in the same episode; or None
+        :return: (B, H, n_features), zero before the episode's start; None without a history"""
+        if history is None or mask is None:
+            return None
+        features = self.features(map_observations(lambda tensor: tensor.flatten(0, 1), history))
+        return features.view(*mask.shape, features.shape[1]) * mask[:, :, None]
+
+    def forward(self, observations: PyTorchObs) -> th.Tensor:
         """:param observations: (B, *obs_shape) or a dict of such
-        :param history: (B, H, n_features) for a working memory, zeros before the episode's start
-        :return: actions in [-1, 1], (B, A)"""
+        :return: actions in [-1, 1], (B, A), with an empty working memory"""
         features = self.features(observations)
-        if self.memory is None:
-            return self.acting.project(features)
-        if history is None:
-            history = features.new_zeros(len(features), self.memory_history, features.shape[1])
-        return self.acting.project(features, self.memory(history))
+        memory = None if self.memory is None else features.new_zeros(len(features), self.memory.size)
+        return self.acting.project(features, memory)
 
     def roll_out(
         self,
-        observation: np.ndarray | dict[str, np.ndarray],
+        observations: PyTorchObs,
         state: tuple[np.ndarray, ...] | None,
         episode_start: np.ndarray | None,
         circuits: list[NGCCircuit],
@@ -192,40 +169,29 @@ class ActPCActor(BasePolicy):
         """
         As :meth:`predict`, with a circuit for every environment.
 
-        :param observation: (n_envs, *obs_shape), or a dict of such
+        :param observations: (n_envs, *obs_shape), or a dict of such
         :param state: as for ``predict``
         :param episode_start: as for ``predict``
         :param circuits: n_envs of them
         :return: actions in [-1, 1], (n_envs, *action_shape), and the new state
+        :raises ValueError: for a state of another number of environments
         """
-        self.set_training_mode(False)
         with th.no_grad():
-            features = self.features(self.obs_to_tensor(observation)[0])
-            memory = None
+            features, memory = self.features(observations), None
             if self.memory is not None:
-                memory, state = self._remember(features, state, episode_start)
+                shape = len(features), self.memory.history, features.shape[1]
+                history = np.zeros(shape, dtype=np.float32) if state is None else state[0].copy()
+                if len(history) != len(features):
+                    raise ValueError(f"state is of {len(history)} environments, the observations are of {len(features)}")
+                if episode_start is not None:
+                    history[np.asarray(episode_start, dtype=bool)] = 0.0
+                memory = self.memory(th.as_tensor(history, device=self.device))
+                state = (np.concatenate([history[:, 1:], features.cpu().numpy()[:, None]], axis=1),)
             actions = th.empty(len(features), circuits[0].sizes[-1], device=features.device)
             for circuit in dict.fromkeys(circuits):
                 rows = [row for row, own in enumerate(circuits) if own is circuit]
                 actions[rows] = circuit.project(features[rows], None if memory is None else memory[rows])
         return actions.cpu().numpy().reshape(-1, *self.action_space.shape), state
-
-    def _remember(
-        self, features: th.Tensor, state: tuple[np.ndarray, ...] | None, episode_start: np.ndarray | None
-    ) -> tuple[th.Tensor, tuple[np.ndarray, ...]]:
-        """m_t of the observations before these, (n_envs, n_memory), and the state with these among them."""
-        assert self.memory is not None
-        shape = (len(features), self.memory_history, features.shape[1])
-        history = np.zeros(shape, dtype=np.float32) if state is None else state[0].copy()
-        if len(history) != len(features):
-            raise ValueError(
-                f"state is of {len(history)} environments, the observations are of {len(features)}: pass the state that "
-                "predict returned for the same environments, or state=None where they begin"
-            )
-        if episode_start is not None:
-            history[np.asarray(episode_start, dtype=bool)] = 0.0
-        memory = self.memory(th.as_tensor(history, device=self.device))
-        return memory, (np.concatenate([history[:, 1:], features.cpu().numpy()[:, None]], axis=1),)
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         return self(observation)
@@ -240,24 +206,14 @@ class ActPCActor(BasePolicy):
         """
         SB3's ``predict``. With a working memory ``state`` carries it: one array (n_envs, H, n_features), returned updated.
 
-        A bare ``predict(obs)`` then acts with an empty memory and warns once.
+        As with SB3's recurrent policies, a bare ``predict(obs)`` then acts with an empty memory.
         """
         if self.memory is None:
             return super().predict(observation, state, episode_start, deterministic)
-        if state is None and episode_start is None and not self._warned_of_empty_memory:
-            warnings.warn(
-                "This agent has a working memory: predict(obs) acts with an empty one. Pass the returned state and "
-                "episode_start back in, as with SB3's recurrent policies.",
-                stacklevel=3,
-            )
-            self._warned_of_empty_memory = True
-        self.set_training_mode(False)
         observations, vectorized = self.obs_to_tensor(observation)
-        with th.no_grad():
-            features = self.features(observations)
-            memory, state = self._remember(features, state, episode_start)
-            actions = self.acting.project(features, memory).cpu().numpy()
-        actions = self.unscale_action(actions.reshape(-1, *self.action_space.shape))
+        n_envs = len(next(iter(observations.values())) if isinstance(observations, dict) else observations)
+        actions, state = self.roll_out(observations, state, episode_start, [self.acting] * n_envs)
+        actions = self.unscale_action(actions)
         return (actions if vectorized else actions[0]), state
 
 
@@ -321,16 +277,12 @@ class ActPCPolicy(BasePolicy):
         optimizer_class: Annotated[type[th.optim.Optimizer], check_optimizer] = th.optim.Adam,
         optimizer_kwargs: Settings | None = None,
     ) -> None:
-        if features_extractor_class is FlattenExtractor and isinstance(observation_space, spaces.Dict):
-            raise ValueError(f"{type(self).__name__} does not take Dict observations: use 'MultiInputPolicy'")
-        if features_extractor_class is CombinedExtractor and not isinstance(observation_space, spaces.Dict):
-            fitting = "CnnPolicy" if is_image_space(observation_space) else "MlpPolicy"
-            raise ValueError(f"{type(self).__name__} is for Dict observations, not {observation_space}: use {fitting!r}")
-        if features_extractor_class is FlattenExtractor and is_image_space(observation_space):
-            raise ValueError(
-                f"observations of shape {observation_space.shape} are images: ActPC learns no convolutions; use "
-                "'CnnPolicy' (fixed random ones), policy_kwargs=dict(features_extractor_class=...) or vector observations"
-            )
+        fitting = "CnnPolicy" if is_image_space(observation_space) else "MlpPolicy"
+        if isinstance(observation_space, spaces.Dict):
+            fitting = "MultiInputPolicy"
+        kinds = {FlattenExtractor: "MlpPolicy", CombinedExtractor: "MultiInputPolicy"}
+        if kinds.get(features_extractor_class, fitting) != fitting:
+            raise ValueError(f"{type(self).__name__} does not take {observation_space}: use {fitting!r}")
         super().__init__(
             observation_space,
             action_space,
@@ -341,43 +293,28 @@ class ActPCPolicy(BasePolicy):
             normalize_images=normalize_images,
             squash_output=True,
         )
-        self.net_arch = net_arch
-        self.n_critics = n_critics
-        self.memory_history = memory_history
-        self.circuit_class = circuit_class
-        self.circuit_kwargs = dict(circuit_kwargs or {})
-        self.kwargs_of = dict(zip(CIRCUITS, (actor_kwargs, critic_kwargs, generator_kwargs, prior_kwargs), strict=True))
-        self.is_gated = is_gated
-        self.nudge = nudge
-        self.lr_schedule = lr_schedule
+        self.net_arch, self.n_critics, self.memory_history, self.nudge = net_arch, n_critics, memory_history, nudge
+        self.circuit_class, self.circuit_kwargs = circuit_class, dict(circuit_kwargs or {})
+        self.actor_kwargs, self.critic_kwargs = actor_kwargs, critic_kwargs
+        self.generator_kwargs, self.prior_kwargs = generator_kwargs, prior_kwargs
+        self.is_gated, self.lr_schedule = is_gated, lr_schedule
         self._build()
 
     def _build(self) -> None:
         with named_in_errors(f"features_extractor_kwargs={self.features_extractor_kwargs!r}", AssertionError):
             extractor = self.make_features_extractor()
         extractor.requires_grad_(False)
-        arch = self._net_arch_of("actor")
-        kwargs = self._circuit_kwargs_of("actor")
-        self.actor = ActPCActor(
-            self.observation_space,
-            self.action_space,
-            extractor,
-            arch,
-            kwargs,
-            self._circuit_class_of("actor"),
-            self.memory_history,
-            self.is_gated,
-            self.normalize_images,
-        )
-        n_features = extractor.features_dim
-        n_actions = int(np.prod(self.action_space.shape))
-        n_memory = self.actor.memory.size if self.actor.memory else 0
+        n_features, n_actions = extractor.features_dim, int(np.prod(self.action_space.shape))
+        memory = WorkingMemory(n_features, self.memory_history) if self.memory_history else None
+        n_memory = memory.size if memory else 0
+        circuit = self._make_circuit("actor", n_features, n_actions, output_activation="tanh", n_memory=n_memory)
+        spaces_ = self.observation_space, self.action_space
+        self.actor = ActPCActor(*spaces_, extractor, memory, circuit, self.is_gated, self.normalize_images)
         n_members = self.n_critics if self.n_critics > 1 else 0
-        self.critic = self._circuit(
-            "critic", n_features + n_actions, n_actions, n_feedback_inputs=n_actions, n_members=n_members
-        )
-        self.generator = self._circuit("generator", n_features + n_actions, n_features, n_memory=n_memory)
-        self.prior = self._circuit("prior", n_features, n_features, n_memory=n_memory)
+        n_inputs = n_features + n_actions
+        self.critic = self._make_circuit("critic", n_inputs, n_actions, n_feedback_inputs=n_actions, n_members=n_members)
+        self.generator = self._make_circuit("generator", n_inputs, n_features, n_memory=n_memory)
+        self.prior = self._make_circuit("prior", n_features, n_features, n_memory=n_memory)
         check_agreement(self.actor.circuit, self.critic)
         self.actor_target = self.actor.circuit.projection_copy()
         self.critic_target = self.critic.projection_copy()
@@ -386,62 +323,50 @@ class ActPCPolicy(BasePolicy):
         self.register_buffer("n_prior_updates", th.tensor(0.0))
         names = ("average", "challenger", "previous") if self.is_gated else ()
         self.selection = nn.ModuleDict({name: self.actor.circuit.projection_copy() for name in names})
-        for name, circuit in self.named_circuits():
-            circuit.optimizer = self._optimizer(name.partition(".")[0], circuit)
+        for name, circuit in self.circuits().items():
+            circuit.optimizer = self._make_optimizer(name, circuit)
 
-    def named_circuits(self) -> list[tuple[str, NGCCircuit]]:
-        """The circuits that learn, with their names: actor, critic, generator, prior."""
-        others = [("critic", self.critic), ("generator", self.generator), ("prior", self.prior)]
-        return [("actor", self.actor.circuit), *others]
+    def circuits(self) -> dict[str, NGCCircuit]:
+        """The circuits that learn: actor, critic, generator, prior."""
+        return {"actor": self.actor.circuit, "critic": self.critic, "generator": self.generator, "prior": self.prior}
 
     def selection_circuits(self) -> dict[str, NGCCircuit] | None:
         """The circuits of the deployment gate: deployed, average, challenger and previous; None without a gate."""
         if self.actor.deployed is None:
             return None
-        circuits: dict[str, NGCCircuit] = {"deployed": self.actor.deployed}
-        for name in self.selection:
-            circuit = self.selection[name]
-            assert isinstance(circuit, NGCCircuit)
-            circuits[name] = circuit
-        return circuits
+        circuits: Any = dict(self.selection)
+        return {"deployed": self.actor.deployed, **circuits}
 
-    def _settings_of(self, name: str) -> dict[str, Any]:
-        return dict(self.kwargs_of[name] or {})
+    def settings_of(self, name: str) -> dict[str, Any]:
+        """What a circuit has of its own, such as ``actor_kwargs``."""
+        return dict(getattr(self, f"{name}_kwargs") or {})
 
-    def _net_arch_of(self, name: str) -> list[int]:
-        default = list(PRIOR_NET_ARCH) if name == "prior" else [256, 256]
-        own = self._settings_of(name).get("net_arch")
-        if own is not None:
-            return list(own)
-        if isinstance(self.net_arch, dict):
-            return list(self.net_arch.get({"actor": "pi", "critic": "qf"}.get(name, name), default))
-        return default if self.net_arch is None else list(self.net_arch)
-
-    def _circuit_kwargs_of(self, name: str) -> dict[str, Any]:
+    def _make_circuit(self, name: str, n_inputs: int, n_outputs: int, **extra: Any) -> NGCCircuit:
+        own = self.settings_of(name)
+        kind = self.circuit_class.get(name, NGCCircuit) if isinstance(self.circuit_class, dict) else self.circuit_class
+        # Hidden sizes: the circuit's own, those of its key, or those of all
+        arch: Any = self.net_arch
+        if isinstance(arch, dict):
+            arch = arch.get({"actor": "pi", "critic": "qf"}.get(name, name))
+        if own.get("net_arch") is not None:
+            arch = own["net_arch"]
+        if arch is None:
+            arch = PRIOR_NET_ARCH if name == "prior" else [256, 256]
+        # Keywords: ActPC's defaults, those of every circuit, the circuit's own
         default: dict[str, Any] = {"feedback": "learned", "feedback_start": "mirrored", "weight_decay": 0.1}
-        if name == "prior":
+        is_normalized = name == "critic" and self.circuit_kwargs.get("settling") == "scheduled"
+        if is_normalized or name == "prior":
             default["activation"] = "relu"
-        if name == "critic" and self.circuit_kwargs.get("settling") == "scheduled":
-            default |= {"normalization": "layer", "activation": "relu"}
-        own = {k: v for k, v in self._settings_of(name).items() if k not in ("net_arch", "learning_rate", "batch_size")}
-        kwargs = {**default, **self.circuit_kwargs, **own}
-        known = sorted({*CIRCUIT_KEYWORDS, *constructor_keywords(self._circuit_class_of(name))} - _SIZES)
-        unknown = sorted(set(kwargs) - set(known))
-        if unknown:
+        if is_normalized:
+            default["normalization"] = "layer"
+        kwargs = {**default, **self.circuit_kwargs, **{k: own[k] for k in own if k not in NOT_OF_CIRCUITS}}
+        known = sorted({*CIRCUIT_KEYWORDS, *constructor_keywords(kind)} - _SIZES)
+        if unknown := sorted(set(kwargs) - set(known)):
             raise ValueError(f"circuit_kwargs, {name}_kwargs: a circuit has no keywords {unknown}; choose from {known}")
-        return kwargs
+        return kind(n_inputs, n_outputs, list(arch), **kwargs, **extra)
 
-    def _circuit(self, name: str, n_inputs: int, n_outputs: int, **extra: Any) -> NGCCircuit:
-        kind = self._circuit_class_of(name)
-        return kind(n_inputs, n_outputs, self._net_arch_of(name), **self._circuit_kwargs_of(name), **extra)
-
-    def _circuit_class_of(self, name: str) -> type[NGCCircuit]:
-        if isinstance(self.circuit_class, dict):
-            return self.circuit_class.get(name, NGCCircuit)
-        return self.circuit_class
-
-    def _optimizer(self, name: str, circuit: NGCCircuit) -> th.optim.Optimizer:
-        start, own = self.lr_schedule(1.0), self._settings_of(name).get("learning_rate")
+    def _make_optimizer(self, name: str, circuit: NGCCircuit) -> th.optim.Optimizer:
+        start, own = self.lr_schedule(1.0), self.settings_of(name).get("learning_rate")
         scale = 1.0
         if own is not None:
             scale = own / start if start else 0.0  # a loaded policy has no schedule, and does not learn
@@ -450,9 +375,7 @@ class ActPCPolicy(BasePolicy):
             group["lr_scale"] *= scale
         kwargs = dict(self.optimizer_kwargs)
         if "lr" in kwargs:
-            raise ValueError(
-                f"optimizer_kwargs has lr={kwargs['lr']!r}: use learning_rate=, or a circuit's own, as in actor_kwargs"
-            )
+            raise ValueError(f"optimizer_kwargs has lr={kwargs['lr']!r}: use learning_rate=, or a circuit's own")
         if self.optimizer_class is th.optim.Adam and not kwargs.keys() & {"foreach", "differentiable"}:
             kwargs.setdefault("fused", True)  # one kernel for all synapses
         with named_in_errors(f"optimizer_kwargs={self.optimizer_kwargs!r}"):
@@ -460,32 +383,17 @@ class ActPCPolicy(BasePolicy):
 
     def batch_sizes(self, default: int) -> dict[str, int]:
         """Batch size of every circuit: its own ``batch_size`` or the agent's."""
-        return {name: int((own or {}).get("batch_size", default)) for name, own in self.kwargs_of.items()}
+        return {name: int(self.settings_of(name).get("batch_size", default)) for name in CIRCUITS}
 
     def set_learning_rate(self, learning_rate: float) -> None:
         """The agent's learning rate, times what each parameter group asks for (γ_e, a circuit's own learning rate)."""
-        for _, circuit in self.named_circuits():
+        for circuit in self.circuits().values():
             for group in circuit.optimizer.param_groups:
                 group["lr"] = learning_rate * group["lr_scale"]
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
-        data = super()._get_constructor_parameters()
-        data.update(
-            lr_schedule=self._dummy_schedule,  # not needed to act
-            net_arch=self.net_arch,
-            n_critics=self.n_critics,
-            circuit_class=self.circuit_class,
-            circuit_kwargs=self.circuit_kwargs,
-            memory_history=self.memory_history,
-            is_gated=self.is_gated,
-            nudge=self.nudge,
-            optimizer_class=self.optimizer_class,
-            optimizer_kwargs=self.optimizer_kwargs,
-            features_extractor_class=self.features_extractor_class,
-            features_extractor_kwargs=self.features_extractor_kwargs,
-            **{f"{name}_kwargs": self.kwargs_of[name] for name in CIRCUITS},
-        )
-        return data
+        names = constructor_keywords(ActPCPolicy)
+        return {**{name: getattr(self, name) for name in names}, "lr_schedule": self._dummy_schedule}  # not needed to act
 
     def train(self, mode: bool = True) -> "ActPCPolicy":
         """See :meth:`ActPCActor.train`."""
@@ -534,3 +442,10 @@ POLICIES: dict[str, type[BasePolicy]] = {
     "CnnPolicy": CnnPolicy,
     "MultiInputPolicy": MultiInputPolicy,
 }
+
+
+def check_policy(name: str, policy: Any) -> None:
+    """:raises ValueError: when it is neither the name of a policy nor a subclass of :class:`ActPCPolicy`"""
+    is_name = isinstance(policy, str) and policy in POLICIES
+    if not is_name and not (isinstance(policy, type) and issubclass(policy, ActPCPolicy)):
+        raise ValueError(f"{name}={policy!r} must be one of {list(POLICIES)}, or a subclass of {ActPCPolicy.__name__}")

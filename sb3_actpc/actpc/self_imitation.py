@@ -7,15 +7,10 @@ from functools import cached_property
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-import torch as th
-from gymnasium import spaces
 
-from sb3_actpc.demonstrations import Demonstrations, scaled_actions
-from sb3_actpc.demonstrations.rows import split_observations
+from sb3_actpc.actpc.batches import Observations
 from sb3_actpc.utils.nested import map_observations
 
-Observations = np.ndarray | dict[str, np.ndarray]
-TensorObservations = th.Tensor | dict[str, th.Tensor]
 Weighting = Literal["returns", "uniform"]
 RETURN_EXPONENT = 4.0  # an episode with half the return is imitated a sixteenth as often
 PATIENCE = 20  # episodes, all with a negative return, after which the memory warns
@@ -52,36 +47,16 @@ class Episodes:
     returns: np.ndarray
 
     @cached_property
-    def weights(self) -> np.ndarray:
-        """(N,), the positive returns to the power of ``RETURN_EXPONENT``."""
-        return np.maximum(self.returns, 0.0) ** RETURN_EXPONENT
-
-    @cached_property
     def cumulative_weights(self) -> np.ndarray:
-        """(N,), their running sum."""
-        return np.cumsum(self.weights)
+        """(N,), the running sum of the positive returns to the power of ``RETURN_EXPONENT``."""
+        return np.cumsum(np.maximum(self.returns, 0.0) ** RETURN_EXPONENT)
 
     def __len__(self) -> int:
         return len(self.actions)
 
-    @classmethod
-    def from_demonstrations(
-        cls, demonstrations: Demonstrations, observation_space: spaces.Space, action_space: spaces.Box
-    ) -> "Episodes":
-        """The demonstrations with actions scaled to [-1, 1]."""
-        bounds = demonstrations.episode_bounds
-        lengths = bounds[:, 1] - bounds[:, 0]
-        return cls(
-            observations=split_observations(observation_space, demonstrations.observations),
-            actions=scaled_actions(demonstrations, action_space),
-            starts=np.repeat(bounds[:, 0], lengths),
-            returns=np.repeat(demonstrations.episode_returns, lengths),
-        )
-
     def join(self, other: "Episodes") -> "Episodes":
         """These episodes, then the ``other`` ones, whose starts count from the first of these."""
-        columns = [_concatenate([getattr(one, field.name) for one in (self, other)]) for field in fields(self)]
-        return Episodes(*columns)
+        return Episodes(*(_concatenate([getattr(one, field.name) for one in (self, other)]) for field in fields(self)))
 
     def without_first(self, n: int) -> "Episodes":
         """All but the first ``n`` rows, which are whole episodes."""
@@ -90,9 +65,8 @@ class Episodes:
 
     def take(self, indices: np.ndarray, history: int = 0) -> ImitationSamples:
         """(B,) rows, each with ``history`` preceding observations of the same episode."""
-        past, mask = self.past(indices, history)
         observations = map_observations(lambda array: array[indices], self.observations)
-        return ImitationSamples(observations, self.actions[indices], past, mask)
+        return ImitationSamples(observations, self.actions[indices], *self.past(indices, history))
 
     def past(
         self, indices: np.ndarray, history: int, including: bool = False
@@ -140,9 +114,8 @@ class SelfImitationMemory:
         self._n_ended, self._best_ended = self._n_ended + 1, max(self._best_ended, episode_return)
         if self._n_ended == PATIENCE and self._best_ended < 0.0:
             warnings.warn(
-                f"all of the first {PATIENCE} episodes had a negative return: self-imitation only takes episodes with a "
-                "positive return; shift the reward above 0, or turn it off with "
-                "replay_buffer_kwargs=dict(self_imitation_size=0)",
+                f"all of the first {PATIENCE} episodes had a negative return, self-imitation takes positive ones: shift the "
+                "reward above 0, or turn it off with replay_buffer_kwargs=dict(self_imitation_size=0)",
                 stacklevel=2,
             )
         is_good = self.takes_all or episode_return >= self.best_return
@@ -151,32 +124,25 @@ class SelfImitationMemory:
     def store(self, observations: Observations, actions: np.ndarray, episode_return: float) -> None:
         """One whole episode: observations (T, *obs_shape) or a dict of such, actions (T, A), and its sparse return."""
         n_new = len(actions)
-        start = len(self)
-        new = Episodes(observations, actions, np.full(n_new, start), np.full(n_new, float(episode_return)))
-        episodes = new if self.episodes is None else self.episodes.join(new)
+        new = Episodes(observations, actions, np.full(n_new, len(self)), np.full(n_new, float(episode_return)))
+        self.episodes = new if self.episodes is None else self.episodes.join(new)
         self.lengths.append(n_new)
         self.returns.append(episode_return)
-        n_gone = 0
         while len(self) > self.capacity:
-            n_gone += self.lengths.pop(0)
+            self.episodes = self.episodes.without_first(self.lengths.pop(0))
             self.returns.pop(0)
-        self.episodes = episodes.without_first(n_gone) if n_gone else episodes
 
     def checkpoint_state(self) -> dict[str, Any]:
         """The stored episodes and their returns, for a checkpoint."""
-        episodes = None
-        if self.episodes is not None:
-            names = [field.name for field in fields(self.episodes)]
-            episodes = {name: getattr(self.episodes, name) for name in names}
-        ended = [self._n_ended, None if self._n_ended == 0 else self._best_ended]
-        return {"returns": list(self.returns), "lengths": list(self.lengths), "episodes": episodes, "ended": ended}
+        episodes = (
+            None if self.episodes is None else {field.name: getattr(self.episodes, field.name) for field in fields(Episodes)}
+        )
+        return {**vars(self), "episodes": episodes}
 
     def restore_checkpoint_state(self, state: dict[str, Any]) -> None:
         """:param state: what :meth:`checkpoint_state` returned"""
-        self.returns, self.lengths = list(state["returns"]), list(state["lengths"])
-        self.episodes = None if state["episodes"] is None else Episodes(**state["episodes"])
-        self._n_ended, best = state["ended"]
-        self._best_ended = -np.inf if best is None else best
+        episodes = None if state["episodes"] is None else Episodes(**state["episodes"])
+        vars(self).update({**state, "episodes": episodes})
 
 
 def is_by_return(parts: list[Episodes], weighting: Weighting) -> bool:
@@ -206,11 +172,7 @@ def sample_union(parts: list[Episodes], n: int, history: int = 0, weighting: Wei
             rows = np.searchsorted(weights[index], rows, side="right").clip(max=len(part) - 1)
         taken.append(part.take(rows.astype(np.int64), history))
         start = end
-    if len(taken) == 1:
-        return taken[0]
-    columns: list[Any] = [
-        None if any(part is None for part in column) else _concatenate(column) for column in zip(*taken, strict=True)
-    ]
+    columns: list[Any] = [None if column[0] is None else _concatenate(column) for column in zip(*taken, strict=True)]
     return ImitationSamples(*columns)
 
 

@@ -1,6 +1,6 @@
 """The default guidance: BC pre-training, critic warm-up, return-weighted imitation and the deployment gate, as hooks."""
 
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from numbers import Integral, Real
 from typing import Any, Literal
 
@@ -58,11 +58,6 @@ class GuidanceConfig:
         for name in ("q_filter", "gate"):
             if not isinstance(getattr(self, name), bool):
                 raise ValueError(f"guidance_kwargs[{name!r}]={getattr(self, name)!r} must be True or False")
-
-    @classmethod
-    def names(cls) -> list[str]:
-        """The keywords."""
-        return [one.name for one in fields(cls)]
 
 
 class BehaviorGuidance(ActorGuidance):

@@ -2,10 +2,13 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import torch as th
 
-_LEAKY_SLOPE = 0.01
+aten = th.ops.aten
+Function = Callable[[th.Tensor, th.Tensor], th.Tensor]
+Derivative = Callable[[th.Tensor, th.Tensor, th.Tensor], th.Tensor]
 
 
 @dataclass(frozen=True)
@@ -20,77 +23,37 @@ class Activation:
     """
 
     name: str
-    apply: Callable[[th.Tensor, th.Tensor], th.Tensor]
-    damp: Callable[[th.Tensor, th.Tensor, th.Tensor], th.Tensor]
+    apply: Function
+    damp: Derivative
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return get_activation, (self.name,)  # functions without a name cannot be pickled
 
 
-# Functions with names, so that a circuit can be pickled. z are latents, h = φ(z), f the signal that is damped.
-
-
-def _pass(z: th.Tensor, out: th.Tensor) -> th.Tensor:
-    return z
-
-
-def _pass_undamped(f: th.Tensor, z: th.Tensor, h: th.Tensor) -> th.Tensor:
-    return f
-
-
-def _relu(z: th.Tensor, out: th.Tensor) -> th.Tensor:
-    return th.clamp(z, min=0.0, out=out)
-
-
-def _damp_relu(f: th.Tensor, z: th.Tensor, h: th.Tensor) -> th.Tensor:
-    return th.ops.aten.threshold_backward.grad_input(f, z, 0.0, grad_input=f)
-
-
-def _relu6(z: th.Tensor, out: th.Tensor) -> th.Tensor:
-    return th.clamp(z, 0.0, 6.0, out=out)
-
-
-def _damp_relu6(f: th.Tensor, z: th.Tensor, h: th.Tensor) -> th.Tensor:
-    return th.ops.aten.hardtanh_backward.grad_input(f, z, 0.0, 6.0, grad_input=f)
-
-
-def _leaky_relu(z: th.Tensor, out: th.Tensor) -> th.Tensor:
-    return th.ops.aten.leaky_relu.out(z, _LEAKY_SLOPE, out=out)
-
-
-def _damp_leaky_relu(f: th.Tensor, z: th.Tensor, h: th.Tensor) -> th.Tensor:
-    return th.ops.aten.leaky_relu_backward.grad_input(f, z, _LEAKY_SLOPE, False, grad_input=f)
-
-
-def _elu(z: th.Tensor, out: th.Tensor) -> th.Tensor:
-    return th.ops.aten.elu.out(z, 1.0, 1.0, 1.0, out=out)
-
-
-def _damp_elu(f: th.Tensor, z: th.Tensor, h: th.Tensor) -> th.Tensor:
-    return th.ops.aten.elu_backward.grad_input(f, 1.0, 1.0, 1.0, False, z, grad_input=f)
-
-
-def _tanh(z: th.Tensor, out: th.Tensor) -> th.Tensor:
-    return th.tanh(z, out=out)
-
-
-def _damp_tanh(f: th.Tensor, z: th.Tensor, h: th.Tensor) -> th.Tensor:
-    return th.ops.aten.tanh_backward.grad_input(f, h, grad_input=f)
-
-
-ACTIVATIONS: dict[str, Activation] = {
-    "identity": Activation("identity", _pass, _pass_undamped),
-    "relu": Activation("relu", _relu, _damp_relu),
-    "relu6": Activation("relu6", _relu6, _damp_relu6),
-    "leaky_relu": Activation("leaky_relu", _leaky_relu, _damp_leaky_relu),
-    "elu": Activation("elu", _elu, _damp_elu),
-    "tanh": Activation("tanh", _tanh, _damp_tanh),
+# z are latents, h = φ(z), f the signal that is damped
+_FUNCTIONS: dict[str, tuple[Function, Derivative]] = {
+    "identity": (lambda z, out: z, lambda f, z, h: f),
+    "relu": (
+        lambda z, out: th.clamp(z, min=0.0, out=out),
+        lambda f, z, h: aten.threshold_backward.grad_input(f, z, 0.0, grad_input=f),
+    ),
+    "relu6": (
+        lambda z, out: th.clamp(z, 0.0, 6.0, out=out),
+        lambda f, z, h: aten.hardtanh_backward.grad_input(f, z, 0.0, 6.0, grad_input=f),
+    ),
+    "leaky_relu": (
+        lambda z, out: aten.leaky_relu.out(z, 0.01, out=out),
+        lambda f, z, h: aten.leaky_relu_backward.grad_input(f, z, 0.01, False, grad_input=f),
+    ),
+    "elu": (
+        lambda z, out: aten.elu.out(z, 1.0, 1.0, 1.0, out=out),
+        lambda f, z, h: aten.elu_backward.grad_input(f, 1.0, 1.0, 1.0, False, z, grad_input=f),
+    ),
+    "tanh": (lambda z, out: th.tanh(z, out=out), lambda f, z, h: aten.tanh_backward.grad_input(f, h, grad_input=f)),
 }
+ACTIVATIONS = {name: Activation(name, apply, damp) for name, (apply, damp) in _FUNCTIONS.items()}
 
 
 def get_activation(name: str) -> Activation:
-    """
-    :param name: one of the keys of ``ACTIVATIONS``
-    :return: the activation of that name
-    :raises ValueError: when there is none
-    """
-    if name not in ACTIVATIONS:
-        raise ValueError(f"activation={name!r} is unknown; choose one of {sorted(ACTIVATIONS)}")
+    """The activation of that name."""
     return ACTIVATIONS[name]

@@ -1,7 +1,7 @@
 """The neural generative coding (NGC) circuit: one stack of layers that predict, settle and learn by Hebbian changes."""
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from math import inf
 from numbers import Integral, Real
 from typing import Any
@@ -9,8 +9,8 @@ from typing import Any
 import torch as th
 from torch import nn
 
-from sb3_actpc.ngc.activations import ACTIVATIONS, get_activation
-from sb3_actpc.ngc.dynamics import DYNAMICS, ChainSettings, SettledState, SettlingChain
+from sb3_actpc.ngc.activations import ACTIVATIONS
+from sb3_actpc.ngc.dynamics import DYNAMICS, SettledState, SettlingChain
 from sb3_actpc.ngc.krylov import settle_krylov
 from sb3_actpc.ngc.normalization import EPSILON, NORMALIZATIONS, jacobian_product, normalize
 from sb3_actpc.ngc.plasticity import SYNAPTIC_SCALINGS, HebbianChanges, bound_columns_, hebbian_changes, mirrored, soft_bound_
@@ -18,9 +18,6 @@ from sb3_actpc.ngc.products import affine
 from sb3_actpc.ngc.stability import largest_norm_, settling_rates
 from sb3_actpc.ngc.synapses import Synapses
 
-SETTLINGS = ("iterative", "scheduled")
-FEEDBACKS = ("learned", "tied")
-FEEDBACK_STARTS = ("independent", "mirrored")
 LARGEST_SIZE = 2**20  # of a layer, and of the number of steps
 
 
@@ -103,50 +100,10 @@ class NGCCircuit(nn.Module):
         memory_weight: float = 1.0,
         n_feedback_inputs: int = 0,
     ) -> None:
+        _check_settings(dict(locals()))
         super().__init__()
-        _check_choice("settling", settling, SETTLINGS)
-        _check_choice("dynamics", dynamics, DYNAMICS)
-        _check_choice("synaptic_scaling", synaptic_scaling, SYNAPTIC_SCALINGS)
-        _check_choice("feedback", feedback, FEEDBACKS)
-        _check_choice("feedback_start", feedback_start, FEEDBACK_STARTS)
-        _check_choice("activation", activation, tuple(ACTIVATIONS))
-        _check_choice("output_activation", output_activation, tuple(ACTIVATIONS))
-        _check_choice("normalization", normalization, NORMALIZATIONS)
-        if not isinstance(hidden, Sequence) or isinstance(hidden, str):
-            raise ValueError(f"hidden={hidden!r} must be a list of layer sizes")
-        _check_sizes(1, n_inputs=n_inputs, n_outputs=n_outputs, n_settling_steps=n_settling_steps)
-        _check_sizes(1, **{f"hidden[{layer}]": size for layer, size in enumerate(hidden)})
-        _check_sizes(0, n_memory=n_memory, n_feedback_inputs=n_feedback_inputs, n_members=n_members)
-        if n_members and n_memory:
-            raise ValueError(f"n_members={n_members} and n_memory={n_memory} do not go together: an ensemble has no memory")
-        if n_feedback_inputs > n_inputs:
-            raise ValueError(f"n_feedback_inputs={n_feedback_inputs} must lie between 0 and n_inputs={n_inputs}")
-        _check_not_negative(
-            leak=leak,
-            settling_tolerance=settling_tolerance,
-            feedback_rate=feedback_rate,
-            weight_bound=weight_bound,
-            weight_decay=weight_decay,
-            feedback_scale=feedback_scale,
-            memory_weight=memory_weight,
-        )
-        if synaptic_scaling != "none" and not weight_bound:
-            raise ValueError(f"weight_bound={weight_bound!r} must be above 0 with synaptic_scaling={synaptic_scaling!r}")
-        _check_rate(settling_rate)
-        _check_flags(derivative_free=derivative_free)
-        if settling == "iterative" and dynamics == "krylov" and (leak or settling_rate != "auto"):
-            given = f"leak={leak!r}" if leak else f"settling_rate={settling_rate!r}"
-            raise ValueError(f"{given} needs dynamics='state': 'krylov' knows neither leak nor rates")
-        if settling == "scheduled":
-            _check_scheduled(
-                feedback_scale=feedback_scale,
-                leak=leak,
-                settling_rate=settling_rate,
-                derivative_free=derivative_free,
-            )
         self.sizes = [n_inputs, *hidden, n_outputs]
-        self.activation = get_activation(activation)
-        self.output_activation = get_activation(output_activation)
+        self.activation, self.output_activation = ACTIVATIONS[activation], ACTIVATIONS[output_activation]
         self.settling, self.n_settling_steps, self.dynamics = settling, n_settling_steps, dynamics
         self.settling_tolerance = settling_tolerance
         self.settling_rate, self.leak, self.derivative_free = settling_rate, leak, derivative_free
@@ -189,7 +146,6 @@ class NGCCircuit(nn.Module):
     def _create_rates(self) -> None:
         moves_by_rates = self.settling == "iterative" and self.dynamics != "krylov"
         self._keep_rates = moves_by_rates and self.settling_rate == "auto" and self.n_hidden > 0
-        self._follows_loaded = False
         self.register_load_state_dict_post_hook(_follow_loaded)
         # others are the constructor's, and do not travel with the synapses
         self.register_buffer("rates", th.zeros(max(1, self.n_hidden)), persistent=self._keep_rates)
@@ -200,17 +156,6 @@ class NGCCircuit(nn.Module):
             self.update_settling_rates(n_iterations=30)
         elif self.settling_rate != "auto":
             self.rates.fill_(float(self.settling_rate))
-
-    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
-        """Also synapses of a circuit that settles in another way: rates that are adapted follow from them."""
-        adapted = [prefix + name for name in ("rates", *(name for name, _ in self._coupling_matrices()))]
-        if not self._keep_rates:
-            for name in adapted:
-                state_dict.pop(name, None)
-        self._follows_loaded = self._keep_rates and not state_dict.keys() >= set(adapted)
-        if self._follows_loaded:
-            state_dict.update({name: getattr(self, name.removeprefix(prefix)) for name in adapted})
-        super()._load_from_state_dict(state_dict, prefix, *args)
 
     def mirror_feedback(self) -> None:
         """
@@ -304,29 +249,15 @@ class NGCCircuit(nn.Module):
 
     def chain(self, x: th.Tensor, memory: th.Tensor | None = None) -> SettlingChain:
         """The projected chain of this circuit's layers, to be clamped and settled; see :meth:`settle` for the shapes."""
-        x = self._as_input(x)
-        settings = ChainSettings(
-            self.activation,
-            self.output_activation,
-            self.dynamics,
-            self.leak,
-            self.derivative_free,
-            self.feedback_scale,
-            self.memory_weight,
-            self.normalization == "layer",
-        )
-        return self.chain_class(self.synapses, settings, x, memory)
+        return self.chain_class(self, self._as_input(x), memory)
 
     def _as_input(self, x: th.Tensor) -> th.Tensor:
         """``x``, checked; of an ensemble the same for every member, (M, B, n_inputs)."""
-        self._check_inputs(x)
-        return x.expand(self.n_members, -1, -1) if self.n_members else x
-
-    def _check_inputs(self, x: th.Tensor) -> None:
         n, dtype = self.sizes[0], self.synapses.weights[0].dtype
         if not isinstance(x, th.Tensor) or x.dim() != 2 or x.shape[1] != n or x.dtype != dtype:
             found = f"a {x.dtype} tensor {tuple(x.shape)}" if isinstance(x, th.Tensor) else f"a {type(x).__name__}"
             raise ValueError(f"this circuit takes inputs of shape (B, {n}), a {dtype} tensor, but was given {found}")
+        return x.expand(self.n_members, -1, -1) if self.n_members else x
 
     def residual(self, state: SettledState) -> th.Tensor:
         """
@@ -376,7 +307,7 @@ class NGCCircuit(nn.Module):
             groups.append({"params": self.synapses.feedback, "lr": learning_rate * scale, "lr_scale": scale})
         return groups
 
-    def apply_changes(self, changes: HebbianChanges, weight_decay: float | None = None) -> None:
+    def apply_changes(self, changes: HebbianChanges) -> None:
         """
         Hand the changes to the circuit's ``optimizer``, which its owner has set (see :meth:`parameter_groups`), bound the step
         it takes, and keep the settling rates stable.
@@ -384,57 +315,43 @@ class NGCCircuit(nn.Module):
         The one place where a change becomes a gradient to ascend.
 
         :param changes: of this circuit's synapses
-        :param weight_decay: λ of this once; None for the circuit's own
         :raises ValueError: for a circuit without an optimiser
         """
         if not hasattr(self, "optimizer"):
-            raise ValueError(
-                "this circuit has no optimizer to hand its changes to; set one first, as in "
-                "circuit.optimizer = torch.optim.Adam(circuit.parameter_groups(1e-3))"
-            )
-        self._decay_synapses(self.weight_decay if weight_decay is None else weight_decay)
-        old = [parameter.clone() for parameter in self._scaled_synapses()] if self.synaptic_scaling == "soft_bound" else []
+            raise ValueError("no optimizer: set circuit.optimizer = torch.optim.Adam(circuit.parameter_groups(1e-3)) first")
+        # W, M and E decay; biases do not
+        biases = set(map(id, self.synapses.biases))
+        for group in self.optimizer.param_groups if self.weight_decay else ():
+            matrices = [parameter for parameter in group["params"] if id(parameter) not in biases]
+            if matrices:
+                th._foreach_mul_(matrices, max(0.0, 1.0 - group["lr"] * self.weight_decay))
+        bounded = [*self.synapses.weights, *self.synapses.feedback]
+        old = [parameter.clone() for parameter in bounded] if self.synaptic_scaling == "soft_bound" else []
+        # The optimizer ascends where it can, as torch's own: no product for the sign
+        ascends = "maximize" in self.optimizer.defaults
+        for group in self.optimizer.param_groups if ascends else ():
+            group["maximize"] = True
         targets = [*self.synapses.weights, *self.synapses.biases, *self.synapses.memory]
-        given = changes.tensors() if self._ascends() else th._foreach_neg(changes.tensors())
+        given = changes.tensors() if ascends else th._foreach_neg(changes.tensors())
         for parameter, gradient in zip(targets, given, strict=True):
             parameter.grad = gradient
-        above = self.synapses.weights[0 if self.n_feedback_inputs else 1 :]
         # E^T is stored in the layout of W, so that its change is ΔW itself
+        above = self.synapses.weights[0 if self.n_feedback_inputs else 1 :]
         for parameter, weights in zip(self.synapses.feedback, above, strict=self.feedback == "learned"):
             assert weights.grad is not None
             parameter.grad = weights.grad[..., weights.shape[-1] - parameter.shape[-1] :].contiguous()
         self.optimizer.step()
-        self._scale_synapses(old)
+        self._bound_step(bounded, old)
         if self._keep_rates:
             self.update_settling_rates()
 
-    def _ascends(self) -> bool:
-        """Whether the optimizer adds what it is given, as torch's own can: no product for the sign."""
-        if "maximize" not in self.optimizer.defaults:
-            return False
-        for group in self.optimizer.param_groups:
-            group["maximize"] = True
-        return True
-
-    def _decay_synapses(self, weight_decay: float) -> None:
-        if not weight_decay:
-            return
-        biases = set(map(id, self.synapses.biases))
-        for group in self.optimizer.param_groups:
-            matrices = [parameter for parameter in group["params"] if id(parameter) not in biases]
-            if matrices:
-                th._foreach_mul_(matrices, max(0.0, 1.0 - group["lr"] * weight_decay))
-
-    def _scaled_synapses(self) -> list[th.Tensor]:
-        return [*self.synapses.weights, *self.synapses.feedback]
-
-    def _scale_synapses(self, old: list[th.Tensor]) -> None:
-        if self.synaptic_scaling == "soft_bound":
-            for synapses, before in zip(self._scaled_synapses(), old, strict=True):
-                soft_bound_(synapses, before, self.weight_bound)
-        elif self.synaptic_scaling == "column_norm":
-            for synapses in self._scaled_synapses():
-                bound_columns_(synapses, self.weight_bound)
+    def _bound_step(self, synapses: list[th.Tensor], old: list[th.Tensor]) -> None:
+        """Bounds act on the step that was taken from the ``old`` synapses."""
+        for new, before in zip(synapses, old, strict=False):
+            soft_bound_(new, before, self.weight_bound)
+        if self.synaptic_scaling == "column_norm":
+            for new in synapses:
+                bound_columns_(new, self.weight_bound)
 
     def projection_copy(self) -> "NGCCircuit":
         """An equal circuit that only projects: a target circuit or a deployed policy. It has no learned error synapses."""
@@ -474,11 +391,10 @@ class NGCCircuit(nn.Module):
         """
         Follow the spectral norms of the synapses by power iteration and set the rates that are stable for them.
 
+        Only of a circuit that moves by them: ``settling="iterative"``, ``dynamics="state"``, ``settling_rate="auto"``.
+
         :param n_iterations: of each matrix's singular vector
-        :raises ValueError: for a circuit that does not move by such rates
         """
-        if not self._keep_rates:
-            raise ValueError("rates follow synapses only with settling='iterative', dynamics='state', settling_rate='auto'")
         norms = th.stack([largest_norm_(m, getattr(self, name), n_iterations) for name, m in self._coupling_matrices()])
         forward = norms[: self.n_hidden].tolist()
         feedback = norms[self.n_hidden :].tolist() or [self.feedback_scale * norm for norm in forward]
@@ -487,8 +403,6 @@ class NGCCircuit(nn.Module):
 
 def _follow_loaded(circuit: NGCCircuit, _: Any) -> None:
     circuit._list_synapses()  # ``assign=True`` puts others in their place
-    if circuit._follows_loaded:
-        circuit.update_settling_rates(n_iterations=30)
 
 
 def _uniform(shape: tuple[int, ...], fan_in: int) -> nn.Parameter:
@@ -497,48 +411,73 @@ def _uniform(shape: tuple[int, ...], fan_in: int) -> nn.Parameter:
     return nn.Parameter(th.empty(shape).uniform_(-bound, bound), requires_grad=False)
 
 
-def _check_choice(name: str, value: Any, allowed: Sequence[str]) -> None:
-    if not isinstance(value, str) or value not in allowed:
-        raise ValueError(f"{name}={value!r} is unknown; choose one of {sorted(allowed)}")
+# ------------------------------------------------------------------ checks of the constructor's keywords
+
+_CHOICES: dict[str, Collection[str]] = {
+    "activation": ACTIVATIONS,
+    "output_activation": ACTIVATIONS,
+    "settling": ("iterative", "scheduled"),
+    "dynamics": DYNAMICS,
+    "feedback": ("learned", "tied"),
+    "feedback_start": ("independent", "mirrored"),
+    "synaptic_scaling": SYNAPTIC_SCALINGS,
+    "normalization": NORMALIZATIONS,
+}
+_SMALLEST = {"n_inputs": 1, "n_outputs": 1, "n_settling_steps": 1, "n_memory": 0, "n_feedback_inputs": 0, "n_members": 0}
+_RATES = (
+    "leak",
+    "settling_tolerance",
+    "feedback_rate",
+    "weight_bound",
+    "weight_decay",
+    "feedback_scale",
+    "memory_weight",
+)
+# what scheduled settling implies
+_IMPLIED: dict[str, tuple[Any, ...]] = {
+    "feedback_scale": (1.0,),
+    "leak": (0.0,),
+    "settling_rate": ("auto", 1.0),
+    "derivative_free": (False,),
+}
 
 
-def _check_sizes(smallest: int, **given: Any) -> None:
-    for name, value in given.items():
-        is_whole = isinstance(value, Integral)
-        if not is_whole or not smallest <= value <= LARGEST_SIZE:
+def _check_settings(given: dict[str, Any]) -> None:
+    """:raises ValueError: for a keyword with a value that is not allowed, or for two that do not go together"""
+    for name, allowed in _CHOICES.items():
+        if not isinstance(given[name], str) or given[name] not in allowed:
+            raise ValueError(f"{name}={given[name]!r} is unknown; choose one of {sorted(allowed)}")
+    if not isinstance(given["hidden"], Sequence) or isinstance(given["hidden"], str):
+        raise ValueError(f"hidden={given['hidden']!r} must be a list of layer sizes")
+    sizes = [(name, given[name], smallest) for name, smallest in _SMALLEST.items()]
+    for name, value, smallest in [*sizes, *((f"hidden[{layer}]", n, 1) for layer, n in enumerate(given["hidden"]))]:
+        if not isinstance(value, Integral) or not smallest <= int(value) <= LARGEST_SIZE:
             raise ValueError(f"{name}={value!r} must be a whole number from {smallest} to {LARGEST_SIZE}")
+    for name in _RATES:
+        if not isinstance(given[name], Real) or not 0.0 <= given[name] < inf:
+            raise ValueError(f"{name}={given[name]!r} must be a finite number that is not negative")
+    rate = given["settling_rate"]
+    if not (isinstance(rate, str) and rate == "auto") and not (isinstance(rate, Real) and 0.0 < float(rate) <= 1.0):
+        raise ValueError(f"settling_rate={rate!r} must be 'auto' or a number in (0, 1]")
+    if not isinstance(given["derivative_free"], bool):
+        raise ValueError(f"derivative_free={given['derivative_free']!r} must be True or False")
+    _check_agreement(given)
 
 
-def _check_not_negative(**given: Any) -> None:
-    for name, value in given.items():
-        is_number = isinstance(value, Real)
-        if not is_number or not 0.0 <= value < inf:
-            raise ValueError(f"{name}={value!r} must be a finite number that is not negative")
+def _check_agreement(given: dict[str, Any]) -> None:
+    def refuse(one: str, other: str, why: str) -> None:
+        raise ValueError(f"{one}={given[one]!r} does not go with {other}={given[other]!r}: {why}")
 
-
-def _check_rate(settling_rate: Any) -> None:
-    is_auto, is_number = isinstance(settling_rate, str) and settling_rate == "auto", isinstance(settling_rate, Real)
-    if not is_auto and not (is_number and 0.0 < settling_rate <= 1.0):
-        raise ValueError(f"settling_rate={settling_rate!r} must be 'auto' or a number in (0, 1]")
-
-
-def _check_flags(**given: Any) -> None:
-    for name, value in given.items():
-        if not isinstance(value, bool):
-            raise ValueError(f"{name}={value!r} must be True or False")
-
-
-def _check_scheduled(**given: Any) -> None:
-    """Scheduled settling implies these settings: say which explicit one conflicts."""
-    implied: dict[str, tuple[Any, ...]] = {
-        "feedback_scale": (1.0,),
-        "leak": (0.0,),
-        "settling_rate": ("auto", 1.0),
-        "derivative_free": (False,),
-    }
-    for name, value in given.items():
-        if value not in implied[name]:
-            raise ValueError(
-                f"{name}={value!r} conflicts with settling='scheduled', which implies {name}={implied[name][0]!r}; "
-                f"leave {name} out or use settling='iterative'"
-            )
+    if given["n_members"] and given["n_memory"]:
+        refuse("n_members", "n_memory", "an ensemble has no memory")
+    if given["n_feedback_inputs"] > given["n_inputs"]:
+        refuse("n_feedback_inputs", "n_inputs", "it can be at most as large")
+    if given["synaptic_scaling"] != "none" and not given["weight_bound"]:
+        refuse("weight_bound", "synaptic_scaling", "it must be above 0")
+    for name, implied in _IMPLIED.items() if given["settling"] == "scheduled" else ():
+        if given[name] not in implied:
+            refuse(name, "settling", f"leave {name} out or use settling='iterative'")
+    if given["settling"] == "iterative" and given["dynamics"] == "krylov":
+        for name in ("leak", "settling_rate"):
+            if given[name] not in _IMPLIED[name][:1]:
+                refuse(name, "dynamics", "it needs dynamics='state'")

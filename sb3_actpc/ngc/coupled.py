@@ -146,7 +146,7 @@ def _clamp_actor(motor: SettlingChain, value: SettlingChain, to_action: th.Tenso
 
 def _damped(chain: SettlingChain, error: th.Tensor) -> th.Tensor:
     """The output error times g' at the held output; the error itself when g is the identity."""
-    activation = chain.settings.output_activation
+    activation = chain.circuit.output_activation
     if activation.name == "identity":
         return error
     return activation.damp(error.clone(), chain.output_prediction, chain.output)

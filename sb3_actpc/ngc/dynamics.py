@@ -2,14 +2,15 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import TYPE_CHECKING
 
 import torch as th
 
-from sb3_actpc.ngc.activations import Activation
 from sb3_actpc.ngc.normalization import Normalized, jacobian_product, normalize
 from sb3_actpc.ngc.products import add_product, affine
-from sb3_actpc.ngc.synapses import Synapses
+
+if TYPE_CHECKING:
+    from sb3_actpc.ngc.circuit import NGCCircuit
 
 DYNAMICS = ("krylov", "state")
 
@@ -47,19 +48,6 @@ class SettledState:
         return 0.5 * th.stack([error.square().sum(-1) for error in self.errors]).sum(0)
 
 
-class ChainSettings(NamedTuple):
-    """What a chain asks of its circuit beside the synapses; see :class:`~sb3_actpc.ngc.circuit.NGCCircuit` for each."""
-
-    activation: Activation
-    output_activation: Activation
-    dynamics: str = "krylov"
-    leak: float = 0.0
-    derivative_free: bool = False
-    feedback_scale: float = 1.0
-    memory_weight: float = 1.0
-    normalizes: bool = False
-
-
 class SettlingChain:
     """
     The live latents and errors of one circuit, advanced step by step; ``integrate`` and ``predict`` allocate nothing.
@@ -70,17 +58,16 @@ class SettlingChain:
 
     Layers that no error has reached yet stand still and cost nothing.
 
-    :param synapses: used, never changed
-    :param settings: how the layers move
+    :param circuit: its synapses are used, never changed, and its settings say how the layers move
     :param x: the clamped input, (B, n_inputs)
     :param memory: m_t, (B, n_memory), or None
     """
 
-    def __init__(self, synapses: Synapses, settings: ChainSettings, x: th.Tensor, memory: th.Tensor | None) -> None:
-        self.synapses = synapses
-        self.settings = settings
+    def __init__(self, circuit: "NGCCircuit", x: th.Tensor, memory: th.Tensor | None) -> None:
+        self.circuit = circuit
+        self.synapses = synapses = circuit.synapses
         self.memory = memory
-        self.biases = synapses.layer_biases(memory, settings.memory_weight)
+        self.biases = synapses.layer_biases(memory, circuit.memory_weight)
         self.latents: list[th.Tensor] = [x]
         self.activations: list[th.Tensor] = [x]
         self.normalized: list[Normalized | None] = [None]
@@ -91,7 +78,7 @@ class SettlingChain:
             self.activations.append(th.empty_like(latents))
             self._activate(len(self.latents) - 1)
         self.output_prediction = affine(self.biases[-1], self.activations[-1], synapses.weights[-1])
-        self.output = settings.output_activation.apply(self.output_prediction, th.empty_like(self.output_prediction))
+        self.output = circuit.output_activation.apply(self.output_prediction, th.empty_like(self.output_prediction))
         self.n_hidden = len(self.latents) - 1
         self.lowest_reached = self.n_hidden + 1
         self.target: th.Tensor | None = None
@@ -102,15 +89,15 @@ class SettlingChain:
     def _activate(self, layer: int) -> None:
         """Bring φ(z), or φ of the normalized z, of a hidden layer up to date."""
         latents = self.latents[layer]
-        if self.settings.normalizes:
+        if self.circuit.normalization == "layer":
             normalized = normalize(latents)
             self.normalized[layer] = normalized
             latents = normalized.values
-        self.activations[layer] = self.settings.activation.apply(latents, self.activations[layer])
+        self.activations[layer] = self.circuit.activation.apply(latents, self.activations[layer])
 
     def damp(self, layer: int, signal: th.Tensor) -> th.Tensor:
         """``signal``, (B, n), which is overwritten, times the transposed derivative of a hidden layer's activation."""
-        activation = self.settings.activation
+        activation = self.circuit.activation
         normalized = self.normalized[layer]
         if normalized is None:
             return activation.damp(signal, self.latents[layer], self.activations[layer])
@@ -119,7 +106,7 @@ class SettlingChain:
 
     def slope(self, layer: int, move: th.Tensor) -> th.Tensor:
         """How much a hidden layer's activation changes, to first order, when its latents move by ``move``, (B, n)."""
-        activation = self.settings.activation
+        activation = self.circuit.activation
         normalized = self.normalized[layer]
         if normalized is None:
             return activation.damp(move.clone(), self.latents[layer], self.activations[layer])
@@ -146,7 +133,7 @@ class SettlingChain:
             )
         self.target = target
         self.output_error = th.empty_like(self.output)
-        self.drive = th.empty_like(self.output) if self.settings.output_activation.name != "identity" else self.output_error
+        self.drive = th.empty_like(self.output) if self.circuit.output_activation.name != "identity" else self.output_error
         self._refresh_output_error()
 
     def clamp_output_drive(self, drive: th.Tensor) -> None:
@@ -159,34 +146,28 @@ class SettlingChain:
         th.sub(self.target, self.output, out=self.output_error)
         if self.drive is not self.output_error:
             self.drive.copy_(self.output_error)
-            self.settings.output_activation.damp(self.drive, self.output_prediction, self.output)
+            self.circuit.output_activation.damp(self.drive, self.output_prediction, self.output)
 
-    def feedback_to(self, layer: int, exact: bool = False) -> th.Tensor:
+    def feedback(self, layer: int, below: th.Tensor, exact: bool = False, out: th.Tensor | None = None) -> th.Tensor:
         """
-        (E_l e_{l+1}) ⊙ φ'(z_l), what the layer below tells hidden layer ``layer`` (1 = first) of its error, (B, n).
+        (E_l e_{l+1}) ⊙ φ'(z_l), what an error ``below``, (B, n_below), tells hidden layer ``layer`` (1 = first) of its own.
 
         With ``exact`` through W^T and with φ', whatever the circuit uses.
         """
-        below = self.drive if layer == self.n_hidden else self.errors[layer]
-        return self.feedback(layer, below, exact, out=self.signals[layer - 1])
-
-    def feedback(self, layer: int, below: th.Tensor, exact: bool = False, out: th.Tensor | None = None) -> th.Tensor:
-        """:meth:`feedback_to` from any error ``below`` of the layer that ``layer`` predicts, (B, n_below)."""
-        settings = self.settings
-        matrix = self.synapses.feedback_matrix(layer, settings.feedback_scale, tied=exact)
+        matrix = self.synapses.feedback_matrix(layer, self.circuit.feedback_scale, tied=exact)
         signal = th.matmul(below, matrix, out=out)
-        if exact or not settings.derivative_free:
-            return self.damp(layer, signal)
-        return signal
+        return self.damp(layer, signal) if exact or not self.circuit.derivative_free else signal
 
     def integrate(self, rates: Sequence[float]) -> None:
         """One step of eq. 1 for every hidden layer that an error has reached; ``rates`` are the β, first layer first."""
-        settings = self.settings
-        self.lowest_reached = 1 if settings.leak else max(1, self.lowest_reached - 1)
+        circuit = self.circuit
+        self.lowest_reached = 1 if circuit.leak else max(1, self.lowest_reached - 1)
         for layer in range(self.lowest_reached, self.n_hidden + 1):
-            signal, error, rate = self.feedback_to(layer), self.errors[layer - 1], rates[layer - 1]
-            if settings.leak:
-                signal.sub_(self.latents[layer], alpha=settings.leak)
+            below = self.drive if layer == self.n_hidden else self.errors[layer]
+            signal = self.feedback(layer, below, out=self.signals[layer - 1])
+            error, rate = self.errors[layer - 1], rates[layer - 1]
+            if circuit.leak:
+                signal.sub_(self.latents[layer], alpha=circuit.leak)
             if layer == 1:  # its prediction is constant: the error moves as the state does
                 error.lerp_(signal, rate)
             else:
@@ -198,12 +179,12 @@ class SettlingChain:
 
         :param output: also predict the output (needless where its error is clamped)
         """
-        settings = self.settings
+        circuit = self.circuit
         for layer in range(self.lowest_reached, self.n_hidden + 1):
             latents, error = self.latents[layer], self.errors[layer - 1]
             if layer == 1:
                 th.add(self.first_prediction, error, out=latents)
-            elif settings.dynamics != "state":
+            elif circuit.dynamics != "state":
                 th.add(error, self.biases[layer - 1], out=latents)
                 add_product(latents, self.activations[layer - 1], self.synapses.weights[layer - 1].mT)
             else:
@@ -222,7 +203,7 @@ class SettlingChain:
 
     def _predict_output(self) -> None:
         self.output_prediction = affine(self.biases[-1], self.activations[-1], self.synapses.weights[-1])
-        self.output = self.settings.output_activation.apply(self.output_prediction, self.output)
+        self.output = self.circuit.output_activation.apply(self.output_prediction, self.output)
         if self.target is not None:
             self._refresh_output_error()
 

@@ -52,7 +52,7 @@ def settle_krylov(chain: SettlingChain, n_steps: int, tolerance: float) -> int:
 
 def _respond(chain: SettlingChain, drive: th.Tensor) -> tuple[th.Tensor, list[th.Tensor]]:
     """(I + A) ``drive``, (B, n_outputs), with the hidden layers' errors and, after them, the moves of their states."""
-    settings, weights, n_hidden = chain.settings, chain.synapses.weights, chain.n_hidden
+    weights, n_hidden = chain.synapses.weights, chain.n_hidden
     errors = [drive] * (n_hidden + 1)
     for layer in range(n_hidden, 0, -1):
         errors[layer - 1] = chain.feedback(layer, errors[layer])
@@ -64,7 +64,7 @@ def _respond(chain: SettlingChain, drive: th.Tensor) -> tuple[th.Tensor, list[th
         moves.append(move)
     answer = chain.slope(n_hidden, moves[-1]) @ weights[-1].mT
     for _ in range(2):  # g' once in the prediction, once in the error that reaches the synapses
-        answer = settings.output_activation.damp(answer, chain.output_prediction, chain.output)
+        answer = chain.circuit.output_activation.damp(answer, chain.output_prediction, chain.output)
     return answer.add_(drive), [*errors[:-1], *moves]
 
 

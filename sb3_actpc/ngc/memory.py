@@ -11,13 +11,10 @@ class WorkingMemory(nn.Module):
 
     :param n_inputs: size of one observation
     :param history: H, number of observations in the memory
-    :raises ValueError: when a size is not positive
     """
 
     def __init__(self, n_inputs: int, history: int = 7) -> None:
         super().__init__()
-        if n_inputs < 1 or history < 1:
-            raise ValueError(f"n_inputs={n_inputs} and history={history} must be at least 1")
         self.n_inputs, self.history = n_inputs, history
         std = n_inputs**-0.5  # σ_q, which keeps the scale of the observations
         self.projection = nn.Parameter(th.randn(n_inputs, n_inputs) * std, requires_grad=False)

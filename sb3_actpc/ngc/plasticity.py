@@ -61,15 +61,8 @@ def hebbian_changes(
     return HebbianChanges(
         weights=[sum_outer(error, activity) for error, activity in zip(scaled, activations, strict=True)],
         biases=[error.sum(-2, keepdim=error.dim() > 2) for error in scaled],
-        memory=[] if memory is None else [_memory_change(error, memory, memory_weight) for error in scaled],
+        memory=[] if memory is None else [memory_weight * (error.t() @ memory) for error in scaled],
     )
-
-
-def _memory_change(error: th.Tensor, memory: th.Tensor, memory_weight: float) -> th.Tensor:
-    """α_m e m^T; no product where the memory does not count."""
-    if not memory_weight:
-        return error.new_zeros(error.shape[1], memory.shape[1])
-    return memory_weight * (error.t() @ memory)
 
 
 def mirrored(weights: th.Tensor) -> th.Tensor:

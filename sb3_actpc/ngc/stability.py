@@ -5,32 +5,21 @@ import torch as th
 MAX_AUTO_RATE = 0.3  # activations with kinks chatter at larger rates (batch-mean energy rises by 0.1 %)
 
 
-def power_iteration_(matrix: th.Tensor, vector: th.Tensor, n_iterations: int = 1) -> th.Tensor:
-    """
-    One or more steps of power iteration, warm-started, for the largest singular value of ``matrix``.
-
-    :param matrix: (n_out, n_in)
-    :param vector: (n_in,), the running estimate of the right singular vector; overwritten
-    :return: the estimate of ||matrix||_2, 0-d, never above the true value
-    """
-    for _ in range(n_iterations):
-        image = matrix @ vector
-        th.mv(matrix.t(), image, out=vector)
-        vector.div_(th.linalg.vector_norm(vector).clamp_min(1e-30))
-    return th.linalg.vector_norm(matrix @ vector)
-
-
 def largest_norm_(matrix: th.Tensor, vector: th.Tensor, n_iterations: int = 1) -> th.Tensor:
     """
-    :func:`power_iteration_` of one matrix, or of every member of an ensemble.
+    The largest singular value of a matrix, or of those of all members of an ensemble, by warm-started power iteration.
 
     :param matrix: (n_out, n_in) or (M, n_out, n_in)
-    :param vector: (n_in,) or (M, n_in); overwritten
-    :return: the largest norm, 0-d
+    :param vector: (n_in,) or (M, n_in), the running estimates of right singular vectors; overwritten
+    :return: the estimate, 0-d, never above the true value
     """
-    if matrix.dim() == 2:
-        return power_iteration_(matrix, vector, n_iterations)
-    return th.stack([power_iteration_(*member, n_iterations) for member in zip(matrix, vector, strict=True)]).max()
+    norms = []
+    for one, direction in [(matrix, vector)] if matrix.dim() == 2 else zip(matrix, vector, strict=True):
+        for _ in range(n_iterations):
+            th.mv(one.t(), one @ direction, out=direction)
+            direction.div_(th.linalg.vector_norm(direction).clamp_min(1e-30))
+        norms.append(th.linalg.vector_norm(one @ direction))
+    return th.stack(norms).max()
 
 
 def settling_rates(forward_norms: list[float], feedback_norms: list[float]) -> list[float]:

@@ -73,6 +73,3 @@ def weights_of(circuit) -> list[th.Tensor]:
 
 def differ(one, other) -> bool:
     return any(not th.equal(a, b) for a, b in zip(one, other, strict=True))
-
-
-LEARNED = {"feedback": "learned", "feedback_start": "mirrored", "weight_decay": 0.1}

@@ -1,6 +1,5 @@
 """Replay: combined experience replay, signals kept apart, self-imitation, n-step sums, memory."""
 
-import pickle
 import warnings
 
 import numpy as np
@@ -8,9 +7,9 @@ import pytest
 from gymnasium import spaces
 from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 
-from sb3_actpc.actpc.buffers import CombinedReplayBuffer, combined_buffer_class
-from sb3_actpc.actpc.self_imitation import RETURN_EXPONENT, Episodes, SelfImitationMemory, sample_union
-from tests.checkpoints.runs import assert_equal
+from sb3_actpc.actpc.buffers import CombinedReplayBuffer
+from sb3_actpc.actpc.self_imitation import RETURN_EXPONENT as K
+from sb3_actpc.actpc.self_imitation import Episodes, SelfImitationMemory, sample_union
 
 SPACES = (spaces.Box(-1, 1, (2,), np.float64), spaces.Box(-1, 1, (1,), np.float32))
 
@@ -72,7 +71,7 @@ def test_n_step_sums_equal_sb3s(n_envs, steps):
         fill(buffer, steps, n_envs, rng=np.random.default_rng(1))
     rows = np.arange(min(steps, 40))
     for env in range(n_envs):
-        one = ours._gather(rows, np.full(len(rows), env), None)
+        one = ours.gather(rows, np.full(len(rows), env), None)
         np.random.seed(0)
         original, np.random.randint = np.random.randint, lambda *a, size, e=env, **k: np.full(size, e)
         try:
@@ -90,7 +89,7 @@ def test_signals_are_summed_over_the_n_step_window_like_rewards():
         signals = np.array([step]), np.array([-step])
         buffer.add(obs, obs, np.zeros((1, 1)), nothing, nothing, [{}])
         buffer.store_signals(*signals)
-    batch = buffer._gather(np.array([2, 10]), np.zeros(2, int), None)
+    batch = buffer.gather(np.array([2, 10]), np.zeros(2, int), None)
     assert np.allclose(batch.epistemic.ravel(), [2 + 0.9 * 3 + 0.81 * 4, 10 + 0.9 * 11])
     assert np.allclose(batch.instrumental, -batch.epistemic)
 
@@ -103,14 +102,6 @@ def test_memory_stays_near_sb3s():
         for kind in (CombinedReplayBuffer, ReplayBuffer)
     ]
     assert size[0] <= 1.2 * size[1]
-
-
-def test_an_unknown_buffer_class_is_named():
-    class Mine(ReplayBuffer):
-        pass
-
-    with pytest.raises(ValueError, match="Mine does not keep"):
-        combined_buffer_class(Mine, SPACES[0])
 
 
 # ---------------------------------------------------------------------- self-imitation
@@ -139,7 +130,7 @@ def test_beside_demonstrations_imitated_by_returns_every_paid_episode_enters():
     memory.takes_all = True
     assert [offer(memory, 4, paid) for paid in (3.0, 0.0, -1.0, 1.0)] == [True, False, False, True]
     assert not offer(memory, 9, 5.0) and list(memory.returns) == [3.0, 1.0]
-    assert list(memory.episodes.weights) == [81.0] * 4 + [1.0] * 4  # and the poor one is seldom imitated
+    assert memory.episodes.cumulative_weights.tolist() == [81, 162, 243, 324, 325, 326, 327, 328]  # the poor one is rare
 
 
 def test_the_oldest_episodes_leave_when_the_memory_is_full():
@@ -149,46 +140,6 @@ def test_the_oldest_episodes_leave_when_the_memory_is_full():
     assert list(memory.returns) == [2.0, 3.0]
     assert set(memory.episodes.observations[:, 0]) == {2.0, 3.0}
     assert not offer(memory, 13, 9.0)
-
-
-def random_episodes(n, rng, with_keys=False):
-    """Observations (or a dict of them), actions and return of n episodes; some returns occur several times."""
-    for _ in range(n):
-        length = int(rng.integers(1, 9))
-        seen, actions = rng.normal(size=(length, 3)).astype(np.float32), rng.normal(size=(length, 2)).astype(np.float32)
-        yield {"seen": seen, "goal": -seen} if with_keys else seen, actions, float(rng.integers(1, 6))
-
-
-@pytest.mark.parametrize("with_keys", [False, True])
-@pytest.mark.parametrize("halfway", ["goes on", "is pickled", "is restored"])
-def test_the_memory_is_its_last_episodes_laid_end_to_end(halfway, with_keys):
-    """After every episode, and as if it had been laid out anew: steps are drawn from it alike."""
-    memory, kept = SelfImitationMemory(60), []
-    for number, (seen, actions, paid) in enumerate(random_episodes(200, np.random.default_rng(0), with_keys)):
-        memory.store(seen, actions, paid)
-        kept.append((seen, actions, paid))
-        while sum(len(one[1]) for one in kept) > 60:
-            kept.pop(0)
-        if number == 100 and halfway == "is pickled":
-            memory = pickle.loads(pickle.dumps(memory))
-        if number == 100 and halfway == "is restored":
-            state, memory = memory.checkpoint_state(), SelfImitationMemory(60)
-            memory.restore_checkpoint_state(state)
-        lengths, returns = [len(one[1]) for one in kept], [one[2] for one in kept]
-        assert (memory.lengths, memory.returns) == (lengths, returns)
-        assert (len(memory), memory.best_return) == (sum(lengths), max(returns))
-        seen = [one[0] for one in kept]
-        if with_keys:
-            observations = {key: np.concatenate([one[key] for one in seen]) for key in ("seen", "goal")}
-        else:
-            observations = np.concatenate(seen)
-        starts = np.repeat(np.cumsum([0, *lengths[:-1]]), lengths)
-        anew = Episodes(observations, np.concatenate([one[1] for one in kept]), starts, np.repeat(returns, lengths))
-        drawn = []
-        for episodes in (anew, memory.episodes):
-            np.random.seed(number)
-            drawn.append([sample_union([episodes], 16, 2, weighting) for weighting in ("returns", "uniform")])
-        assert_equal(*drawn, "what is drawn")
 
 
 @pytest.mark.parametrize(("given", "capacity"), [(None, 20), (0, None), (7, 7), (50, 50)])
@@ -221,20 +172,6 @@ def test_an_episode_is_whole_when_the_ring_wraps_and_left_out_when_the_ring_has_
     assert np.allclose(episodes.actions[:, 0], np.arange(12) / 100)
 
 
-def test_signals_are_stored_with_the_newest_transitions_which_come_back_as_they_were_added():
-    buffer = CombinedReplayBuffer(4, *SPACES, n_envs=2, history=2, device="cpu")
-    obs, nothing = np.array([[1.0, 2.0], [3.0, 4.0]]), np.zeros(2)
-    for step in range(2):
-        buffer.add(obs + step, obs + step + 1, np.full((2, 1), 0.25), nothing, nothing, [{}, {}])
-        newest = buffer.newest_transitions()
-        assert np.array_equal(newest.observations, obs + step) and np.array_equal(newest.next_observations, obs + step + 1)
-        buffer.store_signals(newest.observations[:, 0] + 0.5, -newest.next_observations[:, 0])
-    assert buffer.epistemic[:2].tolist() == [[1.5, 3.5], [2.5, 4.5]]
-    assert buffer.instrumental[:2].tolist() == [[-2.0, -4.0], [-3.0, -5.0]]
-    assert (newest.actions == 0.25).all() and newest.history_mask.tolist() == [[0, 1], [0, 1]]
-    assert np.array_equal(newest.history[:, 1], obs)
-
-
 def test_a_restored_memory_remembers_what_was_paid():
     """Else twenty bad episodes after a stop would be taken for all there were."""
     memory, restored = SelfImitationMemory(100), SelfImitationMemory(100)
@@ -265,38 +202,25 @@ def episodes_of(*given: tuple[int, float]) -> Episodes:
     return Episodes(numbers, np.zeros((len(numbers), 1)), starts, np.repeat(returns, lengths))
 
 
-def test_the_union_is_drawn_uniformly():
-    parts = [episodes_of((30, 5.0)), episodes_of((0, 0.0), (10, 1.0))]
-    share = np.mean([sample_union(parts, 100).observations.mean() for _ in range(200)])
-    assert share == pytest.approx(0.25, abs=0.02)
-
-
-def test_imitation_draws_a_step_by_the_return_of_its_episode():
-    """p ∝ length * max(return, 0)^k, over the union of both parts."""
-    shown = episodes_of((10, 1.0), (20, 2.0), (30, 0.0))
-    own = episodes_of((0, 0.0), (0, 0.0), (0, 0.0), (5, 4.0), (7, 0.0))
-    drawn = sample_union([shown, own], 40_000, weighting="returns").observations[:, 0].astype(int)
-    expected = np.array([10, 20 * 2.0**RETURN_EXPONENT, 0, 5 * 4.0**RETURN_EXPONENT, 0])
-    assert np.bincount(drawn, minlength=5) / 40_000 == pytest.approx(expected / expected.sum(), abs=0.01)
-
-
-def test_a_rewarded_own_episode_does_not_end_the_imitation_of_demonstrations_without_reward():
-    shown, own = episodes_of((30, 0.0)), episodes_of((0, 0.0), (10, 0.01))
-    drawn = sample_union([shown, own], 20_000, weighting="returns").observations
-    assert drawn.mean() == pytest.approx(0.25, abs=0.02)
-
-
-def test_with_a_negative_demonstrated_return_imitation_draws_uniformly():
-    """A constant added to the rewards would else change what is imitated."""
-    shown, own = episodes_of((10, 0.1), (30, -3.0)), episodes_of((0, 0.0), (0, 0.0), (40, 9.0))
-    drawn = sample_union([shown, own], 20_000, weighting="returns").observations[:, 0].astype(int)
-    assert np.bincount(drawn, minlength=3) / 20_000 == pytest.approx([0.125, 0.375, 0.5], abs=0.02)
-
-
-@pytest.mark.parametrize("low", [0.0, -5.0])
-def test_without_a_positive_return_imitation_draws_uniformly(low):
-    drawn = sample_union([episodes_of((10, low), (30, 2 * low))], 20_000, weighting="returns").observations
-    assert drawn.mean() == pytest.approx(0.75, abs=0.02)
+@pytest.mark.parametrize(
+    ("shown", "own", "weighting", "expected"),
+    [
+        ([(30, 5.0)], [(10, 1.0)], "uniform", [30, 10]),
+        # p ∝ length * max(return, 0)^k, over the union of both parts
+        ([(10, 1.0), (20, 2.0), (30, 0.0)], [(5, 4.0), (7, 0.0)], "returns", [10, 20 * 2.0**K, 0, 5 * 4.0**K, 0]),
+        # a rewarded own episode does not end the imitation of demonstrations without reward
+        ([(30, 0.0)], [(10, 0.01)], "returns", [30, 10]),
+        # a constant added to the rewards would else change what is imitated
+        ([(10, 0.1), (30, -3.0)], [(40, 9.0)], "returns", [10, 30, 40]),
+        ([(10, -5.0), (30, -10.0)], [], "returns", [10, 30]),
+    ],
+)
+def test_imitated_steps_are_drawn_uniformly_or_by_the_return_of_their_episode(shown, own, weighting, expected):
+    """Demonstrations and own episodes, each of (length, return)."""
+    parts = [episodes_of(*shown), episodes_of(*[(0, 0.0)] * len(shown), *own)]
+    drawn = sample_union(parts, 40_000, weighting=weighting).observations[:, 0].astype(int)
+    shares = np.bincount(drawn, minlength=len(expected)) / 40_000
+    assert shares == pytest.approx(np.array(expected) / np.sum(expected), abs=0.01)
 
 
 def test_episode_history_stops_at_the_start_of_the_episode():
@@ -307,27 +231,3 @@ def test_episode_history_stops_at_the_start_of_the_episode():
     past, mask = episodes.past(np.array([1, 4, 3]), 2, including=True)
     assert np.array_equal(mask, [[1, 1], [1, 1], [0, 1]])
     assert np.array_equal(past[..., 0] * mask, [[0, 1], [3, 4], [0, 3]])
-
-
-@pytest.mark.parametrize("n_steps", [1, 3, 9])
-@pytest.mark.parametrize("steps", [5, 75])
-def test_the_past_of_the_bootstrapped_observation_is_what_came_before_it_in_its_episode(steps, n_steps):
-    """The observation of step t holds t, the next one t + 1, so that the past is known from the number alone."""
-    n_envs, history, capacity = 2, 4, 40
-    buffer = CombinedReplayBuffer(capacity * n_envs, *SPACES, n_envs=n_envs, n_steps=n_steps, history=history, device="cpu")
-    fill(buffer, steps, n_envs)
-    rows = np.repeat(np.arange(min(steps, capacity)), n_envs)
-    envs = np.tile(np.arange(n_envs), len(rows) // n_envs)
-    batch = buffer._gather(rows, envs, None)
-    if n_steps == 1:
-        assert batch.next_history is None  # it is the past, and the present observation
-        next_past, next_mask = buffer._history_at(rows, envs, None, including=True)
-    else:
-        next_past, next_mask = batch.next_history.numpy(), batch.next_history_mask.numpy()
-    for row, env in enumerate(envs):
-        following = round(float(batch.next_observations[row, 0]) - env / 10)
-        oldest = max(steps - capacity, 0)
-        start = max((following - 1 + env) // 7 * 7 - env, oldest)  # of the episode that `following` ended or goes on with
-        expected = list(range(max(start, following - history), following))
-        assert next_mask[row].sum() == len(expected)
-        assert next_past[row, history - len(expected) :, 0] == pytest.approx(np.array(expected) + env / 10)

@@ -47,18 +47,3 @@ def test_noise_of_several_environments_is_that_of_one_in_another_number_of_them(
     for n_envs in (1, 3):
         loaded = ActPC.load(tmp_path / "agent", env=DummyVecEnv([CountingEnv] * n_envs)).learn(30)
         assert loaded.num_timesteps == 30 and getattr(loaded.action_noise, "n_envs", 1) == n_envs
-
-
-@pytest.mark.parametrize("answer", [NotImplementedError, AttributeError, False])
-def test_environments_that_nobody_can_ask_what_they_are_wrapped_in_are_learned_in(answer, monkeypatch):
-    """As those of some simulators that step many at once."""
-
-    def env_is_wrapped(self, kind, indices=None):
-        if answer:
-            raise answer
-        return False
-
-    env = DummyVecEnv([CountingEnv])
-    model = make(env)
-    monkeypatch.setattr(DummyVecEnv, "env_is_wrapped", env_is_wrapped)
-    assert model.learn(5).learn(5, reset_num_timesteps=False).num_timesteps == 10

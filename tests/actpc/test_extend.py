@@ -34,7 +34,7 @@ def test_a_plasticity_rule():
     errors = [error.sign() * error.abs().mean() for error in state.postsynaptic]
     for change, error, activity in zip(circuit.hebbian_update(state).weights, errors, state.activations, strict=True):
         th.testing.assert_close(change, error.t() @ activity / len(error))
-    assert all(isinstance(one, type(circuit)) for _, one in model.policy.named_circuits())
+    assert all(isinstance(one, type(circuit)) for one in model.policy.circuits().values())
 
 
 def test_a_feedback_rule():

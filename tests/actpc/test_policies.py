@@ -4,10 +4,7 @@ import pytest
 import torch as th
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 
-from sb3_actpc import ActPC
-from sb3_actpc.actpc.policies import ActPCPolicy
 from tests.actpc.agents import imitating, make
-from tests.actpc.envs import CountingEnv, demonstrations
 
 
 class Dropping(BaseFeaturesExtractor):
@@ -38,25 +35,6 @@ def test_adam_takes_the_form_that_it_is_given(given):
     model = make(policy_kwargs={"optimizer_kwargs": given})
     assert bool(model.actor.circuit.optimizer.defaults["fused"]) == (not given)
     model.learn(15)
-
-
-def test_an_optimiser_that_asks_for_losses_is_refused():
-    with pytest.raises(ValueError, match="asks for a loss"):
-        make(policy_kwargs={"optimizer_class": th.optim.LBFGS})
-
-
-class Closed(ActPCPolicy):
-    """Takes nothing but what it names."""
-
-    def __init__(self, observation_space, action_space, lr_schedule, net_arch=None):
-        super().__init__(observation_space, action_space, lr_schedule, net_arch=net_arch)
-
-
-def test_a_policy_has_to_pass_on_what_it_does_not_know():
-    with pytest.raises(ValueError, match=r"Closed does not take \['circuit_kwargs'\].*\*\*kwargs"):
-        ActPC(Closed, CountingEnv())
-    with pytest.raises(ValueError, match=r"Closed does not take \['circuit_kwargs', 'is_gated'\].*\*\*kwargs"):
-        ActPC(Closed, CountingEnv(), demonstrations=demonstrations())
 
 
 def test_nothing_is_imitated_where_nothing_is_shown_or_kept():

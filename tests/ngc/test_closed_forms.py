@@ -4,7 +4,7 @@ import pytest
 import torch as th
 
 from sb3_actpc.ngc import NGCCircuit
-from sb3_actpc.ngc.plasticity import bound_columns_, hebbian_changes, soft_bound_
+from sb3_actpc.ngc.plasticity import bound_columns_, soft_bound_
 from sb3_actpc.ngc.stability import settling_rates
 
 
@@ -20,14 +20,6 @@ def test_only_columns_beyond_the_bound_are_shrunk():
     weights = th.tensor([[3.0, 0.3], [4.0, 0.4]])
     bound_columns_(weights, 1.0)
     th.testing.assert_close(weights, th.tensor([[0.6, 0.3], [0.8, 0.4]]))
-
-
-@pytest.mark.parametrize("memory_weight", [1.0, 0.25, 0.0])
-def test_the_memorys_change_is_weighed_as_the_memory_is(memory_weight):
-    """The prediction holds α_m M m, whose gradient by M is α_m e m^T."""
-    error, memory = th.tensor([[1.0, -2.0], [3.0, 0.0]]), th.tensor([[2.0], [4.0]])
-    changes = hebbian_changes([error], [th.zeros(2, 1)], memory, memory_weight)
-    th.testing.assert_close(changes.memory[0], memory_weight * th.tensor([[7.0], [-2.0]]))
 
 
 def test_the_total_discrepancy_is_half_the_summed_squared_errors():

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch as th
 
-from sb3_actpc.ngc import NGCCircuit, settle_coupled
+from sb3_actpc.ngc import NGCCircuit, policy_gradient, settle_coupled
 from tests.ngc import oracle
 
 N_UPDATES = 20_000
@@ -70,20 +70,6 @@ def test_energy_still_falls_after_20k_updates_on_unnormalised_transitions(transi
     assert blown[-1] > energies[0]
 
 
-def policy_gradient(actor, critic, x):
-    weights, biases = oracle.synapses(actor)
-    action = oracle.forward(actor, weights, biases, x)
-    oracle.forward(critic, *oracle.synapses(critic, False), th.cat([x, action], dim=1)).mean(1).mean().backward()
-    return [w.grad for w in weights]
-
-
-def alignment(actor, critic, x):
-    changes = actor.hebbian_update(settle_coupled(actor, critic, x).actor).weights
-    gradients = policy_gradient(actor, critic, x)
-    cosines = [oracle.cosine(c, g) for c, g in zip(changes, gradients, strict=True)]
-    return cosines, [float(c.norm() / g.norm()) for c, g in zip(changes, gradients, strict=True)]
-
-
 @pytest.mark.slow
 def test_the_coupled_pair_follows_the_policy_gradient_at_the_start_and_after_20k_updates(transitions):
     """Default iterative settings (tied feedback): cosine at least 0.9 in every layer at the start, 0.7 at the end."""
@@ -94,7 +80,9 @@ def test_the_coupled_pair_follows_the_policy_gradient_at_the_start_and_after_20k
     for update in range(N_UPDATES + 1):
         o, a, r, n = batch_of(transitions)
         if update % 5000 == 0:
-            cosines, ratios = alignment(actor, critic, o)
+            changes = actor.hebbian_update(settle_coupled(actor, critic, o).actor).weights
+            pairs = list(zip(changes, policy_gradient(actor, critic, o).weights, strict=True))
+            cosines, ratios = [oracle.cosine(*pair) for pair in pairs], [float(c.norm() / g.norm()) for c, g in pairs]
             print(f"{update} updates: cosine {np.round(cosines, 3)}, norm ratio {np.round(ratios, 3)}")
             assert min(cosines) > (0.9 if update == 0 else 0.7)
         changes = actor.hebbian_update(settle_coupled(actor, critic, o).actor)

@@ -18,8 +18,3 @@ def test_the_projection_is_fixed_and_gaussian():
     memory = WorkingMemory(100)
     assert not memory.projection.requires_grad
     assert float(memory.projection.std()) == pytest.approx(0.1, rel=0.05)
-
-
-def test_bad_sizes_are_named():
-    with pytest.raises(ValueError, match="history=0"):
-        WorkingMemory(5, history=0)

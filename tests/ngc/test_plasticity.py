@@ -19,12 +19,12 @@ def train(circuit, optimizer, n_updates, batch=teacher_batch):
         circuit.apply_changes(circuit.hebbian_update(circuit.settle(*batch())))
 
 
-def apply_nothing(circuit, memory=None, **once):
+def apply_nothing(circuit, memory=None):
     """Changes of zero, at a learning rate of 0.1: what is left is what the circuit does on its own."""
     changes = circuit.hebbian_update(circuit.settle(*teacher_batch(), memory=memory))
     th._foreach_zero_(changes.tensors())
     circuit.optimizer = th.optim.SGD(circuit.parameter_groups(0.1))
-    circuit.apply_changes(changes, **once)
+    circuit.apply_changes(changes)
 
 
 def test_plain_sgd_adds_the_change():
@@ -48,18 +48,6 @@ def test_a_circuit_learns_a_function(settling, feedback):
     start = (target - circuit.project(x)).square().mean()
     train(circuit, optimizer, 1500)
     assert (target - circuit.project(x)).square().mean() < 0.2 * start
-
-
-def test_learned_error_synapses_align_with_the_transposed_weights():
-    circuit = NGCCircuit(8, 3, (64, 64), settling="scheduled", feedback="learned")
-    optimizer = th.optim.Adam(circuit.parameter_groups(3e-3))
-    pairs = list(zip(circuit.feedback_weights, list(circuit.weights)[1:], strict=True))
-    start = [oracle.cosine(e, w) for e, w in pairs]
-    assert max(map(abs, start)) < 0.2
-    train(circuit, optimizer, 4000)
-    end = [oracle.cosine(e, w) for e, w in pairs]
-    print(f"cosine of E with W^T: {start} -> {end}")
-    assert min(end) > 0.5
 
 
 @pytest.mark.parametrize("optimizer_class", [th.optim.SGD, th.optim.Adam])
@@ -96,13 +84,6 @@ def test_weight_decay_aligns_the_error_synapses_under_adam():
     assert cosines[0] < 0.9 and cosines[1] > 0.95
 
 
-@pytest.mark.parametrize("kind", ["soft_bound", "column_norm"])
-def test_a_bound_of_nothing_is_named(kind):
-    with pytest.raises(ValueError, match=f"weight_bound=0.0 must be above 0 with synaptic_scaling='{kind}'"):
-        NGCCircuit(8, 3, (16,), synaptic_scaling=kind, weight_bound=0.0)
-    NGCCircuit(8, 3, (16,), weight_bound=0.0)
-
-
 def test_a_synapse_at_its_soft_bound_still_decays():
     circuit = NGCCircuit(8, 3, (16,), synaptic_scaling="soft_bound", weight_bound=0.4, weight_decay=0.5)
     circuit.weights[0].fill_(0.4)
@@ -118,16 +99,6 @@ def test_weight_decay_spares_the_biases():
         assert th.allclose(parameter, before[name] * (1.0 if name.startswith("biases") else 0.95))
 
 
-@pytest.mark.parametrize(("once", "kept"), [({"weight_decay": 2.0}, 0.8), ({"weight_decay": 0.0}, 1.0), ({}, 0.95)])
-def test_a_decay_of_this_once_is_in_the_place_of_the_circuits_own(once, kept):
-    circuit = NGCCircuit(8, 3, (16,), weight_decay=0.5)
-    before = [synapses.clone() for synapses in circuit.weights]
-    apply_nothing(circuit, **once)
-    for synapses, old in zip(circuit.weights, before, strict=True):
-        assert th.allclose(synapses, kept * old)
-    assert circuit.weight_decay == 0.5
-
-
 def test_halving_gamma_e_halves_the_movement_of_the_error_synapses_under_adam():
     moved, n_updates = [], 50
     for feedback_rate in (0.8, 0.4):
@@ -141,27 +112,14 @@ def test_halving_gamma_e_halves_the_movement_of_the_error_synapses_under_adam():
     assert moved[1] == pytest.approx(0.5 * moved[0], rel=0.1)
 
 
-def test_soft_bound_keeps_every_synapse_inside_under_adam():
-    circuit = NGCCircuit(8, 3, (32, 32), feedback="learned", synaptic_scaling="soft_bound", weight_bound=0.4)
-    optimizer = th.optim.Adam(circuit.parameter_groups(0.02))
-    train(circuit, optimizer, 200)
-    largest = max(float(p.abs().max()) for p in (*circuit.weights, *circuit.feedback_weights))
-    assert 0.3 < largest <= 0.4
-
-
-def test_column_norm_bound_binds_under_adam():
-    circuit = NGCCircuit(8, 3, (32, 32), feedback="learned", synaptic_scaling="column_norm", weight_bound=1.0)
-    optimizer = th.optim.Adam(circuit.parameter_groups(0.02))
-    train(circuit, optimizer, 300)
-    norms = th.cat([p.norm(dim=0) for p in (*circuit.weights, *circuit.feedback_weights)])
-    assert norms.max() <= 1.0 + 1e-5 and (norms > 1.0 - 1e-4).float().mean() > 0.15
-
-
-def test_without_scaling_the_same_training_passes_the_bounds():
-    circuit = NGCCircuit(8, 3, (32, 32))
-    optimizer = th.optim.Adam(circuit.parameter_groups(0.02))
-    train(circuit, optimizer, 200)
-    assert max(float(p.abs().max()) for p in circuit.weights) > 0.4
+@pytest.mark.parametrize("scaling", ["none", "soft_bound", "column_norm"])
+def test_bounds_bind_under_adam(scaling):
+    bound = 1.0 if scaling == "column_norm" else 0.4
+    circuit = NGCCircuit(8, 3, (32, 32), feedback="learned", synaptic_scaling=scaling, weight_bound=bound)
+    train(circuit, th.optim.Adam(circuit.parameter_groups(0.02)), 200)
+    synapses = [*circuit.weights, *circuit.feedback_weights]
+    sizes = th.cat([p.norm(dim=0) if scaling == "column_norm" else p.abs().flatten() for p in synapses])
+    assert sizes.max() > 0.75 * bound and (sizes.max() <= bound + 1e-5) == (scaling != "none")
 
 
 def test_auto_rates_follow_the_spectral_norms():
@@ -174,8 +132,6 @@ def test_auto_rates_follow_the_spectral_norms():
         weights.mul_(10.0)
     circuit.update_settling_rates(20)
     assert (circuit.rates < 0.2 * before).all()
-    with pytest.raises(ValueError, match="only with settling='iterative', dynamics='state', settling_rate='auto'"):
-        NGCCircuit(8, 3, (32, 32)).update_settling_rates()
 
 
 def test_working_memory_changes_its_own_synapses_and_the_output():
