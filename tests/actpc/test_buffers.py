@@ -48,12 +48,6 @@ def test_of_many_environments_the_newest_are_half_of_a_batch_and_all_have_their_
     assert np.mean([(batch[4:, 0] < steps - 1).mean() for batch in seen]) > 0.9
 
 
-def test_without_combined_replay_the_newest_is_not_singled_out():
-    buffer = CombinedReplayBuffer(1000, *SPACES, combined=False, device="cpu")
-    fill(buffer, 1000, 1)
-    assert np.mean([float(buffer.sample(1).observations[0, 0]) == 999 for _ in range(200)]) < 0.1
-
-
 def test_sampling_is_uniform():
     buffer = CombinedReplayBuffer(20, *SPACES, combined=False, device="cpu")
     fill(buffer, 33, 1)

@@ -2,7 +2,6 @@
 
 import re
 
-import gymnasium as gym
 import numpy as np
 import pytest
 from stable_baselines3 import TD3
@@ -90,16 +89,6 @@ def test_the_keywords_of_an_agents_policy_are_those_of_the_loaded_one(tmp_path):
     assert ActPC.load(tmp_path / "agent", policy_kwargs={"net_arch": [16, 16]}).policy.is_gated
     with pytest.raises(ValueError, match=re.escape("specified kwargs: {'net_arch': [8]}")):
         ActPC.load(tmp_path / "agent", policy_kwargs={"net_arch": [8]})
-
-
-def test_a_trained_agent_goes_on_in_another_task_without_its_demonstrations(tmp_path):
-    gym.register("OtherCounted-v0", CountingEnv)
-    other = gym.make("OtherCounted-v0", disable_env_checker=True)
-    imitating().learn(10).save(tmp_path / "agent")
-    with pytest.raises(ValueError, match="env_id"):
-        ActPC.load(tmp_path / "agent", env=other).learn(5)
-    with pytest.warns(UserWarning, match="goes on without"):
-        ActPC.load(tmp_path / "agent", env=other, demonstrations=None).learn(5)
 
 
 def test_a_loaded_replay_buffer_joins_no_two_episodes(tmp_path):

@@ -1,10 +1,11 @@
-"""Small formulas of the circuits, worked by hand."""
+"""Small formulas of the circuits, worked by hand: bounds, energies, rates, products and the working memory."""
 
 import pytest
 import torch as th
 
-from sb3_actpc.ngc import NGCCircuit
+from sb3_actpc.ngc import NGCCircuit, WorkingMemory
 from sb3_actpc.ngc.plasticity import bound_columns_, soft_bound_
+from sb3_actpc.ngc.products import NARROW, TALL, sum_outer
 from sb3_actpc.ngc.stability import settling_rates
 
 
@@ -33,3 +34,29 @@ def test_the_automatic_rate_is_stable_where_every_unit_is_active(norm):
     """One hidden layer: e <- e - β (1 + ||W|| ||E||) e + const settles while β (1 + ||W|| ||E||) < 2."""
     rate = settling_rates([norm], [norm])[0]
     assert 0.0 < rate * (1.0 + norm**2) < 2.0
+
+
+@pytest.mark.parametrize("n, m", [(TALL * 11, 11), (TALL * 11 - 1, 11), (3, 40), (TALL * NARROW, NARROW)])
+@pytest.mark.parametrize("members", [(), (4,)])
+def test_outer_products_are_summed_whatever_the_shape(n, m, members):
+    """The optimizer's fused step reads changes as they lie in memory."""
+    left, right = th.randn(*members, 64, n), th.randn(*members, 64, m)
+    found = sum_outer(left, right)
+    expected = th.einsum("...bn,...bm->...nm", left.double(), right.double())
+    assert found.is_contiguous()
+    assert found.shape == (*members, n, m)
+    assert (found - expected).norm() < 1e-5 * expected.norm()
+
+
+def test_memory_is_the_concatenation_of_projected_observations():
+    memory = WorkingMemory(5, history=3)
+    history = th.randn(4, 3, 5)
+    expected = th.cat([history[:, step] @ memory.projection.t() for step in range(3)], dim=1)
+    assert th.allclose(memory(history), expected, atol=1e-6)
+    assert memory.size == 15 and not th.any(memory(th.zeros(1, 3, 5)))
+
+
+def test_the_projection_is_fixed_and_gaussian():
+    memory = WorkingMemory(100)
+    assert not memory.projection.requires_grad
+    assert float(memory.projection.std()) == pytest.approx(0.1, rel=0.05)

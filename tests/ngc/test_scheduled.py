@@ -100,13 +100,6 @@ def test_a_pair_that_does_not_fit_is_named():
         settle_coupled(actor, critic, x)
 
 
-def test_a_swept_pair_may_name_any_number_of_steps():
-    actor, critic, x = make_pair(settling="scheduled")
-    expected = settle_coupled(actor, critic, x).actor.errors[-1].clone()
-    critic.n_settling_steps = 7
-    assert th.equal(settle_coupled(actor, critic, x).actor.errors[-1], expected)
-
-
 def test_policy_gradient_is_exact_whatever_the_feedback():
     actor, critic, x = make_pair(feedback="learned", derivative_free=True)
     exact = policy_gradient(actor, critic, x)
@@ -132,17 +125,6 @@ def test_the_learned_sweep_is_where_error_neurons_rest_under_an_infinitesimal_er
         settled.predict(output=False)
     for mine, rest in zip(swept.errors, settled.errors, strict=True):
         assert mine.abs().max() > 1e-10 and th.allclose(mine, rest, rtol=1e-4, atol=1e-13)
-
-
-def test_the_coupled_learned_sweep_is_where_the_pair_rests_under_an_infinitesimal_error():
-    actor, critic, x = (m.double() for m in make_pair((16, 12), **LEARNED))
-    swept = settle_coupled(actor, critic, x).actor
-    for circuit in (actor, critic):
-        circuit.settling, circuit.n_settling_steps, circuit.dynamics = "iterative", 400, "state"
-        circuit.rates.fill_(0.3)
-    settled = settle_coupled(actor, critic, x, nudge=1e-6).actor
-    for mine, rest in zip(swept.postsynaptic, settled.postsynaptic, strict=True):
-        assert mine.abs().max() > 1e-5 and th.allclose(mine, rest, rtol=1e-4, atol=1e-9)
 
 
 @pytest.mark.parametrize("feedback", ["learned", "tied"])

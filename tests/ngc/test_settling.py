@@ -45,14 +45,6 @@ def test_hebbian_change_is_minus_the_gradient_by_the_weights_at_the_settled_stat
         assert th.allclose(change, -synapse.grad, atol=1e-12)
 
 
-def test_an_error_comes_one_layer_further_with_every_step():
-    circuit, x, target = make((8, 6, 7), settling_rate=0.1)
-    for circuit.n_settling_steps in (1, 2, 3):
-        state = circuit.settle(x, target)
-        moved = [bool(error.abs().max() > 0) for error in state.errors[:-1]]
-        assert state.n_steps == circuit.n_settling_steps == sum(moved) and moved == sorted(moved)
-
-
 @pytest.mark.parametrize("dynamics", DYNAMICS)
 @pytest.mark.parametrize("hidden", [(8,), (8, 6), (8, 6, 7)])
 def test_a_linear_circuit_settles_to_the_solution_of_its_linear_system(dynamics, hidden):
@@ -90,19 +82,8 @@ def test_krylov_settling_rests_where_eq_1_does_while_states_move_little(hidden, 
     circuit.rates.fill_(0.1)
     rest = circuit.settle(x, target)
     assert mine.n_steps == 3 and float(circuit.residual(mine)) < 1e-3
-    assert float(circuit.residual(_swept(circuit, x, target))) > 0.01
     for a, b in zip([*mine.errors, *mine.latents], [*rest.errors, *rest.latents], strict=True):
         assert th.allclose(a, b, atol=1e-9)
-
-
-def _swept(circuit, x, target):
-    chain = circuit.chain(x)
-    chain.clamp_output(target)
-    chain.start_settling()
-    chain.sweep()
-    chain.lowest_reached = 1
-    chain.predict()
-    return chain.state()
 
 
 def test_krylov_settling_stops_at_its_tolerance():
