@@ -14,7 +14,7 @@ from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_actpc.actpc.base import NEED_DEMONSTRATIONS, ActPCBase
-from sb3_actpc.actpc.batches import Batch
+from sb3_actpc.actpc.batches import Batch, last_observations
 from sb3_actpc.actpc.buffers import SignalReplay, relabels
 from sb3_actpc.actpc.policies import POLICIES, ActPCPolicy, check_policy
 from sb3_actpc.actpc.reward_signals import InternalSignals
@@ -38,7 +38,6 @@ from sb3_actpc.utils.arguments import (
     checked,
 )
 from sb3_actpc.utils.checks import Settings, check_finite
-from sb3_actpc.utils.nested import map_observations
 
 # the mean absolute action-value that divides the critic term is at least this: before any reward was seen, the critic's
 # noise must not be scaled up to full strength
@@ -283,16 +282,7 @@ class ActPC(ActPCBase):
             observations = self._last_obs
         else:
             next_observations, rewards = normalize.get_original_obs(), normalize.get_original_reward()
-        last: Any = map_observations(np.array, next_observations)
-        for env in np.flatnonzero(dones):
-            terminal = infos[env].get("terminal_observation")
-            if terminal is not None and normalize is not None:
-                terminal = normalize.unnormalize_obs(terminal)
-            if isinstance(terminal, dict):
-                for key in last:
-                    last[key][env] = terminal[key]
-            elif terminal is not None:
-                last[env] = terminal
+        last = last_observations(next_observations, dones, infos, normalize)
         # Store (o_t, a_t, r_t, o_t+1), then its signals
         replay_buffer.add(observations, last, buffer_action, rewards, dones, infos)
         if any(self.reward_weights[1:]):
@@ -302,6 +292,8 @@ class ActPC(ActPCBase):
         # Guidance counts steps of policies, not random ones
         if self.num_timesteps >= self.learning_starts + self.n_envs:
             self.actor_guidance.on_step(self._context(starts), rewards, dones, self._n_updates)
+        if self.expert is not None and np.any(dones):
+            self.expert.check_scale(replay_buffer.rewards[: replay_buffer.size()])
         waits = self.actor_guidance.has_gate or isinstance(replay_buffer, HerReplayBuffer)
         if waits and ENDLESS in replay_buffer.running_lengths:
             warnings.warn(

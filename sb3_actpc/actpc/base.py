@@ -2,7 +2,7 @@
 
 import time
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from os import PathLike
 from pathlib import Path
 from typing import Any, TypeVar
@@ -185,19 +185,28 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
         # An actor that has imitated keeps the statistics of its demonstrations
         normalizer, extractor = self.actor.normalizer, self.actor.features_extractor
         is_normalised = self._vec_normalize_env is not None and bool(self._vec_normalize_env.norm_obs)
-        parts: Any = ()
+        parts: Iterable[Any]
         if self.observation_normalization == "bounds":
             parts = [finite_bounds(self.observation_space, is_normalised)]
         elif self.observation_normalization == "demonstrations" and self.expert is not None and not self.is_pretrained:
             parts = [] if is_normalised else self.expert.parts()
-        if not isinstance(parts, tuple):
-            seen = [self.actor.extract_features(to_device(part, self.device), extractor) for part in parts]
-            normalizer.fit(th.cat(seen) if seen else None)
+        else:
+            return
+        seen = [self.actor.extract_features(to_device(part, self.device), extractor) for part in parts]
+        normalizer.fit(th.cat(seen) if seen else None)
 
     def _update_demonstrations(self) -> None:
         """Use demonstrations that were set since. A prior and a normalizer that have learned stay as they are."""
         now = self.demonstrations, self.n_demonstrations, self.n_demonstration_transitions
-        if self.expert is None or any(mine is not used for mine, used in zip(now, self._used_demonstrations, strict=False)):
+        used = self._used_demonstrations
+        if self.demonstrations is not None and self.guidance == "none" and used and used[0] is None:
+            warnings.warn(
+                "demonstrations were set after the agent was made without: guidance='none' "
+                f"(no BC pre-training), n_steps={self.n_steps} and demonstration_fraction={self.demonstration_fraction:g} "
+                "stay. For the defaults with demonstrations, pass demonstrations= to the constructor",
+                stacklevel=5,
+            )
+        if self.expert is None or any(mine is not one for mine, one in zip(now, used, strict=True)):
             self._setup_demonstrations()
         # one discount and one length of returns for what is replayed and what is demonstrated, of a loaded buffer too
         self.replay_buffer.set_returns(self.n_steps, self.gamma)
@@ -213,9 +222,7 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
             warnings.warn(f"alpha_in={self.alpha_in:g} has no effect without demonstrations=", stacklevel=5)
 
     def pretrain(self) -> None:
-        """
-        Train the prior on the demonstrations and let guidance start, once; ``learn`` calls this.
-        """
+        """Train the prior on the demonstrations and let guidance start, once; ``learn`` calls this."""
         expert, env = self.expert, self._vec_normalize_env
         if expert is not None:
             if not self.is_pretrained and env is not None and env.norm_obs:

@@ -1,5 +1,6 @@
 """The demonstrations, as the agent uses them: imitated by the actor, predicted by the prior, mixed into the critic's batch."""
 
+import warnings
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -16,6 +17,8 @@ from sb3_actpc.demonstrations.rows import split_observations
 from sb3_actpc.utils.nested import map_observations
 
 PART = 1024  # rows at a time, where all are passed through: there can be many images
+# so many rewards are enough to compare, and so many times the demonstrated ones are another scale
+ENOUGH_REWARDS, OTHER_SCALE = 500, 30.0
 
 
 class DemonstrationReplay:
@@ -41,6 +44,7 @@ class DemonstrationReplay:
         self.next_observations = split_observations(observation_space, demonstrations.next_observations)
         self.epistemic, self.instrumental = np.zeros((2, len(demonstrations)), dtype=np.float32)
         self.has_signals = False
+        self.has_scale = False  # whether rewards have been compared
 
     def __len__(self) -> int:
         return len(self.demonstrations)
@@ -107,6 +111,30 @@ class DemonstrationReplay:
 
     def _next(self, rows: np.ndarray) -> Observations:
         return map_observations(lambda array: array[rows], self.next_observations)
+
+    def check_scale(self, rewards: np.ndarray) -> None:
+        """
+        Warn, once, where the environment's rewards cannot have the scale of the demonstrated ones.
+
+        Maximum and mean of the positive rewards, and of the negative ones, then differ in the same direction. One alone may
+        differ by behavior.
+
+        :param rewards: of all environment steps so far; of few, or without a common sign, they say nothing
+        """
+        if self.has_scale or rewards.size < ENOUGH_REWARDS:
+            return
+        ratios: list[float] = []
+        for sign in (1.0, -1.0):
+            demonstrated, own = (sign * part[sign * part > 0.0] for part in (self.demonstrations.rewards, rewards))
+            if len(demonstrated) and len(own):
+                ratios += [demonstrated.mean() / own.mean(), demonstrated.max() / own.max()]
+        self.has_scale = bool(ratios)
+        if ratios and (min(ratios) > OTHER_SCALE or max(ratios) < 1 / OTHER_SCALE):
+            warnings.warn(
+                f"the rewards in the demonstrations are {min(ratios):.3g} to {max(ratios):.3g} times the environment's: bring "
+                "them to its scale with dataclasses.replace(demonstrations, rewards=demonstrations.rewards * ...)",
+                stacklevel=2,
+            )
 
     def parts(self) -> Iterator[Any]:
         """All observations, some at a time."""

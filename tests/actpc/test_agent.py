@@ -604,6 +604,36 @@ def test_a_saved_policy_acts_as_the_agent_does(own, tmp_path):
     assert np.array_equal(MlpPolicy.load(tmp_path / "policy.pt").predict(seen)[0], model.predict(seen)[0])
 
 
+@pytest.mark.parametrize(
+    ("shown", "own", "is_other"),
+    [
+        ([0.0, 1.0], [0.0, 1.0], False),
+        ([0.0, 1.0], [0.0, 100.0], True),
+        ([0.0, 100.0], [0.0, 0.0], False),  # no reward yet
+        ([-0.1] * 99 + [100.0], [-0.1] * 100, False),  # a beginner earns no prize
+        ([-1000.0] + [-10.0] * 99, [-10.0] * 100, False),  # the same mean, a larger maximum
+        ([-1000.0, 500.0], [-10.0, 5.0], True),
+    ],
+)
+def test_demonstrated_rewards_of_another_scale_are_named_once(shown, own, is_other):
+    data = demonstrations()
+    model = make(demonstrations=dataclasses.replace(data, rewards=np.resize(shown, len(data))))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        model.expert.check_scale(np.resize(own, (499, 1)))
+        assert not caught
+        model.expert.check_scale(np.resize(own, (500, 1)))
+        model.expert.check_scale(np.resize(own, (500, 1)))
+    assert [("times the environment's" in str(one.message)) for one in caught] == [True] * is_other
+
+
+def test_demonstrated_rewards_are_compared_while_the_agent_learns():
+    data = demonstrations()
+    model = make(demonstrations=dataclasses.replace(data, rewards=100 * data.rewards), learning_starts=600)
+    with pytest.warns(UserWarning, match="the rewards in the demonstrations are .* times the environment's"):
+        model.learn(540)
+
+
 def test_demonstrations_that_are_set_later_are_checked_and_used(tmp_path):
     demonstrations().save(tmp_path / "demos.npz")
     model = make(demonstrations=tmp_path / "demos.npz").learn(20)

@@ -265,6 +265,13 @@ def test_wrong_guidance_keywords_are_named(wrong, named):
         imitating(guidance_kwargs=wrong)
 
 
+def test_demonstrations_that_come_later_warn_of_what_stays():
+    model = make(learning_starts=5)
+    model.demonstrations = demonstrations()
+    with pytest.warns(UserWarning, match="demonstrations were set after the agent was made without"):
+        model.learn(10)
+
+
 def test_without_demonstrations_there_is_no_bc_of_own_episodes():
     model = make(guidance="default", guidance_kwargs={"bc_updates": 500}, learning_starts=0)
     model.learn(80)
