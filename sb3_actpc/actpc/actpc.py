@@ -231,7 +231,8 @@ class ActPC(ActPCBase):
             check_own_learning_rates(self.policy, self.lr_schedule(1.0))
             needing = [name for name in NEED_DEMONSTRATIONS if getattr(self, name)]
             if not has_demonstrations and (needing or observation_normalization == "demonstrations"):
-                raise ValueError(f"{' and '.join(needing) or 'observation_normalization'} need demonstrations=")
+                needing = needing or ["observation_normalization"]
+                raise ValueError(f"{' and '.join(needing)}: give demonstrations=, or leave it out")
             self._setup_demonstrations()
 
     # ------------------------------------------------------------------ collecting (Algorithm 1, lines 8 to 16)

@@ -3,6 +3,7 @@
 import time
 import warnings
 from collections.abc import Iterable, Iterator
+from dataclasses import fields
 from os import PathLike
 from pathlib import Path
 from typing import Any, TypeVar
@@ -539,8 +540,11 @@ def make_guidance(given: ActorGuidance | str, settings: Settings | None) -> Acto
     """:raises ValueError: for another name, or keywords that the guidance has not"""
     if given not in ("default", "none") and not isinstance(given, ActorGuidance):
         raise ValueError(f"guidance={given!r} must be None, 'default', 'none' or an ActorGuidance")
-    with named_in_errors(f"guidance_kwargs={settings!r}", ValueError):
-        config = GuidanceConfig(**(settings or {}))
+    known = [one.name for one in fields(GuidanceConfig)]
+    unknown = sorted({*(settings or {})} - {*known})
+    if unknown:
+        raise ValueError(f"guidance_kwargs={settings!r} has unknown keys {unknown}: choose from {known}")
+    config = GuidanceConfig(**(settings or {}))
     if settings and given != "default":
         warnings.warn(f"guidance_kwargs={settings!r} have no effect without guidance='default'", stacklevel=4)
     if isinstance(given, ActorGuidance):
