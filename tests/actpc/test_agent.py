@@ -10,7 +10,6 @@ import pytest
 import torch as th
 from stable_baselines3.common.envs import BitFlippingEnv
 from stable_baselines3.common.evaluation import evaluate_policy
-from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
@@ -782,7 +781,6 @@ def test_vec_normalize_relabels_the_task_reward_alone():
         ({"policy_kwargs": {"critic_kwargs": {"hidden": [8]}}}, "critic_kwargs: a circuit has no keywords"),
         ({"policy_kwargs": {"optimizer_class": th.optim.LBFGS}}, "asks for a loss"),
         ({"policy_kwargs": {"critic_kwargs": {"learning_rate": 1.0}}, "learning_rate": lambda left: 1 - left}, "begin above"),
-        ({"action_noise": NormalActionNoise(np.zeros(3), np.ones(3))}, r"shapes \(3,\) and \(3,\), an action has \(2,\)"),
         ({"demonstration_fraction": 0.5}, "demonstration_fraction: give demonstrations="),
         ({"n_demonstrations": 3}, "n_demonstrations: give demonstrations="),
         ({"replay_buffer_kwargs": {"combine": True}}, "replay_buffer_kwargs=.*'combine'"),
