@@ -24,7 +24,7 @@ from sb3_actpc.actpc.policies import ActPCActor, ActPCPolicy
 from sb3_actpc.actpc.reward_signals import InternalSignals
 from sb3_actpc.actpc.self_imitation import Episodes, sample_union
 from sb3_actpc.actpc.validation import (
-    check_agreement,
+    check_keywords_agree,
     check_loaded_buffer,
     check_observations,
     check_own_learning_rates,
@@ -105,7 +105,7 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
         if self.action_space is None:
             raise ValueError("env=None: an environment or the id of one is needed, such as 'Pendulum-v1'")
         self._check_actions()
-        check_agreement(self.alpha_ep, self.optimize_memory_usage, self.bootstrap, self.n_steps)
+        check_keywords_agree(self.alpha_ep, self.optimize_memory_usage, self.bootstrap, self.n_steps)
         self.actor_guidance = make_guidance(self.guidance, self.guidance_kwargs)
         self._setup_lr_schedule()
         self.set_random_seed(self.seed)
@@ -130,6 +130,8 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
             raise ValueError(
                 "policy_kwargs has activation_fn: name one, policy_kwargs=dict(circuit_kwargs=dict(activation=...))"
             )
+        if "is_gated" in self.policy_kwargs:
+            raise ValueError("policy_kwargs has is_gated, which guidance sets: use guidance_kwargs=dict(gate=...)")
         with named_in_errors(f"policy_kwargs={self.policy_kwargs!r}", ValueError):
             circuit_kwargs = {"settling": self.settling, **(self.policy_kwargs.get("circuit_kwargs") or {})}
             if circuit_kwargs["settling"] != self.settling:
@@ -224,6 +226,8 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
 
     def pretrain(self) -> None:
         """Train the prior on the demonstrations and let guidance start, once; ``learn`` calls this."""
+        if self.expert is None and self.demonstrations is not None:  # of a loaded agent
+            self._setup_demonstrations()
         expert, env = self.expert, self._vec_normalize_env
         if expert is not None:
             if not self.is_pretrained and env is not None and env.norm_obs:
@@ -279,7 +283,7 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
         tb_log_name: str = "run",
         progress_bar: bool = False,
     ) -> tuple[int, BaseCallback]:
-        check_agreement(self.alpha_ep, self.optimize_memory_usage, self.bootstrap, self.n_steps)
+        check_keywords_agree(self.alpha_ep, self.optimize_memory_usage, self.bootstrap, self.n_steps)
         check_own_learning_rates(self.policy, self.lr_schedule(1.0))
         # Running episodes are cut where SB3 resets the environments, or someone else has stepped in them since
         if self.is_disturbed:
@@ -453,6 +457,8 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
         :param state: what :meth:`checkpoint_state` returned
         :raises ValueError: when it was taken with other demonstrations
         """
+        if self.expert is None and self.demonstrations is not None:  # ``set_env`` leaves them to what comes next
+            self._setup_demonstrations()
         stored = state["expert_signals"]
         n_stored, n_present = 0 if stored is None else len(stored[0]), 0 if self.expert is None else len(self.expert)
         if n_stored != n_present:

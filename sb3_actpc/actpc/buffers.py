@@ -199,8 +199,7 @@ class SignalReplay(ReplayBuffer):
             epistemic = self._summed(self.epistemic, window, envs, mask, rewards_of[0])
             instrumental = self._summed(self.instrumental, window, envs, mask, rewards_of[1])
         one_step_on = self.n_steps > 1 and rewards_of is not None
-        samples: Any = SignalReplaySamples  # of arrays
-        arrays = samples(
+        arrays = dict(
             observations=self._observations_at(rows, envs, env),
             actions=self.actions[rows, envs],
             next_observations=self._next_observations_at(last, envs, env),
@@ -215,7 +214,7 @@ class SignalReplay(ReplayBuffer):
             next_history=next_history,
             next_history_mask=next_history_mask,
         )
-        return to_device(arrays, th.device(self.device))
+        return SignalReplaySamples(**to_device(arrays, th.device(self.device)))
 
     def _observations_at(self, rows: np.ndarray, envs: np.ndarray, env: VecNormalize | None) -> Observations:
         return self._normalize_obs(map_observations(lambda array: array[rows, envs], self.observations), env)

@@ -90,8 +90,7 @@ class DemonstrationReplay:
             return values.reshape(-1, 1).astype(np.float32, copy=False)
 
         next_history, next_mask = self.episodes.past(last, self.history if n_steps > 1 else 0, including=True)
-        arrays: Any = SignalReplaySamples
-        arrays = arrays(
+        arrays = dict(
             observations=normalized(samples.observations, env),
             actions=samples.actions,
             next_observations=normalized(self._next(last), env),
@@ -106,7 +105,7 @@ class DemonstrationReplay:
             next_history=normalized(next_history, env),
             next_history_mask=next_mask,
         )
-        moved = to_device(arrays, actor.normalizer.mean.device)
+        moved = SignalReplaySamples(**to_device(arrays, actor.normalizer.mean.device))
         return Batch.of(moved, moved.rewards, actor)
 
     def _next(self, rows: np.ndarray) -> Observations:

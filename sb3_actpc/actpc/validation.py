@@ -13,7 +13,7 @@ from sb3_actpc.utils.nested import map_observations
 LARGEST_BOUND = 1e6  # of an observation; larger ones stand for none
 
 
-def check_agreement(alpha_ep: float, optimize_memory_usage: bool, bootstrap: str, n_steps: int) -> None:
+def check_keywords_agree(alpha_ep: float, optimize_memory_usage: bool, bootstrap: str, n_steps: int) -> None:
     """:raises ValueError: for keywords of the agent that do not go together"""
     if alpha_ep and optimize_memory_usage:
         raise ValueError(

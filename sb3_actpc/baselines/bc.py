@@ -194,16 +194,22 @@ class BCRNNPolicy(BCPolicy):
     :param hidden_size: units of each GRU layer
     :param n_layers: GRU layers
     :param restart_every: steps after which the state begins anew
-    :param options: ``optimizer_kwargs``
+    :param optimizer_kwargs: of AdamW
     :raises ValueError: for a keyword with a value that is not allowed
     """
 
     @checked
     def __init__(
-        self, *args: Any, hidden_size: Positive = 256, n_layers: Positive = 1, restart_every: Positive = 10, **options: Any
+        self,
+        *args: Any,
+        hidden_size: Positive = 256,
+        n_layers: Positive = 1,
+        restart_every: Positive = 10,
+        optimizer_kwargs: dict[str, Any] | None = None,
     ) -> None:
         self.hidden_size, self.n_layers, self.restart_every = hidden_size, n_layers, restart_every
-        super().__init__(*args, **options)
+        observed, acted, lr_schedule = args
+        super().__init__(observed, acted, lr_schedule, optimizer_kwargs=optimizer_kwargs)
 
     def _build(self, net_arch: list[int]) -> None:
         self.memory = nn.GRU(self.n_inputs, self.hidden_size, self.n_layers, batch_first=True)
@@ -379,7 +385,7 @@ class BCRNN(BC):
         super().__init__(*args, **options)
 
     def _new_policy(self, **options: Any) -> BCPolicy:
-        return super()._new_policy(restart_every=self.sequence_length)
+        return super()._new_policy(**{"restart_every": self.sequence_length, **options})
 
     def _loss(self, network: BCPolicy, rows: th.Tensor, noise: float = 0.0) -> th.Tensor:
         """Mean squared error of the actions over the steps, from (B,) rows on, that lie within an episode."""

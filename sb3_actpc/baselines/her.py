@@ -54,6 +54,8 @@ class PrioritizedHerReplayBuffer(DemonstrationHerReplayBuffer):
         """Those with their own goals come first; ``importance_weights`` then holds the weights, (B, 1)."""
         n_rows = self.size()
         is_whole = self.ep_length[:n_rows, :, None] > 0  # not of an episode that runs or is partly overwritten
+        if not is_whole.any():
+            raise RuntimeError("no episode has ended yet: raise learning_starts above the length of an episode")
         priorities = (self.priorities[:n_rows] * is_whole).ravel()
         sums = priorities.cumsum()
         # one from each B-th part of the total

@@ -55,6 +55,8 @@ class CheckpointCallback(BaseCallback):
         report: Report = warnings.warn,
         restored: Restored | None = None,
     ) -> None:
+        if save_freq < 1 or keep < 1:
+            raise ValueError(f"save_freq={save_freq!r} and keep={keep!r} must be at least 1")
         super().__init__()
         self.folder, self.save_freq, self.keep = Path(folder), save_freq, keep
         self.handle_signals, self.at_end = handle_signals, at_end
@@ -81,6 +83,10 @@ class CheckpointCallback(BaseCallback):
         if reason := why_no_checkpoints(type(self.model)):
             raise ValueError(f"{type(self.model).__name__} {reason}: leave the callback out")
         self.folder.mkdir(parents=True, exist_ok=True)
+        if self.restored is None and not self._last_saved and list_bundles(self.folder):
+            self.report(
+                f"{self.folder} holds checkpoints of another run, which this one's replace: give each run its own folder"
+            )
         if self.handle_signals:
             self.signals.install()
 

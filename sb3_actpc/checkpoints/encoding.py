@@ -7,11 +7,14 @@ their names, and objects by their attributes: the program that reads must have t
 
 import copyreg
 import functools
+import logging
+import pathlib
 import random
 import sys
 import types
 from collections import Counter, OrderedDict, deque
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from enum import Enum
 from typing import Any
 
@@ -29,13 +32,17 @@ Node = dict[str, Any]
 _DICTS: tuple[type, ...] = (dict, OrderedDict, Counter)
 _CONTAINERS: dict[str, Any] = {kind.__name__: kind for kind in (list, tuple, set, frozenset, deque, *_DICTS)}
 # constructors make these again, or they never change
-_UNCHANGED: tuple[Any, ...] = (type, np.dtype, th.device, EnvSpec, ResultsWriter, types.ModuleType, mujoco.MjModel)
+_UNCHANGED: tuple[Any, ...] = (
+    *(type, np.dtype, th.device, types.ModuleType, logging.Logger, pathlib.PurePath),
+    *(EnvSpec, ResultsWriter, mujoco.MjModel),
+)
 _METHODS = (types.MethodType, types.BuiltinFunctionType)
 # made from one array
 _FROM_ARRAY: dict[str, Callable[[np.ndarray], Any]] = {
     "array": np.copy,
     "scalar": lambda array: array[()],
     "tensor": lambda array: th.from_numpy(array.copy()),
+    "bytes": lambda array: array.tobytes(),
 }
 # generators that are made where there is none yet, by the name of their class
 _NEW: dict[str, Callable[[], Any]] = {
@@ -87,6 +94,16 @@ def _is_plain(value: Any) -> bool:
     return is_new and isinstance(state, (dict, types.NoneType)) and items == [None, None]
 
 
+def _filled_cells(function: Any) -> list[Any]:
+    """Its closure's cells without those that hold nothing yet."""
+    cells = []
+    for cell in function.__closure__ or ():
+        with suppress(ValueError):
+            cell.cell_contents  # noqa: B018
+            cells.append(cell)
+    return cells
+
+
 class Encoder:
     """Collects the table of nodes and the arrays in it, and why some values cannot be stored (``lost``)."""
 
@@ -119,6 +136,8 @@ class Encoder:
             return self._stored("tensor", value.detach().cpu().numpy())
         if isinstance(value, (np.ndarray, np.generic)):
             return self._array(value)
+        if isinstance(value, bytes):
+            return self._stored("bytes", np.array(list(value), dtype=np.uint8))
         if type(value) in _CONTAINERS.values():
             return self._container(value)
         for kind, (classes, get_state, _) in _STATES.items():
@@ -128,7 +147,7 @@ class Encoder:
 
     def _by_name(self, value: Any) -> Node:
         if isinstance(value, types.FunctionType):
-            cells = [cell.cell_contents for cell in value.__closure__ or ()]
+            cells = [cell.cell_contents for cell in _filled_cells(value)]
             return {"kind": "function", "name": _name_of(value), "cells": self.encode(cells)}
         if isinstance(value, _METHODS) and not isinstance(value.__self__, (type, types.ModuleType, types.NoneType)):
             return {"kind": "method", "name": value.__name__, "of": self.encode(value.__self__)}
@@ -169,8 +188,11 @@ class Encoder:
         return {**node, **maxlen, "items": [self.encode(part) for part in value]}
 
     def _object(self, value: Any) -> Node:
-        skipped = _SKIPPED if isinstance(value, gym.Env) else _SKIPPED_OF_VEC_ENVS if isinstance(value, VecEnv) else set()
-        skipped = {*skipped, *getattr(value, "checkpoint_skipped", ())}
+        skipped = {*getattr(value, "checkpoint_skipped", ())}
+        if isinstance(value, gym.Env):
+            skipped |= _SKIPPED
+        elif isinstance(value, VecEnv):
+            skipped |= _SKIPPED_OF_VEC_ENVS
         kept = {name: one for name, one in vars(value).items() if name not in skipped}
         own = self.encode(value.checkpoint_state()) if hasattr(value, "checkpoint_state") else None
         return {"kind": "object", "name": _name_of(value), "own": own, "attributes": self.encode_each(kept)}
@@ -274,7 +296,7 @@ class Decoder:
 
     def _function(self, node: Node, existing: Any, number: int) -> Any:
         self._made[number] = self._unchanged(node, existing, number)
-        cells = existing.__closure__ or ()
+        cells = _filled_cells(existing)
         contents = self.decode(node["cells"], [cell.cell_contents for cell in cells])
         for cell, content in zip(cells, contents, strict=True):
             cell.cell_contents = content

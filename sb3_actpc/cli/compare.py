@@ -20,7 +20,12 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
     add("--first-seed", type=int, metavar="N", help="the first of them (default: 0)")
     add("--output", metavar="DIR", help="folder of the comparison (default: runs/comparison)")
     add_run_options(parser)
-    add("--workers", type=count, metavar="N", help="runs at a time on this machine (default: one for each core)")
+    add(
+        "--workers",
+        type=count,
+        metavar="N",
+        help="runs at a time on this machine (default: as many as the cores allow with --threads each)",
+    )
     add("--engine", default="local", choices=["local", "ray"], help="processes, or a Ray cluster (default: local)")
     add("--address", help="Ray cluster to use (default: one is started on this machine)")
     add("--retry-failed", action="store_true", help="try runs again that failed before")
@@ -36,6 +41,8 @@ def run(args: argparse.Namespace) -> int:
     from sb3_actpc.experiments.runs.presets import missing_demonstrations
     from sb3_actpc.utils.extras import import_extra
 
+    if args.engine == "local" and args.address is not None:
+        raise ValueError(f"--address {args.address} is of a Ray cluster: give --engine ray, or leave it out")
     from_file = {} if args.file is None else read_comparison_file(Path(args.file))
     comparison = read_comparison(with_options(from_file, given(args, (*OWN_KEYS, *Run.known_keys()))))
     runs, folder = plan_runs(comparison), Path(comparison.output)

@@ -68,7 +68,8 @@ def fit_demonstrations(
     :raises FileNotFoundError: when there is no such file
     :raises ValueError: for demonstrations that are damaged, too few, of another task, or recorded behind other wrappers of
         observations or actions
-    :warns UserWarning: where other wrappers differ, or those of the recording are not known
+    :warns UserWarning: where episodes are longer than the environment's time limit, other wrappers differ, or those of the
+        recording are not known
     """
     has_goals = env is not None and env.has_attr("goal_demonstrations")
     demonstrations = resolve(source, None if has_goals else observation_space)  # they may be of the task without goals
@@ -96,6 +97,7 @@ def fit_demonstrations(
         raise ValueError(f"{error}: {fix}") from None
     if env is None:
         return demonstrations
+    _compare_lengths(demonstrations, env)
     _check_wrappers(demonstrations, env)
     return _transposed(demonstrations, env).rewarded_by(env)
 
@@ -104,6 +106,19 @@ def scaled_actions(demonstrations: Demonstrations, action_space: spaces.Box) -> 
     """(N, action_dim) float32, the actions scaled to [-1, 1]."""
     low, high = action_space.low.ravel(), action_space.high.ravel()
     return np.clip(2.0 * (demonstrations.actions - low) / (high - low) - 1.0, -1.0, 1.0).astype(np.float32)
+
+
+def _compare_lengths(demonstrations: Demonstrations, env: "VecEnv") -> None:
+    """A UserWarning for episodes that are longer than the environment lets an episode be."""
+    name = "_max_episode_steps"  # of TimeLimit; not every specification can be sent from another process
+    limit = env.get_attr(name, indices=[0])[0] if env.has_attr(name) else None
+    longest = int(np.diff(demonstrations.episode_bounds, axis=1).max())
+    if isinstance(limit, int) and longest > limit:
+        warnings.warn(
+            f"demonstrated episodes have up to {longest} steps, the environment's at most {limit}: their returns cannot be "
+            f"compared. Make it with gymnasium.make(..., max_episode_steps={longest}), or record in it as it is",
+            stacklevel=3,
+        )
 
 
 def _check_wrappers(demonstrations: Demonstrations, env: "VecEnv") -> None:

@@ -81,6 +81,7 @@ def resolve(run: Run) -> Run:
     preset = Run(**{name: value for name, value in entries.items() if value is not None})
     said = {name: getattr(run, name) for name in run.model_fields_set - {"settings"}}
     chosen = {name: value for name, value in said.items() if value is not None or name in CAN_BE_NONE}
+    is_noise_chosen = "noise_type" in {*run.settings, *run.model_fields_set}
     run = Run(**merged(preset, Run(**chosen)))
     if run.n_timesteps is None:
         raise ValueError(f"n_timesteps is neither in the preset {run.preset_name!r} nor given: give --steps")
@@ -89,10 +90,17 @@ def resolve(run: Run) -> Run:
     getattr(algorithm, "check_installed", lambda: None)()
     if run.noise_type is not None and run.noise_std is None:
         raise ValueError(f"noise_type={run.noise_type!r} needs a standard deviation: give noise_std, such as 0.1")
+    if run.noise_std is not None and run.noise_type is None and not is_noise_chosen:
+        raise ValueError(f"noise_std={run.noise_std} is of no noise: give noise_type=normal too, or leave it out")
+    if run.noise_type is not None and "action_noise" not in constructor_keywords(algorithm):
+        raise ValueError(f"{algorithm.__name__} takes no action noise: leave noise_type and noise_std out")
     eval_freq = run.eval_freq or max(1, run.n_timesteps // 10)
+    checkpoint_freq = eval_freq if run.checkpoint_freq is None else run.checkpoint_freq
     without = why_no_checkpoints(algorithm)
     if without and run.checkpoint_freq:
         raise ValueError(f"{run.algo} {without}: leave --checkpoint-freq out, or give 0")
+    if without:
+        checkpoint_freq = 0
     normalize = run.normalize
     if normalize is not None and "gamma" in settings:
         normalize = {"gamma": settings["gamma"], **normalize}
@@ -103,7 +111,7 @@ def resolve(run: Run) -> Run:
         "noise_std": None if run.noise_type is None else run.noise_std,
         "normalize": normalize,
         "eval_freq": eval_freq,
-        "checkpoint_freq": 0 if without else eval_freq if run.checkpoint_freq is None else run.checkpoint_freq,
+        "checkpoint_freq": checkpoint_freq,
         "demonstrations_sha256": demonstrations_hash(run),
         "is_resolved": True,
     }
