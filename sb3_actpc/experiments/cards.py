@@ -97,7 +97,7 @@ def _card_text(run: Run, result: dict[str, Any], name: str, has_video: bool) -> 
     parts = [
         f"---\n{yaml.safe_dump(metadata, sort_keys=False)}---",
         f"# {run.algo} on {run.env}",
-        f"An agent of {run.algo}, trained by [sb3_actpc](https://pypi.org/project/sb3-actpc/), a Stable-Baselines3 plugin.",
+        f"An agent of {run.algo}, trained by `sb3_actpc`, a Stable-Baselines3 plugin.",
         "| | |\n| --- | --- |\n" + "\n".join(rows),
         *(["The first evaluation episode is in `replay.mp4`."] if has_video else []),
         f"## Use\n\n{_usage(run, name)}",

@@ -112,7 +112,7 @@ def is_finished(folder: Path) -> bool:
 def read_result(folder: Path) -> dict[str, Any]:
     """The content of ``result.json``; FileNotFoundError when the run is not finished, ValueError when the file is damaged."""
     if not is_finished(folder):
-        raise FileNotFoundError(f"no result in {folder}: the run is not finished")
+        raise FileNotFoundError(f"no result in {folder}: there is no run, or the run is not finished")
     return _read_json(folder / RESULT)
 
 
