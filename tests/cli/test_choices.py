@@ -74,8 +74,7 @@ def test_a_minari_dataset_is_named_by_its_id(monkeypatch: pytest.MonkeyPatch, ca
     assert main([*quick, "--demonstrations", "line/still-v0"]) == 0
     record = json.loads(Path("mine/config.json").read_text(encoding="utf-8"))
     assert (record["demonstrations"], record["demonstrators_return"]) == ("line/still-v0", 20.0)
-    agent = sb3_actpc.ActPC.load("mine/model.zip", env=gym.make(ENV_ID))
-    assert agent.demonstrations == "line/still-v0" and len(agent.expert) == len(shown)
+    assert sb3_actpc.ActPC.load("mine/model.zip", env=gym.make(ENV_ID)).demonstrations == "line/still-v0"
     resume = ["train", "--resume", "mine", "--steps", "10", "--no-progress"]
     assert main(resume) == 0
     shutil.rmtree("sets")
