@@ -132,7 +132,7 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
             )
         if "is_gated" in self.policy_kwargs:
             raise ValueError("policy_kwargs has is_gated, which guidance sets: use guidance_kwargs=dict(gate=...)")
-        with named_in_errors(f"policy_kwargs={self.policy_kwargs!r}", ValueError):
+        with named_in_errors(f"policy_kwargs={self.policy_kwargs!r}", ValueError, AssertionError):
             circuit_kwargs = {"settling": self.settling, **(self.policy_kwargs.get("circuit_kwargs") or {})}
             if circuit_kwargs["settling"] != self.settling:
                 raise ValueError(f"circuit_kwargs has settling={circuit_kwargs['settling']!r}: give settling= to the agent")
@@ -143,7 +143,7 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
         return policy
 
     def _make_replay_buffer(self) -> SignalReplay:
-        kind = combined_buffer_class(self.replay_buffer_class, self.observation_space, self.env)
+        kind = combined_buffer_class(self.replay_buffer_class, self.observation_space, self.env, self.n_steps)
         kwargs: dict[str, Any] = {"history": self.policy.memory_history, "n_steps": self.n_steps, "gamma": self.gamma}
         if issubclass(kind, HerReplayBuffer):
             kwargs["env"] = self.env

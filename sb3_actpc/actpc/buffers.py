@@ -263,6 +263,10 @@ class CombinedReplayBuffer(SignalReplay):
     """ActPC's replay buffer for Box observations; see :class:`SignalReplay`."""
 
 
+class CombinedNStepReplayBuffer(SignalReplay, NStepReplayBuffer):
+    """The same as SB3's n-step class: chosen for ``n_steps`` above 1."""
+
+
 class CombinedDictReplayBuffer(SignalReplay, DictReplayBuffer):  # type: ignore[misc]
     """ActPC's replay buffer for Dict observations; see :class:`SignalReplay`."""
 
@@ -338,7 +342,7 @@ class CombinedHerReplayBuffer(SignalReplay, HerReplayBuffer):  # type: ignore[mi
 
 _COUNTERPARTS: dict[type[ReplayBuffer], type[SignalReplay]] = {
     ReplayBuffer: CombinedReplayBuffer,
-    NStepReplayBuffer: CombinedReplayBuffer,
+    NStepReplayBuffer: CombinedNStepReplayBuffer,
     DictReplayBuffer: CombinedDictReplayBuffer,
     HerReplayBuffer: CombinedHerReplayBuffer,
 }
@@ -352,7 +356,7 @@ def relabels(given: Any) -> bool:
 
 
 def combined_buffer_class(
-    given: type[ReplayBuffer] | str | None, observation_space: spaces.Space, env: VecEnv | None
+    given: type[ReplayBuffer] | str | None, observation_space: spaces.Space, env: VecEnv | None, n_steps: int = 1
 ) -> type[SignalReplay]:
     """
     ActPC's counterpart of a class of SB3's.
@@ -360,12 +364,15 @@ def combined_buffer_class(
     :param given: a class, its name, or None
     :param observation_space: the environment's
     :param env: the environment
+    :param n_steps: length of the returns
     :raises ValueError: for a class without a counterpart, or for other observations
     """
     has_parts = isinstance(observation_space, spaces.Dict)
     kind: Any = _BY_NAME.get(given, given) if isinstance(given, str) else given
-    if kind is None:
-        kind = DictReplayBuffer if has_parts else ReplayBuffer
+    if kind is None and has_parts:
+        kind = DictReplayBuffer
+    elif kind is None:
+        kind = NStepReplayBuffer if n_steps > 1 else ReplayBuffer
     if isinstance(kind, type):
         kind = _COUNTERPARTS.get(kind, kind)
     if not (isinstance(kind, type) and issubclass(kind, SignalReplay)):

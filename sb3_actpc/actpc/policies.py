@@ -120,6 +120,11 @@ class ActPCActor(BasePolicy):
         self.circuit = circuit
         self.deployed = circuit.projection_copy() if is_gated else None
 
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        data = super()._get_constructor_parameters()
+        parts = {"features_extractor": self.features_extractor, "memory": self.memory, "circuit": self.circuit}
+        return {**data, **parts, "is_gated": self.deployed is not None}
+
     @property
     def acting(self) -> NGCCircuit:
         """The circuit that acts: the deployed one where there is a deployment gate."""
