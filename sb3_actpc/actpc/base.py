@@ -143,7 +143,9 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
         return policy
 
     def _make_replay_buffer(self) -> SignalReplay:
-        kind = combined_buffer_class(self.replay_buffer_class, self.observation_space, self.env, self.n_steps)
+        # With optimize_memory_usage the plain class refuses n-step returns by name
+        n_steps = 1 if self.optimize_memory_usage else self.n_steps
+        kind = combined_buffer_class(self.replay_buffer_class, self.observation_space, self.env, n_steps)
         kwargs: dict[str, Any] = {"history": self.policy.memory_history, "n_steps": self.n_steps, "gamma": self.gamma}
         if issubclass(kind, HerReplayBuffer):
             kwargs["env"] = self.env
