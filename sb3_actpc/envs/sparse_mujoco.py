@@ -83,12 +83,6 @@ class SparseReacherEnv(_SparseMujocoEnv):
         distances = np.linalg.norm(demonstrations.next_observations[:, 8:], axis=1)  # fingertip minus target
         return np.where(distances <= self.threshold, 1.0, self.miss_reward).astype(np.float32)
 
-    def demonstrated_positions(self, demonstrations: Demonstrations) -> np.ndarray:
-        """Generalised positions after every recorded transition, (N, 4) float64, to draw the demonstrator with: both joint
-        angles and the target's position."""
-        cosines, sines, targets = np.split(demonstrations.next_observations[:, :6].astype(np.float64), 3, axis=1)
-        return np.concatenate([np.arctan2(sines, cosines), targets], axis=1)
-
     def _sparse_reward(self, info: dict[str, Any]) -> tuple[float, bool]:
         distance = np.linalg.norm(self.get_body_com("fingertip") - self.get_body_com("target"))
         is_near = bool(distance <= self.threshold)
@@ -142,16 +136,6 @@ class SparseLocomotionEnv(_SparseMujocoEnv):
         if self.condition == "forward":
             return (self.demonstrated_velocities(demonstrations) > self.velocity).astype(np.float32)
         return (self.demonstrated_distances(demonstrations) > self.distance).astype(np.float32)
-
-    def demonstrated_positions(self, demonstrations: Demonstrations) -> np.ndarray:
-        """Generalised positions after every recorded transition, (N, nq) float64, to draw the demonstrator with: the observed
-        ones, and the distance travelled along x (the Swimmer's y, not observed either, stays 0)."""
-        assert self.model is not None
-        positions = np.zeros((len(demonstrations), self.model.nq))
-        positions[:, 0] = self.demonstrated_distances(demonstrations)
-        n_observed = demonstrations.next_observations.shape[1] - self.model.nv
-        positions[:, -n_observed:] = demonstrations.next_observations[:, :n_observed]
-        return positions
 
     def demonstrated_distances(self, demonstrations: Demonstrations) -> np.ndarray:
         """x - x_0 in metres after each recorded transition, (N,) float64."""

@@ -313,23 +313,3 @@ def test_demonstrations_of_a_reacher_that_is_shown_otherwise_keep_their_rewards(
     env = make_vec_env("SparseReacher-v5")
     assert np.array_equal(cut.rewarded_by(env).rewards, recorded.rewards)
     env.close()
-
-
-@pytest.mark.parametrize("env_id", SPARSE_MUJOCO_IDS)
-def test_the_demonstrator_is_drawn_where_it_was(env_id: str) -> None:
-    """Angles and travelled distance; the Swimmer's and the start's sideways position are in no recording."""
-    recorded = record(env_id, 1, 50)
-    env = gym.make(env_id)
-    env.reset(seed=0)
-    simulator = env.unwrapped
-    start = simulator.data.qpos.copy()
-    drawn = simulator.demonstrated_positions(recorded)
-    assert drawn.shape == (len(recorded), simulator.model.nq)
-    n_unobserved = 0 if "Reacher" in env_id else 2 if "Swimmer" in env_id else 1
-    for action, row in zip(recorded.actions, drawn, strict=True):
-        env.step(action)
-        turns = np.round((simulator.data.qpos - row) / (2 * np.pi)) * 2 * np.pi if "Reacher" in env_id else 0.0
-        assert np.allclose(simulator.data.qpos[n_unobserved:], (row + turns)[n_unobserved:], atol=1e-4)
-        if n_unobserved:
-            assert row[0] == pytest.approx(simulator.data.qpos[0] - start[0], abs=1e-4)
-    env.close()
