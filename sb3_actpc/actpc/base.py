@@ -215,7 +215,8 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
             self._setup_demonstrations()
         # one discount and one length of returns for what is replayed and what is demonstrated, of a loaded buffer too
         self.replay_buffer.set_returns(self.n_steps, self.gamma)
-        if (memory := self.replay_buffer.self_imitation) is not None:
+        memory = self.replay_buffer.self_imitation
+        if memory is not None:
             memory.takes_all = self.actor_guidance.stores == "positive" and self.expert is not None
         if self.demonstrations is None:
             self.demonstration_fraction, self.n_demonstrations, self.n_demonstration_transitions = 0.0, None, None
@@ -370,7 +371,8 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
         if n_batches < 1:
             return iter(())
         expert, actor, env = self.expert, self.actor, self._vec_normalize_env
-        weights, normalizers = self.reward_weights, self.signals.replayed if any(self.reward_weights[1:]) else None
+        weights = self.reward_weights
+        normalizers = self.signals.replayed if any(weights[1:]) else None
         # Now and then the signals of demonstrated transitions are computed anew, by the present generator
         if expert is not None and self.demonstration_fraction and normalizers is not None:
             if self._n_updates % RESCORING_INTERVAL == 1 or not expert.has_signals:
@@ -462,7 +464,8 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
         if self.expert is None and self.demonstrations is not None:  # ``set_env`` leaves them to what comes next
             self._setup_demonstrations()
         stored = state["expert_signals"]
-        n_stored, n_present = 0 if stored is None else len(stored[0]), 0 if self.expert is None else len(self.expert)
+        n_stored = 0 if stored is None else len(stored[0])
+        n_present = 0 if self.expert is None else len(self.expert)
         if n_stored != n_present:
             raise ValueError(
                 f"the checkpoint's agent has {n_stored} demonstrated transitions, this one {n_present}: pass the same "

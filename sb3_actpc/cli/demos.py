@@ -125,7 +125,9 @@ def _collect_scripted(args: argparse.Namespace) -> Any:
 
     if args.mixed and args.proficiency is not None:
         raise ValueError(f"--proficiency {args.proficiency} and --mixed, which has six of them: give one of the two")
-    proficiency = "mixed" if args.mixed else 1.0 if args.proficiency is None else args.proficiency
+    proficiency = 1.0 if args.proficiency is None else args.proficiency
+    if args.mixed:
+        proficiency = "mixed"
     n_episodes = args.episodes or 50 * (len(MIXED_DEMONSTRATORS) if args.mixed else 1)
     _report(f"scripted demonstrators in {args.env}, proficiency: {proficiency}")
     options = ("env", "demonstrator", "proficiency", "mixed", "obs", "episodes", "max_tries", "seed")
@@ -182,7 +184,9 @@ def command_line(args: argparse.Namespace, options: Sequence[str]) -> str:
     for option in options:
         value = getattr(args, option)
         if value is not None and value is not False and value != []:
-            values = value if isinstance(value, list) else [] if value is True else [value]
+            values = value if isinstance(value, list) else [value]
+            if value is True:
+                values = []
             words += ["--" + option.replace("_", "-"), *(f"{one:.0f}" if option == "steps" else str(one) for one in values)]
     return shlex.join(words)
 

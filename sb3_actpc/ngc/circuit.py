@@ -321,16 +321,17 @@ class NGCCircuit(nn.Module):
             raise ValueError("no optimizer: set circuit.optimizer = torch.optim.Adam(circuit.parameter_groups(1e-3)) first")
         # W, M and E decay; biases do not
         biases = set(map(id, self.synapses.biases))
-        for group in self.optimizer.param_groups if self.weight_decay else ():
+        for group in self.optimizer.param_groups:
             matrices = [parameter for parameter in group["params"] if id(parameter) not in biases]
-            if matrices:
+            if matrices and self.weight_decay:
                 th._foreach_mul_(matrices, max(0.0, 1.0 - group["lr"] * self.weight_decay))
         bounded = [*self.synapses.weights, *self.synapses.feedback]
         old = [parameter.clone() for parameter in bounded] if self.synaptic_scaling == "soft_bound" else []
         # The optimizer ascends where it can, as torch's own: no product for the sign
         ascends = "maximize" in self.optimizer.defaults
-        for group in self.optimizer.param_groups if ascends else ():
-            group["maximize"] = True
+        if ascends:
+            for group in self.optimizer.param_groups:
+                group["maximize"] = True
         targets = [*self.synapses.weights, *self.synapses.biases, *self.synapses.memory]
         given = changes.tensors() if ascends else th._foreach_neg(changes.tensors())
         for parameter, gradient in zip(targets, given, strict=True):
