@@ -156,5 +156,5 @@ def test_what_an_algorithm_or_an_environment_does_not_take_is_said() -> None:
         make_train_env("Pendulum-v1", {}, 1, 0, {"norm_ob": False})
     with pytest.raises(ValueError, match="PPO takes no action noise"):
         resolve(Run(env="Pendulum-v1", algo="ppo", settings={"noise_type": "normal", "noise_std": 0.1}))
-    with pytest.raises(ValueError, match="noise_std=0.1 is of no noise"):
+    with pytest.raises(ValueError, match=r"noise_std=0\.1 is of no noise"):
         resolve(Run(env="Pendulum-v1", algo="sac", settings={"noise_std": 0.1}))
