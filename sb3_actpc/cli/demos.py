@@ -3,17 +3,19 @@
 import argparse
 import shlex
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import closing, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+from sb3_actpc.cli import count
 from sb3_actpc.envs import ROBOSUITE_IDS, SPARSE_IDS, sparse_env_id
 from sb3_actpc.utils.files import folder_name
 
 Subparsers = Any  # argparse's own type is private
-HDF5_SUFFIXES = (".hdf5", ".h5")
+OBS_HELP = "observations of the task, paper or robomimic (default: paper)"
+ROBOSUITE_HELP = f"one of {', '.join(ROBOSUITE_IDS)}"
 _report = partial(print, flush=True)
 
 
@@ -21,23 +23,32 @@ def add_parser(subparsers: Subparsers) -> None:
     parser = subparsers.add_parser("demos", help="make or look at demonstration files")
     commands = parser.add_subparsers(dest="demos_command", required=True, metavar="{collect,convert,download,info}")
     _add_collect(commands)
-    _add_convert(commands)
-    _add_download(commands)
+    about = "make an .npz file of an HDF5 one of robomimic (low-dimensional) or robosuite (demo.hdf5, replayed)"
+    add = commands.add_parser("convert", help=about, description=about).add_argument
+    add("file", type=Path, metavar="FILE", help="the HDF5 file")
+    add("--env", required=True, metavar="ID", help=ROBOSUITE_HELP)
+    add("--obs", default="paper", metavar="LAYOUT", help=OBS_HELP)
+    add("--filter-key", metavar="KEY", help="only robomimic's mask/KEY, such as better or 20_percent")
+    add("--output", type=Path, metavar="FILE", help=".npz file to write (default: FILE with this suffix)")
+    about = "fetch robomimic's 300 human demonstrations (MIT licence, 30 to 130 MB), check and convert them"
+    add = commands.add_parser("download", help=about, description=about).add_argument
+    add("--env", required=True, metavar="ID", help=ROBOSUITE_HELP)
+    add("--url", help="another address of such a file")
+    add("--obs", default="paper", metavar="LAYOUT", help=OBS_HELP)
+    add("--output", type=Path, metavar="FILE", help=".npz file to write (default: <task>_mh.npz)")
     info = commands.add_parser("info", help="print what a demonstration file holds")
     info.add_argument("file", type=Path, metavar="FILE")
 
 
 def _add_collect(commands: Subparsers) -> None:
-    about = (
-        "record successful episodes of a trained demonstrator (of a sparse MuJoCo task: on its dense one), or a scripted one"
-    )
+    about = "record successful episodes of a demonstrator: trained (of a sparse MuJoCo task: on its dense one), or scripted "
+    about += "(of robosuite's tasks)"
     collect = commands.add_parser("collect", help=about, description=f"{about}. A training that was stopped goes on.")
     add = collect.add_argument
     add("--env", required=True, metavar="ID", help="Gymnasium id, such as SparseHopper-v5 (of a goal task: its sparse one)")
-    add("--demonstrator", choices=["trained", "scripted"], help="default: scripted for robosuite tasks, else trained")
-    add("--episodes", type=int, help="episodes to record (default: 20; scripted 50, or 300 when mixed)")
-    add("--max-tries", type=int, help="episodes to play at most (default: ten times --episodes)")
-    several = "a trained one and itself when it stood at half the return, or six scripted ones of three proficiencies"
+    add("--episodes", type=count, help="episodes to record (default: 20; scripted 50, or 300 when mixed)")
+    add("--max-tries", type=count, help="episodes to play at most (default: ten times --episodes)")
+    several = "a trained one and itself when it stood at half the return, or six scripted ones of three levels"
     add("--mixed", action="store_true", help=f"several demonstrators in turn: {several}")
     add("--seed", type=int, default=0, help="of the demonstrator and of the recording (default: 0)")
     add("--output", type=Path, metavar="FILE", help="file to write (default: sparse_<task>.npz)")
@@ -53,59 +64,34 @@ def _add_collect(commands: Subparsers) -> None:
     add("--gym-packages", nargs="+", default=[], metavar="MODULE", help="modules that register the task")
     add = collect.add_argument_group("scripted demonstrators").add_argument
     add("--proficiency", type=float, metavar="P", help="from 0 (clumsy) to 1 (sure, the default)")
-    add("--obs", metavar="LAYOUT", help="of the task, paper or robomimic (default: paper)")
-
-
-def _add_convert(commands: Subparsers) -> None:
-    about = "HDF5 of robomimic (low-dimensional) or robosuite (demo.hdf5, replayed) to .npz, or .npz to robomimic's HDF5"
-    add = commands.add_parser("convert", help=about, description=about).add_argument
-    add("file", type=Path, metavar="FILE", help=".hdf5 or .npz")
-    add("--env", metavar="ID", help=f"task of an .hdf5 file, one of {', '.join(ROBOSUITE_IDS)}")
-    add("--obs", metavar="LAYOUT", help="observations, paper or robomimic (default: paper)")
-    add("--filter-key", metavar="KEY", help="only robomimic's mask/KEY, such as better or 20_percent")
-    add("--output", type=Path, metavar="FILE", help="file to write (default: FILE with the other suffix)")
-
-
-def _add_download(commands: Subparsers) -> None:
-    about = "fetch robomimic's human demonstrations (MIT licence, 30 to 130 MB), check and convert them"
-    add = commands.add_parser("download", help=about, description=about).add_argument
-    add("--env", required=True, metavar="ID", help=f"one of {', '.join(ROBOSUITE_IDS)}")
-    add("--kind", default="mh", metavar="{mh,ph}", help="mh: 300 by six humans of three levels (default); ph: 200 by one")
-    add("--url", help="another address of such a file")
-    add("--obs", default="paper", metavar="LAYOUT", help="observations, paper or robomimic (default: paper)")
-    add("--output", type=Path, metavar="FILE", help=".npz file to write (default: <task>_<kind>.npz)")
+    add("--obs", metavar="LAYOUT", help=OBS_HELP)
 
 
 def run(args: argparse.Namespace) -> int:
     from sb3_actpc.checkpoints import EXIT_STOPPED, TrainingStopped
 
     commands = {"collect": _collect, "convert": _convert, "download": _download, "info": _info}
-    if args.demos_command in ("convert", "download") and args.env is not None:
-        args.env = args.env.rpartition(":")[2]  # robosuite's tasks, also with this package's module
     try:
-        return commands[args.demos_command](args)
+        commands[args.demos_command](args)
     except TrainingStopped as stop:  # of a demonstrator
         print(f"sb3-actpc: {stop}; the same command goes on with it", file=sys.stderr)
         return EXIT_STOPPED
+    return 0
 
 
-def _collect(args: argparse.Namespace) -> int:
+def _collect(args: argparse.Namespace) -> None:
     known = sparse_env_id(args.env.rpartition(":")[2])  # what is recorded in it serves the goal task
-    args.env = known if known in SPARSE_IDS else args.env
-    demonstrator = args.demonstrator or ("scripted" if args.env in ROBOSUITE_IDS else "trained")
-    if demonstrator == "trained" and (args.proficiency, args.obs) != (None, None):
+    if known in SPARSE_IDS:
+        args.env = known
+    is_scripted = args.env in ROBOSUITE_IDS
+    if not is_scripted and (args.proficiency is not None or args.obs is not None):
         raise ValueError("--proficiency and --obs are for scripted demonstrators of robosuite tasks: leave them out")
-    if demonstrator == "scripted" and (args.stochastic or args.quality is not None or args.target_return is not None):
+    if is_scripted and (args.stochastic or args.quality is not None or args.target_return is not None):
         raise ValueError("--stochastic, --quality and --target-return are for trained demonstrators: give --proficiency")
-    for option in ("episodes", "max_tries"):  # before anybody is trained for it
-        number = getattr(args, option)
-        if number is not None and number < 1:
-            raise ValueError(f"--{option.replace('_', '-')} {number} must be at least 1")
     output = args.output or _default_output(args.env)
     if output.is_dir():
         raise IsADirectoryError(f"--output {output} is a folder: give the file in it, such as {output / 'demos.npz'}")
-    demonstrations = _collect_scripted(args) if demonstrator == "scripted" else _collect_trained(args)
-    return _save(demonstrations, output)
+    _save(_collect_scripted(args) if is_scripted else _collect_trained(args), output)
 
 
 def _default_output(env_id: str, suffix: str = "") -> Path:
@@ -113,25 +99,25 @@ def _default_output(env_id: str, suffix: str = "") -> Path:
     return Path(f"{name.replace('sparse', 'sparse_', 1)}{suffix}.npz")
 
 
-def _save(demonstrations: Any, output: Path, write: Callable[..., None] | None = None) -> int:
-    (write or type(demonstrations).save)(demonstrations, output)
+def _save(demonstrations: Any, output: Path) -> None:
+    demonstrations.save(output)
     _report(repr(demonstrations))
     _report(f"wrote {output} ({output.stat().st_size / 1e6:.2f} MB)")
-    return 0
 
 
 def _collect_scripted(args: argparse.Namespace) -> Any:
-    from sb3_actpc.demonstrations import MIXED_DEMONSTRATORS, collect_scripted
+    from sb3_actpc.demonstrations import MIXED_PROFICIENCIES, collect_scripted
 
-    if args.mixed and args.proficiency is not None:
-        raise ValueError(f"--proficiency {args.proficiency} and --mixed, which has six of them: give one of the two")
+    n_episodes = 50
     proficiency = 1.0 if args.proficiency is None else args.proficiency
     if args.mixed:
+        if args.proficiency is not None:
+            raise ValueError(f"--proficiency {args.proficiency} and --mixed, which has six of them: give one of the two")
         proficiency = "mixed"
-    n_episodes = args.episodes or 50 * (len(MIXED_DEMONSTRATORS) if args.mixed else 1)
+        n_episodes *= len(MIXED_PROFICIENCIES)
     _report(f"scripted demonstrators in {args.env}, proficiency: {proficiency}")
-    options = ("env", "demonstrator", "proficiency", "mixed", "obs", "episodes", "max_tries", "seed")
-    given = (args.env, proficiency, n_episodes, args.seed, args.obs or "paper", {"command": command_line(args, options)})
+    metadata = {"command": command_line(args, ("env", "proficiency", "mixed", "obs", "episodes", "max_tries", "seed"))}
+    given = (args.env, proficiency, args.episodes or n_episodes, args.seed, args.obs or "paper", metadata)
     return collect_scripted(*given, max_tries=args.max_tries, report=_report)
 
 
@@ -183,44 +169,43 @@ def command_line(args: argparse.Namespace, options: Sequence[str]) -> str:
     words = ["sb3-actpc", "demos", "collect"]
     for option in options:
         value = getattr(args, option)
-        if value is not None and value is not False and value != []:
-            values = value if isinstance(value, list) else [value]
-            if value is True:
-                values = []
-            words += ["--" + option.replace("_", "-"), *(f"{one:.0f}" if option == "steps" else str(one) for one in values)]
+        if value is None or value is False or value == []:
+            continue
+        words.append("--" + option.replace("_", "-"))
+        if option == "steps":
+            words.append(f"{value:.0f}")
+        elif isinstance(value, list):
+            words += value
+        elif value is not True:
+            words.append(str(value))
     return shlex.join(words)
 
 
-def _convert(args: argparse.Namespace) -> int:
-    from sb3_actpc.demonstrations import Demonstrations, read_hdf5, write_robomimic
+def _convert(args: argparse.Namespace) -> None:
+    from sb3_actpc.demonstrations import read_hdf5
 
-    is_npz = args.file.suffix == ".npz"
-    output = args.output or args.file.with_suffix(".hdf5" if is_npz else ".npz")
-    if output.resolve() == args.file.resolve() or (args.output is None and output.exists()):
+    output = args.output or args.file.with_suffix(".npz")
+    _check_suffix(output)
+    if args.output is None and output.exists():
         raise FileExistsError(f"{output} is there already: give another --output, what it holds may be more")
-    if output.suffix not in (suffixes := HDF5_SUFFIXES if is_npz else (".npz",)):
-        raise ValueError(f"--output {output} must end in {' or '.join(suffixes)}")
-    if is_npz:
-        for option in ("env", "obs", "filter_key"):
-            if getattr(args, option) is not None:
-                raise ValueError(f"--{option.replace('_', '-')} is for HDF5 files: leave it out")
-        return _save(Demonstrations.load(args.file), output, write_robomimic)
-    if args.env is None:
-        raise ValueError(f"--env is needed to convert {args.file}: give one of {', '.join(ROBOSUITE_IDS)}")
-    return _save(read_hdf5(args.file, args.env, args.obs or "paper", args.filter_key), output)
+    _save(read_hdf5(args.file, args.env, args.obs, args.filter_key), output)
 
 
-def _download(args: argparse.Namespace) -> int:
+def _download(args: argparse.Namespace) -> None:
     from sb3_actpc.demonstrations.robomimic import download_robomimic, robomimic_url
 
-    url = args.url or robomimic_url(args.env, args.kind)
-    output = args.output or _default_output(args.env, f"_{args.kind}")
-    if output.suffix in HDF5_SUFFIXES:
-        raise ValueError(f"--output {output} must end in .npz: what is fetched goes beside it, as an .hdf5 file")
-    return _save(download_robomimic(args.env, output.with_suffix(".hdf5"), url, args.obs, _report), output)
+    output = args.output or _default_output(args.env, "_mh")
+    _check_suffix(output)  # what is fetched goes beside it, as an .hdf5 file
+    url = args.url or robomimic_url(args.env)
+    _save(download_robomimic(args.env, output.with_suffix(".hdf5"), url, args.obs, _report), output)
 
 
-def _info(args: argparse.Namespace) -> int:
+def _check_suffix(output: Path) -> None:
+    if output.suffix != ".npz":
+        raise ValueError(f"--output {output} must end in .npz")
+
+
+def _info(args: argparse.Namespace) -> None:
     from sb3_actpc.demonstrations import Demonstrations
 
     if not args.file.is_file():
@@ -233,4 +218,3 @@ def _info(args: argparse.Namespace) -> int:
             _report(f"{name} return: mean {returns.mean():.1f}, min {returns.min():.1f}, max {returns.max():.1f}")
     for key, value in demonstrations.metadata.items():
         _report(f"{key}: {value}")
-    return 0

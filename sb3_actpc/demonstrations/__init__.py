@@ -5,11 +5,11 @@ Every source gives a :class:`Demonstrations`.
 
 from sb3_actpc.demonstrations.dataset import Demonstrations, shipped_demonstrations
 from sb3_actpc.demonstrations.fitting import fit_demonstrations, is_minari_id, resolve, scaled_actions
-from sb3_actpc.demonstrations.robomimic import read_hdf5, write_robomimic
-from sb3_actpc.demonstrations.scripted import MIXED_DEMONSTRATORS, ScriptedDemonstrator, collect_scripted
+from sb3_actpc.demonstrations.robomimic import read_hdf5
+from sb3_actpc.demonstrations.scripted import MIXED_PROFICIENCIES, ScriptedDemonstrator, collect_scripted
 
 __all__ = [
-    "MIXED_DEMONSTRATORS",
+    "MIXED_PROFICIENCIES",
     "Demonstrations",
     "ScriptedDemonstrator",
     "collect_scripted",
@@ -19,5 +19,4 @@ __all__ = [
     "resolve",
     "scaled_actions",
     "shipped_demonstrations",
-    "write_robomimic",
 ]

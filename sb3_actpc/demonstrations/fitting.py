@@ -127,9 +127,15 @@ def _check_wrappers(demonstrations: Demonstrations, env: "VecEnv") -> None:
     is_collected = str(demonstrations.metadata.get("command", "")).startswith("sb3-actpc demos collect")
     recorded = demonstrations.metadata.get("wrappers", [] if is_collected else None)
     try:
-        found = wrapper_names(str(env.env_method("__str__", indices=[0])[0]))
+        written = str(env.env_method("__str__", indices=[0])[0])
     except (AttributeError, NotImplementedError):  # not every kind of vectorised environment can be asked
+        warnings.warn(
+            f"{type(env.unwrapped).__name__} does not name its wrappers (env_method): make sure that the demonstrations were "
+            "recorded behind the same ones, in the units of the agent",
+            stacklevel=3,
+        )
         return
+    found = wrapper_names(written)
     if found == (recorded or []):
         return
     theirs = "wrappers that are not known" if recorded is None else ", ".join(recorded) or "no wrapper"

@@ -21,21 +21,24 @@ OTHERS = (
 
 _ARRAYS = ("observations", "actions", "rewards", "terminations", "episode_starts")
 _TEXTS = ("env_id", "metadata")
-_NEXT = ("next_observation_indices", "next_observation_rows")
+_INDICES = "next_observation_indices"
+_ROWS = "next_observation_rows"
 
 
 def write_npz(path: str | os.PathLike[str], fields: Mapping[str, Any]) -> None:
     """Write the fields of a ``Demonstrations``, all at once or not at all. A next observation is stored only where it is
     not, bit for bit, the following row of ``observations`` of the same episode, so that the file holds the observations
     about once."""
-    next_observations, dense_rewards = fields["next_observations"], fields["dense_rewards"]
+    next_observations = fields["next_observations"]
+    dense_rewards = fields["dense_rewards"]
     indices = unchained_indices(fields["observations"], next_observations, fields["episode_starts"])
     arrays = {
         "format_version": np.array(FORMAT_VERSION, dtype=np.int64),
         **{name: fields[name] for name in _ARRAYS},
         # always present, so that a lost entry is noticed; N >= 1, so empty can only mean None
         "dense_rewards": np.empty(0, dtype=np.float32) if dense_rewards is None else dense_rewards,
-        **dict(zip(_NEXT, (indices, next_observations[indices]), strict=True)),
+        _INDICES: indices,
+        _ROWS: next_observations[indices],
         **{name: np.array(json.dumps(fields[name])) for name in _TEXTS},
     }
     with atomic_write(path) as file:
@@ -59,7 +62,7 @@ def read_npz(path: str | os.PathLike[str]) -> dict[str, Any]:
         version = _read_array(archive, "format_version", source)
         if not np.array_equal(version, FORMAT_VERSION):
             raise field_error(source, "format_version", f"{FORMAT_VERSION} (of a newer one: update sb3-actpc)", str(version))
-        stored = {name: _read_array(archive, name, source) for name in (*_ARRAYS, "dense_rewards", *_NEXT)}
+        stored = {name: _read_array(archive, name, source) for name in (*_ARRAYS, "dense_rewards", _INDICES, _ROWS)}
         texts = {name: _read_array(archive, name, source) for name in _TEXTS}
     dense_rewards = stored["dense_rewards"]
     return {
@@ -90,10 +93,10 @@ def _read_json(array: np.ndarray, name: str, source: str) -> Any:
 
 def _rebuild_next_observations(stored: dict[str, np.ndarray], source: str) -> np.ndarray:
     """Next observations, (N, obs_dim): the following rows, except where others are stored."""
-    observations, (indices, rows) = stored["observations"], (stored[name] for name in _NEXT)
+    observations = stored["observations"]
     try:
         next_observations = np.concatenate([observations[1:], observations[-1:]])
-        next_observations[indices] = rows
+        next_observations[stored[_INDICES]] = stored[_ROWS]
     except (IndexError, TypeError, ValueError) as error:
-        raise field_error(source, _NEXT[0], f"indices of as many {_NEXT[1]}", f"others ({error})") from None
+        raise field_error(source, _INDICES, f"indices of as many {_ROWS}", f"others ({error})") from None
     return next_observations

@@ -16,6 +16,7 @@ from sb3_actpc.utils.extras import installed_version
 
 Columns = dict[str, Any]
 Report = Callable[[str], None]
+RECORDED = ("observations", "next_observations", "actions", "rewards", "terminations", "dense_rewards")
 ENDLESS = 5000  # steps of an episode, after which the user is warned
 # wrappers that pass observations, actions and rewards on as they are, or only clip or cast them
 PLAIN = {"Monitor", "TimeLimit", "PassiveEnvChecker", "RecordEpisodeStatistics", "Autoreset", "ClipAction"}
@@ -149,29 +150,33 @@ def _actor(demonstrator: Any, deterministic: bool) -> Callable[[Any, bool], np.n
 def _play(act: Callable[[Any, bool], np.ndarray], env: gym.Env[Any, Any], seed: int) -> tuple[Columns, dict[str, Any]]:
     """One episode as columns, and its last info."""
     assert isinstance(env.action_space, spaces.Box)
-    rows: list[tuple[Any, ...]] = []
+    columns: Columns = {name: [] for name in RECORDED}
     observation, info = env.reset(seed=seed)
     # copies, here and below: environment and demonstrator may go on writing on what they gave
     row = spaces.flatten(env.observation_space, observation)
     done = False
     while not done:
-        action = act(observation, not rows)
+        n_steps = len(columns["actions"])
+        action = act(observation, n_steps == 0)
         is_array = not isinstance(action, tuple) and np.shape(action) == env.action_space.shape
         if not is_array or outside_bounds(np.ravel(action), env.action_space).any():
             raise ValueError(
-                f"the demonstrator gives {action!r} at step {len(rows)}: {env_name(env)} takes an array of "
+                f"the demonstrator gives {action!r} at step {n_steps}: {env_name(env)} takes an array of "
                 f"{env.action_space} (numpy.clip keeps to the bounds; of an agent give itself, not its predict)"
             )
         row_action = np.array(action, dtype=np.float32).ravel()
         observation, reward, terminated, truncated, info = env.step(action)
         next_row = spaces.flatten(env.observation_space, observation)
-        rows.append((row, next_row, row_action, float(reward), bool(terminated), info.get("dense_reward", float(reward))))
-        row, done = next_row, terminated or truncated
-        if len(rows) == ENDLESS:
+        dense_reward = info.get("dense_reward", float(reward))
+        values = (row, next_row, row_action, float(reward), bool(terminated), dense_reward)
+        for name, value in zip(RECORDED, values, strict=True):
+            columns[name].append(value)
+        row = next_row
+        done = terminated or truncated
+        if n_steps + 1 == ENDLESS:
             limit = "limit it with gymnasium.wrappers.TimeLimit if it never ends"
             warnings.warn(f"an episode of {env_name(env)} has gone on for {ENDLESS} steps: {limit}", stacklevel=2)
-    names = ("observations", "next_observations", "actions", "rewards", "terminations", "dense_rewards")
-    return dict(zip(names, map(list, zip(*rows, strict=True)), strict=True)), info
+    return columns, info
 
 
 def _is_kept(info: Mapping[str, Any], only_successes: bool | None) -> bool:

@@ -1,16 +1,14 @@
 """HDF5 files of the robosuite tasks: robomimic's, of low-dimensional observations (Mandlekar et al., arXiv 2108.03298),
-fetched, read and written; and robosuite's own ``demo.hdf5``, whose states are observed again.
+fetched and read; and robosuite's own ``demo.hdf5``, whose states are observed again.
 
 robomimic's layout: ``data`` (attribute ``env_args``, JSON), ``data/demo_i/{actions,rewards,dones}``,
 ``data/demo_i/{obs,next_obs}/<key>``, and ``mask/<filter key>``, the names of some of the demonstrations. robosuite's:
 ``data`` (attribute ``env_info``, JSON), ``data/demo_i/{states,actions}``.
 """
 
-import io
 import json
 import os
 import re
-from collections import defaultdict
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -23,13 +21,9 @@ from sb3_actpc.demonstrations.dataset import Demonstrations
 from sb3_actpc.demonstrations.recording import Columns, Report, silent
 from sb3_actpc.envs.robosuite_layouts import ACTION_DIM, OBSERVATIONS, RobosuiteTask, robosuite_task
 from sb3_actpc.utils.extras import import_extra
-from sb3_actpc.utils.files import atomic_write
 
 REPOSITORY = "https://huggingface.co/datasets/robomimic/robomimic_datasets/resolve/main"
-KINDS = ("mh", "ph")  # 300 by six humans of three levels, 200 by one proficient human
 TIMEOUT_SECONDS = 30.0
-ROBOSUITE_TYPE = 1  # robomimic's EnvType
-ROBOSUITE_VERSION = "1.5.2"  # whose observations and controller these are
 # metres: the median over an episode of how much an object's two recorded distances from the gripper differ
 OBJECT_TOLERANCE = 0.005
 
@@ -56,8 +50,9 @@ def read_hdf5(path: str | os.PathLike[str], env_id: str, obs: str = "paper", fil
     :raises ImportError: when h5py, or for robosuite's file robosuite, is not installed
     """
     h5py = import_extra("h5py", "robosuite")
-    task, source = robosuite_task(env_id), str(path)
-    task.layout(obs)
+    source = str(path)
+    task = robosuite_task(env_id)
+    obs_dim = task.obs_dim(obs)
     if not Path(path).is_file():
         raise FileNotFoundError(f"no demonstrations file at {path}")
     try:
@@ -72,48 +67,16 @@ def read_hdf5(path: str | os.PathLike[str], env_id: str, obs: str = "paper", fil
     metadata = {"source": "robomimic" if is_robomimic else "robosuite", "demos": names}
     if filter_key is not None:
         metadata["filter_key"] = filter_key
-    read = Demonstrations.from_episodes([_until_success(one) for one in episodes], env_id, metadata, source)
-    read.check(spaces.Box(-np.inf, np.inf, (task.obs_dim(obs),)), spaces.Box(-1.0, 1.0, (ACTION_DIM,)), env_id)
+    read = Demonstrations.from_episodes([_until_success(one) for one in episodes], task.env_id, metadata, source)
+    read.check(spaces.Box(-np.inf, np.inf, (obs_dim,)), spaces.Box(-1.0, 1.0, (ACTION_DIM,)))
     return read
 
 
-def write_robomimic(demonstrations: Demonstrations, path: str | os.PathLike[str]) -> None:
-    """Write demonstrations of ``SparseLift-v0`` or ``SparsePickPlaceCan-v0``, with one of their ``obs``, as robomimic stores
-    them, all at once or not at all. The filter keys of a mixed set (``metadata["filter_keys"]``) become masks. ValueError when
-    they are of another task or layout, ImportError when h5py is not installed."""
-    h5py = import_extra("h5py", "robosuite")
-    task = robosuite_task(demonstrations.env_id)
-    layout = task.layout(task.obs_of_size(demonstrations.observations.shape[1]))
-    content = io.BytesIO()
-    with h5py.File(content, "w") as file:
-        data = file.create_group("data")
-        data.attrs["total"] = len(demonstrations)
-        data.attrs["env_args"] = json.dumps(_env_args(task))
-        masks: dict[str, list[str]] = defaultdict(list)
-        filter_keys = [*demonstrations.metadata.get("filter_keys", []), *[()] * demonstrations.n_episodes]
-        for index, episode in enumerate(demonstrations.episodes):
-            demo = data.create_group(f"demo_{index}")
-            demo.attrs["num_samples"] = len(episode["actions"])
-            demo["actions"], demo["rewards"] = episode["actions"], episode["rewards"]
-            demo["dones"] = episode["terminations"].astype(np.int64)
-            for part, columns in layout.items():
-                demo[f"obs/{part}"] = episode["observations"][:, columns]
-                demo[f"next_obs/{part}"] = episode["next_observations"][:, columns]
-            for key in filter_keys[index]:
-                masks[key].append(f"demo_{index}")
-        for key, members in masks.items():
-            file.create_dataset(f"mask/{key}", data=np.array(members, dtype="S"))
-    with atomic_write(path) as target:
-        target.write(content.getvalue())
-
-
-def robomimic_url(env_id: str, kind: str = "mh") -> str:
-    """Address of a file of low-dimensional observations of a robosuite task and a key of ``KINDS`` (MIT licence; 30 to 130
-    MB)."""
+def robomimic_url(env_id: str) -> str:
+    """Address of robomimic's 300 multi-human demonstrations of a robosuite task, with low-dimensional observations (MIT
+    licence; 30 to 130 MB)."""
     folder = {"Lift": "lift", "PickPlaceCan": "can"}[robosuite_task(env_id).name]
-    if kind not in KINDS:
-        raise ValueError(f"kind={kind!r} is not one of {', '.join(KINDS)}: choose one of these")
-    return f"{REPOSITORY}/v1.5/{folder}/{kind}/low_dim_v15.hdf5"
+    return f"{REPOSITORY}/v1.5/{folder}/mh/low_dim_v15.hdf5"
 
 
 def download_robomimic(
@@ -272,14 +235,3 @@ def _until_success(episode: Columns) -> Columns:
     rewards = episode["rewards"]
     end = int(np.argmax(rewards)) + 1 if rewards.any() else len(rewards)
     return {name: column[:end] for name, column in {**episode, "terminations": rewards > 0.0}.items()}
-
-
-def _env_args(task: RobosuiteTask) -> dict[str, Any]:
-    reach = np.array([0.05] * 3 + [0.5] * 3)  # metres and radians of an action of 1
-    arm: dict[str, Any] = {"type": "OSC_POSE", "input_type": "delta", "input_ref_frame": "base"}
-    arm |= {"input_max": 1.0, "input_min": -1.0, "output_max": reach.tolist(), "output_min": (-reach).tolist()}
-    arm |= {"kp": 150, "damping_ratio": 1, "impedance_mode": "fixed", "kp_limits": [0, 300], "damping_ratio_limits": [0, 10]}
-    arm |= {"gripper": {"type": "GRIP"}, "uncouple_pos_ori": True, "ramp_ratio": 0.2}
-    controller = {"type": "BASIC", "body_parts": {"right": arm}}
-    kwargs = {"robots": ["Panda"], "controller_configs": controller, "control_freq": 20, "reward_shaping": False}
-    return {"env_name": task.name, "env_version": ROBOSUITE_VERSION, "type": ROBOSUITE_TYPE, "env_kwargs": kwargs}

@@ -6,7 +6,7 @@ six people, two worse, two okay and two better, 50 demonstrations each) can be m
 
 from contextlib import closing
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import gymnasium as gym
 import numpy as np
@@ -26,15 +26,7 @@ CARRYING_HEIGHT = 1.05
 CAN_STANDING_HEIGHT = 0.86
 CAN_BIN_CENTRE = (robosuite_layouts.CAN_BIN_LOW + robosuite_layouts.CAN_BIN_HIGH)[:2] / 2.0
 
-# level and proficiency of each demonstrator of a mixed set
-MIXED_DEMONSTRATORS: tuple[tuple[str, float], ...] = (
-    ("worse", 0.1),
-    ("worse", 0.25),
-    ("okay", 0.45),
-    ("okay", 0.6),
-    ("better", 0.85),
-    ("better", 1.0),
-)
+MIXED_PROFICIENCIES = (0.1, 0.25, 0.45, 0.6, 0.85, 1.0)  # of the demonstrators of a mixed set: two worse, okay and better
 
 
 @dataclass(frozen=True)
@@ -62,7 +54,7 @@ class ScriptedDemonstrator:
         self.task: RobosuiteTask = robosuite_task(env_id)
         if isinstance(proficiency, bool) or not isinstance(proficiency, int | float) or not 0.0 <= proficiency <= 1.0:
             raise ValueError(f"proficiency={proficiency!r} must be a number from 0 (clumsy) to 1 (sure), or 'mixed'")
-        self.proficiency, self.seed = proficiency, seed
+        self.seed = seed
         clumsiness = 1.0 - float(proficiency)
         self.speed = 1.0 - 0.6 * clumsiness  # largest translation action
         self.tremor = 0.25 * clumsiness  # standard deviation of the correlated noise on the actions
@@ -109,8 +101,8 @@ class ScriptedDemonstrator:
     def _reach(self, view: View) -> tuple[np.ndarray, float, bool]:
         """Over the object, the fingers open and turned along it."""
         target = view.object_position + self._aim + np.array([0.0, 0.0, self._hover_height])
-        distance, tolerance = np.linalg.norm((target - view.eef_position)[:2]), self.tolerance
-        aligned = distance < tolerance and np.linalg.norm(self._turn(view)) < 10.0 * tolerance
+        is_above = np.linalg.norm((target - view.eef_position)[:2]) < self.tolerance
+        aligned = is_above and np.linalg.norm(self._turn(view)) < 10.0 * self.tolerance
         return target, OPEN, bool(aligned and view.eef_position[2] < target[2] + 0.03)
 
     def _descend(self, view: View) -> tuple[np.ndarray, float, bool]:
@@ -182,7 +174,8 @@ class ScriptedDemonstrator:
         if self.task.name == "PickPlaceCan":
             return yaw_of(view.eef_quat)
         if self._yaw is None or self.stage == "reach":
-            start, quarter = self._yaw or 0.0, np.pi / 2.0
+            start = self._yaw or 0.0
+            quarter = np.pi / 2.0
             self._yaw = start + (yaw_of(view.object_quat) - start + quarter / 2.0) % quarter - quarter / 2.0
         return self._yaw
 
@@ -199,15 +192,19 @@ class ScriptedDemonstrator:
 
     def _view(self, observation: np.ndarray) -> View:
         parts: dict[str, Any] = {name: np.asarray(observation[columns], float) for name, columns in self._layout.items()}
-        fingers, state = parts["robot0_gripper_qpos"], parts["object"]
-        object_position, object_quat = state[self._object_columns["pos"]], state[self._object_columns["quat"]]
-        finger_gap = float(fingers[0] - fingers[1])
-        return View(parts["robot0_eef_pos"], parts["robot0_eef_quat"], finger_gap, object_position, object_quat)
+        fingers = parts["robot0_gripper_qpos"]
+        return View(
+            eef_position=parts["robot0_eef_pos"],
+            eef_quat=parts["robot0_eef_quat"],
+            finger_gap=float(fingers[0] - fingers[1]),
+            object_position=parts["object"][self._object_columns["pos"]],
+            object_quat=parts["object"][self._object_columns["quat"]],
+        )
 
 
 def collect_scripted(
     env_id: str,
-    proficiency: float | str = 1.0,
+    proficiency: float | Literal["mixed"] = 1.0,
     n_episodes: int = 50,
     seed: int = 0,
     obs: str = "paper",
@@ -217,29 +214,22 @@ def collect_scripted(
     """Record successful episodes of scripted demonstrators.
 
     :param env_id: ``SparseLift-v0`` or ``SparsePickPlaceCan-v0``
-    :param proficiency: in [0, 1], or ``"mixed"`` for the six of ``MIXED_DEMONSTRATORS``, which alternate
+    :param proficiency: in [0, 1], or ``"mixed"`` for those of ``MIXED_PROFICIENCIES``, which alternate
     :param n_episodes: successful episodes wanted
     :param seed: of the demonstrators and of the episodes
     :param obs: the environment's ``obs``
     :param metadata: JSON values to keep with the demonstrations
     :param options: further ones of :func:`~sb3_actpc.demonstrations.recording.record_episodes`
-    :return: the episodes; ``metadata["filter_keys"]`` has robomimic's filter keys of each one (``"better"``,
-        ``"better_operator_1"``, ...) when the set is mixed
     :raises ValueError: when an argument is not allowed, or too few episodes succeed
     :raises ImportError: when robosuite is not installed
     """
-    kept: dict[str, Any] = {"demonstrator": "scripted", "proficiency": proficiency}
     if proficiency == "mixed":
-        demonstrators = [
-            ScriptedDemonstrator(env_id, obs, value, 100 * seed + i) for i, (_, value) in enumerate(MIXED_DEMONSTRATORS)
-        ]
-        levels = [level for level, _ in MIXED_DEMONSTRATORS]
-        keys = [[level, f"{level}_operator_{levels[: i + 1].count(level)}"] for i, level in enumerate(levels)]
-        kept["filter_keys"] = [keys[i % len(keys)] for i in range(n_episodes)]
+        parts = enumerate(MIXED_PROFICIENCIES)
+        demonstrators = [ScriptedDemonstrator(env_id, obs, part, 100 * seed + i) for i, part in parts]
     else:
-        demonstrators = [ScriptedDemonstrator(env_id, obs, proficiency, seed)]  # type: ignore[arg-type]
+        demonstrators = [ScriptedDemonstrator(env_id, obs, proficiency, seed)]
+    kept = {"demonstrator": "scripted", "proficiency": proficiency, **(metadata or {})}
     with closing(gym.make(env_id, obs=obs)) as env:
-        kept |= metadata or {}
         return Demonstrations.record(demonstrators, env, n_episodes, True, seed=seed, metadata=kept, **options)
 
 

@@ -49,13 +49,6 @@ class RobosuiteTask:
         """Size of an observation, for a key of ``OBSERVATIONS``."""
         return self.layout(obs)["object"].stop
 
-    def obs_of_size(self, obs_dim: int) -> str:
-        """The key of ``OBSERVATIONS`` that gives observations of this size; ValueError where none does."""
-        sizes = {self.obs_dim(obs): obs for obs in OBSERVATIONS}
-        if obs_dim not in sizes:
-            raise ValueError(f"an observation of {self.env_id} has {sizes} numbers, found {obs_dim}: use one of these layouts")
-        return sizes[obs_dim]
-
     def object_columns(self) -> dict[str, slice]:
         """Part of the object's state -> its columns in it."""
         return _columns(self.object_parts)

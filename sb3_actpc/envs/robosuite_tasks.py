@@ -28,6 +28,7 @@ CONTROL_FREQUENCY = 20
 CUBE_HALF_EDGES = (0.020, 0.022)
 CUBE_DENSITY = 1000.0
 REACH = 0.05  # metres between gripper and object's centre within which it is reached
+PICTURE_SIZE = 384  # pixels
 LIFTED = 0.1  # metres above the bin's floor at which a held can counts as lifted (at rest its centre is at some 6 cm)
 
 
@@ -45,9 +46,6 @@ class SparseRobosuiteEnv(gym.Env[np.ndarray, np.ndarray], utils.EzPickle):
         gripper's position, quaternion and finger positions, and the object's state); float32
     :param horizon: control steps after which an episode is truncated
     :param render_mode: ``"rgb_array"``, or None
-    :param camera: what :meth:`render` looks through: ``"agentview"``, ``"frontview"``, ``"sideview"`` among others
-    :param width: of the rendered pictures, in pixels
-    :param height: likewise
     :raises ImportError: when robosuite is not installed
     :raises ValueError: when a keyword has a value that is not allowed
     """
@@ -59,22 +57,14 @@ class SparseRobosuiteEnv(gym.Env[np.ndarray, np.ndarray], utils.EzPickle):
     # what robosuite holds is put into checkpoints by checkpoint_state
     checkpoint_skipped: ClassVar[tuple[str, ...]] = ("simulation", "_renderer", "_layout", "task")
 
-    def __init__(
-        self,
-        obs: str = "paper",
-        horizon: int = 500,
-        render_mode: str | None = None,
-        camera: str = "agentview",
-        width: int = 384,
-        height: int = 384,
-    ) -> None:
+    def __init__(self, obs: str = "paper", horizon: int = 500, render_mode: str | None = None) -> None:
         self.task: RobosuiteTask = robosuite_task(self.env_id)
         self._layout = self.task.layout(obs)
         if int(horizon) != horizon or horizon < 1:
             raise ValueError(f"horizon={horizon!r} must be a whole number of at least 1: give one, or leave it out")
-        utils.EzPickle.__init__(self, obs, horizon, render_mode, camera, width, height)
-        self.obs, self.horizon, self.render_mode, self.camera = obs, int(horizon), render_mode, camera
-        self.width, self.height = width, height
+        utils.EzPickle.__init__(self, obs, horizon, render_mode)
+        self.horizon = int(horizon)
+        self.render_mode = render_mode
         self.observation_space = spaces.Box(-np.inf, np.inf, (self.task.obs_dim(obs),), np.float32)
         self.action_space = spaces.Box(-1.0, 1.0, (ACTION_DIM,), np.float32)
         self.simulation: Any = make_simulation(self.task.name)
@@ -92,7 +82,8 @@ class SparseRobosuiteEnv(gym.Env[np.ndarray, np.ndarray], utils.EzPickle):
         share_generator(self.simulation, self.np_random)
         self._randomize_model()
         self.simulation.reset()
-        self._elapsed_steps = self._stage = 0
+        self._elapsed_steps = 0
+        self._stage = 0
         return self._observe(), {"is_success": False, "stage": self.stages[0]}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
@@ -117,16 +108,15 @@ class SparseRobosuiteEnv(gym.Env[np.ndarray, np.ndarray], utils.EzPickle):
         return self._observe()
 
     def render(self) -> np.ndarray | None:
-        """The camera's view, (height, width, 3) uint8; None without a render mode. RuntimeError (or what the OpenGL library
+        """robosuite's ``agentview``, (384, 384, 3) uint8; None without a render mode. RuntimeError (or what the OpenGL library
         raises) when the machine cannot render."""
         if self.render_mode is None:
             return None
         if self._renderer is None:
-            self.model.vis.global_.offwidth, self.model.vis.global_.offheight = self.width, self.height
-            self._renderer = mujoco.Renderer(self.model, self.height, self.width)
+            self._renderer = mujoco.Renderer(self.model, PICTURE_SIZE, PICTURE_SIZE)
         options = mujoco.MjvOption()
         options.geomgroup[0] = 0  # collision shapes
-        self._renderer.update_scene(self.data, camera=self.camera, scene_option=options)
+        self._renderer.update_scene(self.data, camera="agentview", scene_option=options)
         return self._renderer.render().copy()
 
     def close(self) -> None:

@@ -1,10 +1,14 @@
-"""Demonstrations of the robosuite tasks that need neither the simulator nor a file."""
+"""Demonstrations of the robosuite tasks that need no simulator, and robomimic's files of them."""
 
+import json
+from pathlib import Path
+
+import h5py
 import numpy as np
 
 from sb3_actpc.demonstrations.dataset import Demonstrations
 from sb3_actpc.envs import ROBOSUITE_IDS
-from sb3_actpc.envs.robosuite_layouts import ROBOSUITE_TASKS
+from sb3_actpc.envs.robosuite_layouts import OBSERVATIONS, ROBOSUITE_TASKS
 
 
 def made_up(env_id: str, lengths: tuple[int, ...] = (4, 3, 5), obs: str = "paper", seed: int = 0) -> Demonstrations:
@@ -32,7 +36,6 @@ def made_up(env_id: str, lengths: tuple[int, ...] = (4, 3, 5), obs: str = "paper
         terminations=rewards > 0,
         episode_starts=np.array([0, *(ends[:-1] + 1)]),
         env_id=env_id,
-        metadata={"filter_keys": [["better"], ["worse"], ["better", "20_percent"]]},
     )
 
 
@@ -40,3 +43,24 @@ def unit(quats: np.ndarray) -> np.ndarray:
     """:param quats: (N, 4)
     :return: the same, each of norm 1"""
     return quats / np.linalg.norm(quats, axis=1, keepdims=True)
+
+
+def write_robomimic(shown: Demonstrations, path: Path) -> None:
+    """What robomimic 0.5 writes (docs/datasets/overview), with three masks."""
+    task = ROBOSUITE_TASKS[shown.env_id]
+    [layout] = [task.layout(obs) for obs in OBSERVATIONS if task.obs_dim(obs) == shown.observations.shape[1]]
+    controller = {"type": "BASIC", "body_parts": {"right": {"type": "OSC_POSE", "input_type": "delta"}}}
+    keywords = {"robots": ["Panda"], "controller_configs": controller, "control_freq": 20}
+    with h5py.File(path, "w") as file:
+        data = file.create_group("data")
+        data.attrs["env_args"] = json.dumps({"env_name": task.name, "type": 1, "env_kwargs": keywords})
+        for index, episode in enumerate(shown.episodes):
+            demo = data.create_group(f"demo_{index}")
+            demo["actions"] = episode["actions"]
+            demo["rewards"] = episode["rewards"]
+            demo["dones"] = episode["terminations"].astype(np.int64)
+            for part, columns in layout.items():
+                demo[f"obs/{part}"] = episode["observations"][:, columns]
+                demo[f"next_obs/{part}"] = episode["next_observations"][:, columns]
+        for key, names in (("better", ["demo_0", "demo_2"]), ("worse", ["demo_1"]), ("20_percent", ["demo_2"])):
+            file[f"mask/{key}"] = np.array(names, dtype="S")

@@ -127,6 +127,17 @@ def test_wrappers_in_other_processes_are_known_by_their_names(shown: Demonstrati
     env.close()
 
 
+def test_an_environment_that_does_not_name_its_wrappers_is_warned_of(shown: Demonstrations) -> None:
+    class Silent(DummyVecEnv):
+        def env_method(self, name: str, *args: Any, **options: Any) -> list[Any]:
+            raise NotImplementedError
+
+    env = Silent([make_pendulum])
+    with pytest.warns(UserWarning, match="Silent does not name its wrappers .* recorded behind the same ones"):
+        fit_demonstrations(shown, env, env.observation_space, env.action_space)
+    env.close()
+
+
 @pytest.mark.parametrize("kind", [ActPC, TD3Demo, BC])
 def test_every_algorithm_refuses_them(kind: Any, shown: Demonstrations) -> None:
     with pytest.raises(ValueError, match="the agent learns behind RescaleAction"):
