@@ -78,22 +78,14 @@ def test_a_time_limit_is_no_termination_and_dense_rewards_are_kept_apart() -> No
     assert shown.rewards.tolist() == [1, 2, 3]
 
 
-@pytest.mark.parametrize(("only_successes", "episodes"), [(None, [1, 3]), (True, [1, 3]), (False, [0, 1])])
-def test_successes_only_unless_told_otherwise(only_successes: bool | None, episodes: list[int]) -> None:
-    shown = Demonstrations.record(forward, Corridor(), 2, only_successes)
+@pytest.mark.parametrize(
+    ("reports", "only_successes", "episodes"),
+    [(True, None, [1, 3]), (True, True, [1, 3]), (True, False, [0, 1]), (False, None, [0, 1])],
+)
+def test_successes_only_unless_told_otherwise(reports: bool, only_successes: bool | None, episodes: list[int]) -> None:
+    shown = Demonstrations.record(forward, Corridor(reports=reports), 2, only_successes)
     assert sorted(set(shown.observations[:, 0])) == episodes
     assert shown.metadata["n_tries"] == episodes[-1] + 1
-
-
-def test_an_environment_that_reports_no_success() -> None:
-    assert Demonstrations.record(forward, Corridor(reports=False), 3).n_episodes == 3
-    with pytest.raises(ValueError, match="only_successes=True needs an environment whose info has is_success"):
-        Demonstrations.record(forward, Corridor(reports=False), 3, only_successes=True)
-
-
-def test_too_few_successes_are_refused_with_the_count() -> None:
-    with pytest.raises(ValueError, match="only 1 of 3 episodes succeeded in Corridor, 2 are needed"):
-        Demonstrations.record(forward, Corridor(), 2, max_tries=3)
 
 
 def test_predict_is_given_its_own_state_and_told_of_every_new_episode() -> None:
@@ -228,6 +220,8 @@ def test_sampled_actions_differ_and_deterministic_ones_do_not() -> None:
         ({"seed": -1}, "seed=-1 must be at least 0, a whole number"),
         ({"demonstrator": []}, r"\[\] must have SB3's predict"),
         ({"env": "CartPole-v1"}, "Box action space, found Discrete"),
+        ({"env": Corridor(), "n_episodes": 2, "max_tries": 3}, "only 1 of 3 episodes succeeded in Corridor, 2 are needed"),
+        ({"env": Corridor(reports=False), "only_successes": True}, "needs an environment whose info has is_success"),
         ({"env": 3}, "env must be a Gymnasium environment or the id of one, found 3"),
     ],
 )
@@ -305,6 +299,9 @@ class TestTrajectories:
         short = Trajectory(np.zeros((n_seen, 2)), np.zeros((n, 1)), infos, False, np.zeros(n))
         with pytest.raises(ValueError, match=message):
             Demonstrations.from_trajectories([short], "Named-v0")
+        states = Trajectory(np.arange(4), np.ones((3, 1)), None, False, np.zeros(3))
+        with pytest.raises(ValueError, match=r"need Box observations, found obs of shape \(4,\)"):
+            Demonstrations.from_trajectories([states], "Named-v0")
 
     def test_without_rewards_the_last_step_is_paid_as_said(self) -> None:
         plain = Trajectory(np.zeros((3, 2)), np.zeros((2, 1)), [{"dense_reward": 1.0}, {"dense_reward": 2.0}], True)
@@ -323,11 +320,6 @@ class TestTrajectories:
         shown = Demonstrations.from_trajectories([trajectory], "Named-v0", observation_space=space)
         first = spaces.utils.flatten(space, {"goal": np.array([9.0]), "state": np.array([0.0, 1.0])})
         assert shown.observations[0].tolist() == list(first)
-
-    def test_discrete_observations_are_refused(self) -> None:
-        states = Trajectory(np.arange(4), np.ones((3, 1)), None, False, np.zeros(3))
-        with pytest.raises(ValueError, match=r"need Box observations, found obs of shape \(4,\)"):
-            Demonstrations.from_trajectories([states], "Named-v0")
 
 
 def test_demonstrations_of_the_dense_base_task_fit_the_sparse_one() -> None:
@@ -355,18 +347,17 @@ def test_demonstrations_of_either_task_without_goals_fit_the_goal_task(recorded_
     env.close()
 
 
-@pytest.mark.parametrize("recorded_id", ["SparseWalker2d-v5", "Walker2d-v5"])
-def test_another_tasks_demonstrations_are_named_by_the_goal_task(recorded_id: str) -> None:
+@pytest.mark.parametrize(
+    ("recorded_id", "env_id", "message"),
+    [
+        ("SparseWalker2d-v5", "GoalHalfCheetah-v5", "SparseWalker2d-v5"),
+        ("Walker2d-v5", "GoalHalfCheetah-v5", "Walker2d-v5"),
+        ("Walker2d-v5", "HalfCheetah-v5", r"record them in this environment, .* rename them: .*env_id='HalfCheetah-v5'"),
+    ],
+)
+def test_another_tasks_demonstrations_are_named(recorded_id: str, env_id: str, message: str) -> None:
     """The Walker2d's rows are as long as the HalfCheetah's."""
-    env = DummyVecEnv([lambda: gym.make("GoalHalfCheetah-v5")])
-    with pytest.raises(ValueError, match=rf"{recorded_id}"):
+    env = DummyVecEnv([lambda: gym.make(env_id)])
+    with pytest.raises(ValueError, match=message):
         fit_demonstrations(record(recorded_id), env, env.observation_space, env.action_space)
-    env.close()
-
-
-def test_demonstrations_of_another_name_can_be_renamed() -> None:
-    """The Walker2d's rows are as long as the HalfCheetah's."""
-    env = DummyVecEnv([lambda: gym.make("HalfCheetah-v5")])
-    with pytest.raises(ValueError, match=r"record them in this environment, .* rename them: .*env_id='HalfCheetah-v5'"):
-        fit_demonstrations(record("Walker2d-v5"), env, env.observation_space, env.action_space)
     env.close()

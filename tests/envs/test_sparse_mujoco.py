@@ -103,9 +103,10 @@ def test_reacher_is_paid_near_the_target_only(env_id: str, kwargs: dict[str, flo
 
 
 @pytest.mark.parametrize("env_id", LOCOMOTION_IDS)
-def test_displacement_is_paid_on_every_step_beyond_the_threshold(env_id: str) -> None:
-    distance = DISTANCES[task_of(env_id)]
-    env = gym.make(env_id)
+@pytest.mark.parametrize("threshold", [None, 0.5])
+def test_displacement_is_paid_on_every_step_beyond_the_threshold(env_id: str, threshold: float | None) -> None:
+    distance = DISTANCES[task_of(env_id)] if threshold is None else threshold
+    env = gym.make(env_id, threshold=threshold)
     env.reset(seed=0)
     shift_x(env, distance - 0.2)
     reward, _, info = still_step(env)
@@ -131,48 +132,22 @@ def test_displacement_is_measured_from_each_resets_own_x(env_id: str) -> None:
 
 
 @pytest.mark.parametrize("env_id", LOCOMOTION_IDS)
-def test_forward_is_paid_above_the_velocity_and_success_is_still_the_distance(env_id: str) -> None:
-    task = task_of(env_id)
-    env = gym.make(env_id, condition="forward")
+@pytest.mark.parametrize("threshold", [None, 0.0, 100.0])
+def test_forward_is_paid_above_the_velocity_and_success_is_still_the_distance(env_id: str, threshold: float | None) -> None:
+    """A threshold of 0 pays any motion forward, as the paper words it of Walker2d, Hopper and Swimmer."""
+    velocity = VELOCITIES[task_of(env_id)] if threshold is None else threshold
+    env = gym.make(env_id, condition="forward", threshold=threshold)
     env.reset(seed=0)
-    for velocity in (0.0, -5.0, 8.0):
-        shift_x(env, 0.0, velocity)
+    for start in (-5.0, -0.5, 0.2, 8.0):
+        shift_x(env, 0.0, start)
         reward, _, info = still_step(env)
-        assert reward == float(info["x_velocity"] > VELOCITIES[task]) == float(velocity > 0.0)
+        assert reward == float(info["x_velocity"] > velocity)
+        assert (info["x_velocity"] > 0.0) == (start > 0.0)
         assert info["is_success"] is False
-    shift_x(env, DISTANCES[task] + 0.5, 0.0)
+    assert reward == float(velocity < 8.0)
+    shift_x(env, DISTANCES[task_of(env_id)] + 0.5, -1.0)
     reward, _, info = still_step(env)
-    assert reward == 0.0
-    assert info["is_success"] is True
-    env.close()
-
-
-@pytest.mark.parametrize("env_id", LOCOMOTION_IDS)
-def test_a_threshold_of_zero_pays_any_motion_forward(env_id: str) -> None:
-    """As the paper words it of Walker2d, Hopper and Swimmer."""
-    env = gym.make(env_id, condition="forward", threshold=0.0)
-    env.reset(seed=0)
-    for velocity in (-0.5, 0.2, 8.0):
-        shift_x(env, 0.0, velocity)
-        reward, _, info = still_step(env)
-        assert reward == float(info["x_velocity"] > 0.0) == float(velocity > 0.0)
-    env.close()
-
-
-@pytest.mark.parametrize("env_id", LOCOMOTION_IDS)
-def test_threshold_moves_the_paying_condition(env_id: str) -> None:
-    env = gym.make(env_id, threshold=0.5)
-    env.reset(seed=0)
-    shift_x(env, 0.7)
-    reward, _, info = still_step(env)
-    assert (reward, info["is_success"]) == (1.0, True)
-    env.close()
-
-    env = gym.make(env_id, condition="forward", threshold=100.0)
-    env.reset(seed=0)
-    shift_x(env, DISTANCES[task_of(env_id)] + 0.5, 8.0)
-    reward, _, info = still_step(env)
-    assert (reward, info["is_success"]) == (0.0, True), "the velocity threshold leaves the distance of success alone"
+    assert (reward, info["is_success"]) == (0.0, True)
     env.close()
 
 
@@ -207,14 +182,6 @@ def test_a_fall_terminates_unless_the_base_keyword_says_otherwise(env_id: str) -
 def test_bad_keywords_are_named_with_their_value(env_id: str, kwargs: dict[str, Any]) -> None:
     name, value = list(kwargs.items())[-1]
     with pytest.raises(ValueError, match=f"{name}={value!r} (must be a finite number, at least|is not one of .*displacement)"):
-        gym.make(env_id, **kwargs)
-
-
-@pytest.mark.parametrize(
-    ("env_id", "kwargs"), [(REACHER_IDS[0], {"condition": "forward"}), (LOCOMOTION_IDS[0], {"miss_reward": 0})]
-)
-def test_keywords_of_other_tasks_are_refused(env_id: str, kwargs: dict[str, Any]) -> None:
-    with pytest.raises(TypeError, match=f"unexpected keyword argument '{next(iter(kwargs))}'"):
         gym.make(env_id, **kwargs)
 
 
