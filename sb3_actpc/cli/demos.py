@@ -192,12 +192,11 @@ def _convert(args: argparse.Namespace) -> None:
 
 
 def _download(args: argparse.Namespace) -> None:
-    from sb3_actpc.demonstrations.robomimic import download_robomimic, robomimic_url
+    from sb3_actpc.demonstrations.robomimic import download_robomimic
 
     output = args.output or _default_output(args.env, "_mh")
     _check_suffix(output)  # what is fetched goes beside it, as an .hdf5 file
-    url = args.url or robomimic_url(args.env)
-    _save(download_robomimic(args.env, output.with_suffix(".hdf5"), url, args.obs, _report), output)
+    _save(download_robomimic(args.env, output.with_suffix(".hdf5"), args.url, args.obs, _report), output)
 
 
 def _check_suffix(output: Path) -> None:

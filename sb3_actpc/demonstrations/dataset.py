@@ -83,7 +83,11 @@ class Demonstrations:
             raise self._error("terminations", expected, f"true at transition {misplaced[0]}, inside an episode")
         if not isinstance(self.env_id, str) or not self.env_id:
             raise self._error("env_id", "a Gymnasium environment id", repr(self.env_id))
-        object.__setattr__(self, "metadata", self._json_metadata())
+        try:
+            metadata = json.loads(json.dumps(dict(self.metadata), allow_nan=False))
+        except (TypeError, ValueError) as error:
+            raise self._error("metadata", "a dictionary of JSON values", f"{self.metadata!r} ({error})") from None
+        object.__setattr__(self, "metadata", metadata)
 
     def __len__(self) -> int:
         return len(self.observations)
@@ -328,13 +332,6 @@ class Demonstrations:
             raise self._error(name, f"finite {np.dtype(dtype)} values", f"{given[where]} at index {where}")
         object.__setattr__(self, name, values)
         return values
-
-    def _json_metadata(self) -> dict[str, Any]:
-        """A copy of the metadata as a JSON file would give it back."""
-        try:
-            return dict(json.loads(json.dumps(dict(self.metadata), allow_nan=False)))
-        except (TypeError, ValueError) as error:
-            raise self._error("metadata", "a dictionary of JSON values", f"{self.metadata!r} ({error})") from None
 
     def _check_count(self, name: str, count: int, available: int) -> None:
         is_whole = isinstance(count, (int, np.integer)) and not isinstance(count, bool)

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from sb3_actpc.demonstrations.rows import box_paths, field_error, join_observations, transition_columns
+from sb3_actpc.demonstrations.rows import box_paths, field_error, join_observations
 from sb3_actpc.utils.extras import import_extra
 
 
@@ -34,9 +34,12 @@ def minari_files(dataset_id: str) -> list[Path]:
 
 def _columns(episode: Any, paths: list[list[str]], source: str) -> dict[str, Any]:
     """One Minari episode (n + 1 observations for n steps) as columns."""
-    rows = join_observations(episode.observations, paths, source)
-    columns: dict[str, Any] = transition_columns(rows, episode.actions, source)
-    columns |= {"rewards": episode.rewards, "terminations": episode.terminations}
+    columns = {
+        "observations": join_observations(episode.observations, paths, source),
+        "actions": episode.actions,
+        "rewards": episode.rewards,
+        "terminations": episode.terminations,
+    }
     dense_rewards = (episode.infos or {}).get("dense_reward")
     if dense_rewards is not None:  # one more when the reset's info was recorded
         columns["dense_rewards"] = np.asarray(dense_rewards)[-len(episode.rewards) :]

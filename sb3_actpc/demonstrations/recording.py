@@ -11,7 +11,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from sb3_actpc.demonstrations.rows import box_paths, join_observations, outside_bounds, transition_columns
+from sb3_actpc.demonstrations.rows import box_paths, join_observations, outside_bounds
 from sb3_actpc.utils.extras import installed_version
 
 Columns = dict[str, Any]
@@ -113,8 +113,7 @@ def trajectory_columns(
     infos = [{}] * n_steps if trajectory.infos is None else [info or {} for info in trajectory.infos]
     if n_steps < 1 or len(infos) != n_steps:
         raise ValueError(f"trajectories need at least 1 action and an info of each, found {n_steps} acts, {len(infos)} infos")
-    columns: Columns = transition_columns(rows, trajectory.acts, "a trajectory")
-    columns["rewards"] = getattr(trajectory, "rews", None)
+    columns: Columns = {"observations": rows, "actions": trajectory.acts, "rewards": getattr(trajectory, "rews", None)}
     if columns["rewards"] is None:
         if final_reward is None:
             raise ValueError("trajectories without rews need final_reward, the reward of each one's last step (1.0, say)")

@@ -72,22 +72,17 @@ def read_hdf5(path: str | os.PathLike[str], env_id: str, obs: str = "paper", fil
     return read
 
 
-def robomimic_url(env_id: str) -> str:
-    """Address of robomimic's 300 multi-human demonstrations of a robosuite task, with low-dimensional observations (MIT
-    licence; 30 to 130 MB)."""
-    folder = {"Lift": "lift", "PickPlaceCan": "can"}[robosuite_task(env_id).name]
-    return f"{REPOSITORY}/v1.5/{folder}/mh/low_dim_v15.hdf5"
-
-
 def download_robomimic(
-    env_id: str, path: str | os.PathLike[str], url: str, obs: str = "paper", report: Report = silent
+    env_id: str, path: str | os.PathLike[str], url: str | None = None, obs: str = "paper", report: Report = silent
 ) -> Demonstrations:
-    """Download a robomimic file to a path, unless it is there already, and read it, see :func:`read_hdf5`. OSError when it
-    cannot be fetched, ValueError when what arrived, or was there, is not such a file, ImportError when h5py is not
-    installed."""
+    """Download robomimic's 300 multi-human demonstrations of a task (MIT licence; 30 to 130 MB), or the file at another
+    address, to a path, unless it is there already, and read it, see :func:`read_hdf5`. OSError when it cannot be fetched,
+    ValueError when what arrived, or was there, is not such a file, ImportError when h5py is not installed."""
     pooch = import_extra("pooch", "experiments")
     import_extra("h5py", "robosuite")  # before the long part
     path = Path(path)
+    folder = {"Lift": "lift", "PickPlaceCan": "can"}[robosuite_task(env_id).name]
+    url = url or f"{REPOSITORY}/v1.5/{folder}/mh/low_dim_v15.hdf5"
     report(f"fetching {url}, unless it is there, to {path}")
     pooch.get_logger().setLevel("WARNING")
     try:

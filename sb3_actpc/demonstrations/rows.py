@@ -59,14 +59,6 @@ def join_observations(observations: Any, paths: list[list[str]], source: str = "
     return np.concatenate(parts, axis=1)
 
 
-def transition_columns(rows: np.ndarray, actions: Any, where: str) -> dict[str, np.ndarray]:
-    """Columns of n actions and of the n + 1 observations (n + 1, obs_dim) around them; ValueError for another number."""
-    n = len(actions)
-    if not n or len(rows) != n + 1:
-        raise ValueError(f"{where} must have a step, and an observation more than actions: found {len(rows)} and {n}")
-    return {"observations": rows[:-1], "actions": np.asarray(actions).reshape(n, -1), "next_observations": rows[1:]}
-
-
 def whole_columns(episode: Mapping[str, Any], known: Sequence[str], source: str) -> dict[str, Any]:
     """An episode's columns, with those that may be left out (see ``Demonstrations.from_episodes``); ValueError when another
     one is missing or unknown, or is no array of numbers with a row for each step."""
@@ -82,7 +74,11 @@ def whole_columns(episode: Mapping[str, Any], known: Sequence[str], source: str)
         raise field_error(source, "actions", expected, f"whole numbers ({columns['actions'].dtype}), as of a Discrete one")
     n = len(columns["actions"])
     if "next_observations" not in columns:
-        columns |= transition_columns(columns["observations"], columns["actions"], "an episode without next_observations")
+        rows = columns["observations"]
+        if not n or len(rows) != n + 1:
+            raise field_error(source, "observations", "a step, and an observation more than actions", f"{len(rows)} and {n}")
+        columns |= {"observations": rows[:-1], "next_observations": rows[1:]}
+        columns["actions"] = columns["actions"].reshape(n, -1)
     for name, column in columns.items():
         if len(column) != n:
             raise field_error(source, name, f"{n} rows, as the episode has actions", f"{len(column)}")

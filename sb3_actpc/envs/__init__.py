@@ -7,8 +7,8 @@ from gymnasium.envs.registration import register, registry
 
 from sb3_actpc.envs.robosuite_layouts import ROBOSUITE_TASKS
 
-SPARSE_MUJOCO_TASKS: tuple[str, ...] = ("Reacher", "HalfCheetah", "Walker2d", "Hopper", "Swimmer")
-SPARSE_MUJOCO_IDS: tuple[str, ...] = tuple(f"Sparse{task}-{v}" for v in ("v5", "v4") for task in SPARSE_MUJOCO_TASKS)
+_TASKS = ("Reacher", "HalfCheetah", "Walker2d", "Hopper", "Swimmer")
+SPARSE_MUJOCO_IDS: tuple[str, ...] = tuple(f"Sparse{task}-{version}" for version in ("v5", "v4") for task in _TASKS)
 GOAL_MUJOCO_IDS: tuple[str, ...] = tuple(env_id.replace("Sparse", "Goal", 1) for env_id in SPARSE_MUJOCO_IDS)
 ROBOSUITE_IDS: tuple[str, ...] = tuple(ROBOSUITE_TASKS)
 SPARSE_IDS: tuple[str, ...] = SPARSE_MUJOCO_IDS + ROBOSUITE_IDS
@@ -24,7 +24,8 @@ def register_envs() -> None:
         if env_id in registry:
             continue
         task, env_version = sparse_env_id(env_id).split("-")
-        limit, kind = 50 if task == "SparseReacher" else 1000, f"{task}{env_version.upper()}Env"
+        limit = 50 if task == "SparseReacher" else 1000
+        kind = f"{task}{env_version.upper()}Env"
         if env_id in SPARSE_MUJOCO_IDS:
             register(env_id, f"sb3_actpc.envs.sparse_mujoco:{kind}", max_episode_steps=limit)
         else:
@@ -55,7 +56,6 @@ __all__ = [
     "ROBOSUITE_IDS",
     "SPARSE_IDS",
     "SPARSE_MUJOCO_IDS",
-    "SPARSE_MUJOCO_TASKS",
     "dense_env_id",
     "register_envs",
     "sparse_env_id",

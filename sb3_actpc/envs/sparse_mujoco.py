@@ -133,15 +133,12 @@ class SparseLocomotionEnv(_SparseMujocoEnv):
         float32; the recorded ones where ``dense_rewards`` is None."""
         if demonstrations.dense_rewards is None:
             return demonstrations.rewards
-        if self.condition == "forward":
-            return (self.demonstrated_velocities(demonstrations) > self.velocity).astype(np.float32)
-        return (self.demonstrated_distances(demonstrations) > self.distance).astype(np.float32)
-
-    def demonstrated_distances(self, demonstrations: Demonstrations) -> np.ndarray:
-        """x - x_0 in metres after each recorded transition, (N,) float64."""
         velocities = self.demonstrated_velocities(demonstrations)
+        if self.condition == "forward":
+            return (velocities > self.velocity).astype(np.float32)
         bounds = demonstrations.episode_bounds
-        return np.concatenate([np.cumsum(velocities[start:end]) * self.dt for start, end in bounds])
+        distances = np.concatenate([np.cumsum(velocities[start:end]) * self.dt for start, end in bounds])
+        return (distances > self.distance).astype(np.float32)
 
     def demonstrated_velocities(self, demonstrations: Demonstrations) -> np.ndarray:
         """Forward velocities in metres per second, (N,) float64: ``dense_rewards`` without control cost and health, weighed by

@@ -489,14 +489,14 @@ def test_an_episode_of_ones_own_arrays() -> None:
 @pytest.mark.parametrize(
     ("change", "named"),
     [
-        ({"observations": np.zeros((3, 2))}, "an observation more than actions: found 3 and 3"),
+        ({"observations": np.zeros((3, 2))}, "'observations': expected .* an observation more than actions, found 3 and 3"),
         ({"rewards": None}, "'rewards': expected some of the columns .*, found observations, actions"),
         ({"termination": np.zeros(3)}, "'termination': expected some of the columns observations, actions"),
         ({"rewards": np.ones(2)}, "'rewards': expected 3 rows, as the episode has actions, found 2"),
         ({"terminations": np.zeros(4)}, "'terminations': expected 3 rows, as the episode has actions, found 4"),
         (
             {"observations": np.zeros((1, 2)), "actions": np.zeros((0, 1)), "rewards": np.ones(0)},
-            "must have a step, .* found 1 and 0",
+            "expected a step, .* found 1 and 0",
         ),
         ({"rewards": 1.0}, "'rewards': expected numbers, a row for each step"),
         ({"observations": {"a": np.zeros((4, 2))}}, r"'observations': .*spaces.flatten.* found a dict"),

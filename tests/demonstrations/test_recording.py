@@ -292,7 +292,7 @@ class TestTrajectories:
         [
             (4, 3, [{}] * 2, "at least 1 action and an info of each, found 3 acts, 2 infos"),
             (1, 0, [], "at least 1 action and an info of each, found 0 acts, 0 infos"),
-            (2, 2, None, "an observation more than actions: found 2 and 2"),
+            (2, 2, None, "an observation more than actions, found 2 and 2"),
         ],
     )
     def test_what_does_not_fit_together_is_refused(self, n_seen: int, n: int, infos: Any, message: str) -> None:

@@ -14,9 +14,8 @@ import numpy as np
 import pytest
 
 from sb3_actpc.cli import main
-from sb3_actpc.demonstrations import ScriptedDemonstrator, collect_scripted, read_hdf5
+from sb3_actpc.demonstrations import ScriptedDemonstrator, collect_scripted, read_hdf5, robomimic
 from sb3_actpc.demonstrations.dataset import Demonstrations, shipped_demonstrations
-from sb3_actpc.demonstrations.robomimic import robomimic_url
 from sb3_actpc.demonstrations.scripted import turn_to_point_down, yaw_of
 from sb3_actpc.envs import ROBOSUITE_IDS
 from sb3_actpc.envs.robosuite_layouts import ROBOSUITE_TASKS, RobosuiteTask
@@ -285,24 +284,26 @@ def test_download_fetches_checks_and_converts(
     """Of half a download nothing is left, so that the next try fetches the file."""
     url, folder = server
     monkeypatch.chdir(tmp_path)
-    write_robomimic(made_up(CAN), folder / "can.hdf5")
+    monkeypatch.setattr(robomimic, "REPOSITORY", url)
+    published = folder / "v1.5/can/mh/low_dim_v15.hdf5"
+    published.parent.mkdir(parents=True)
+    write_robomimic(made_up(CAN), published)
     write_robomimic(made_up(LIFT), folder / "lift.hdf5")
-    command = ["demos", "download", "--env", CAN, "--url"]
+    command = ["demos", "download", "--env", CAN]
     for address, message in (
         (f"{url}/lift.hdf5", "env_name = 'PickPlaceCan'"),
         (f"{url}/nothing.hdf5", "could not fetch"),
         (f"{url}/half.hdf5", "could not fetch"),
         ("http://127.0.0.1:9/x.hdf5", "demos convert"),  # as without a network
     ):
-        assert main([*command, address, "--output", "failed/can.npz"]) == 2
+        assert main([*command, "--url", address, "--output", "failed/can.npz"]) == 2
         error = capsys.readouterr().err.strip()
         assert message in error and len(error.splitlines()) == 1
         found = [path.name for path in Path("failed").iterdir()]
         assert found == (["can.hdf5"] if address.endswith("lift.hdf5") else [])
         Path("failed/can.hdf5").unlink(missing_ok=True)
-    assert main([*command, f"{url}/can.hdf5", "--output", "can.npz"]) == 0
-    assert_equal(Demonstrations.load("can.npz"), made_up(CAN), atol=2e-6)
-    assert robomimic_url(CAN).endswith("v1.5/can/mh/low_dim_v15.hdf5")
+    assert main(command) == 0
+    assert_equal(Demonstrations.load("sparse_pickplacecan_mh.npz"), made_up(CAN), atol=2e-6)
 
 
 def test_a_bad_file_that_was_there_already_is_kept_and_named(lift_file: Path, capsys: pytest.CaptureFixture[str]) -> None:

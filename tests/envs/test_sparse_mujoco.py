@@ -258,25 +258,21 @@ def test_demonstrations_are_paid_as_live_whatever_the_base_tasks_reward_weighs(
     env.close()
 
 
-def test_demonstrations_without_dense_rewards_keep_their_own() -> None:
-    recorded = dataclasses.replace(record("SparseHopper-v5", 2), dense_rewards=None)
-    env = make_vec_env("SparseHopper-v5", env_kwargs={"condition": "forward"})
+@pytest.mark.parametrize(
+    ("env_id", "change", "options"),
+    [
+        ("SparseHopper-v5", {"dense_rewards": None}, {"env_kwargs": {"condition": "forward"}}),
+        # the environment's own method does not know what a wrapper makes of a reward
+        (
+            "SparseHopper-v5",
+            {},
+            {"wrapper_class": gym.wrappers.TransformReward, "wrapper_kwargs": {"func": lambda reward: reward - 1}},
+        ),
+        ("SparseReacher-v5", dict.fromkeys(("observations", "next_observations"), np.zeros((12, 8))), {}),
+    ],
+)
+def test_demonstrations_whose_rewards_cannot_be_told_keep_them(env_id: str, change: Any, options: Any) -> None:
+    recorded = dataclasses.replace(record(env_id, 1), rewards=np.full(12, 0.5), **change)
+    env = make_vec_env(env_id, **options)
     assert np.array_equal(recorded.rewarded_by(env).rewards, recorded.rewards)
-    env.close()
-
-
-def test_demonstrations_keep_their_rewards_under_a_wrapper_that_pays() -> None:
-    """The environment's own method does not know what the wrapper makes of a reward."""
-    recorded = record("SparseHopper-v5", 1)
-    env = make_vec_env("SparseHopper-v5", wrapper_class=gym.wrappers.TransformReward, wrapper_kwargs={"func": lambda r: r - 1})
-    assert recorded.rewarded_by(env) is recorded
-    env.close()
-
-
-def test_demonstrations_of_a_reacher_that_is_shown_otherwise_keep_their_rewards() -> None:
-    recorded = record("SparseReacher-v5", 1)
-    rows = recorded.observations[:, :8]
-    cut = dataclasses.replace(recorded, observations=rows, next_observations=rows)
-    env = make_vec_env("SparseReacher-v5")
-    assert np.array_equal(cut.rewarded_by(env).rewards, recorded.rewards)
     env.close()
