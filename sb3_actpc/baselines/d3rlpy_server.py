@@ -9,6 +9,7 @@ import random
 import sys
 import traceback
 from contextlib import redirect_stderr
+from dataclasses import fields
 from multiprocessing.connection import Connection
 from typing import Any
 
@@ -18,19 +19,23 @@ import numpy as np
 class Server:
     """Builds, trains and plays one of d3rlpy's algorithms."""
 
-    def build(self, method: str, n_inputs: int, n_actions: int, batch_size: int, seed: int, kwargs: dict[str, Any]) -> None:
-        """``kwargs`` are those of d3rlpy's config, and ``net_arch``, the hidden sizes of all networks."""
+    def build(
+        self, method: str, n_inputs: int, n_actions: int, batch_size: int, seed: int, kwargs: dict[str, Any], trained: bytes
+    ) -> None:
+        """``kwargs`` are those of d3rlpy's config, and ``net_arch``, the hidden sizes of all networks; ``trained`` is what
+        :meth:`save` returned, or empty."""
         with redirect_stderr(io.StringIO()):  # old Gym, which it imports, complains at length
             import d3rlpy
 
         random.seed(seed)
         d3rlpy.seed(seed)
         hidden = d3rlpy.models.VectorEncoderFactory(hidden_units=kwargs.pop("net_arch", [256, 256]))
-        parts = {"bcq": ("actor", "critic", "imitator"), "cql": ("actor", "critic")}[method]
-        config = {"bcq": d3rlpy.algos.BCQConfig, "cql": d3rlpy.algos.CQLConfig}[method]
-        encoders = {f"{part}_encoder_factory": hidden for part in parts}
+        config = getattr(d3rlpy.algos, f"{method}Config")
+        encoders = {field.name: hidden for field in fields(config) if field.name.endswith("_encoder_factory")}
         self.algorithm = config(batch_size=batch_size, **encoders, **kwargs).create(device=False)
         self.algorithm.create_impl((n_inputs,), n_actions)
+        if trained:
+            self.algorithm.impl.load_model(io.BytesIO(trained))
 
     def train(self, batch: dict[str, np.ndarray]) -> dict[str, float]:
         """One update on (B, ...) observations, actions, rewards, next_observations and terminals: the losses."""
@@ -51,10 +56,6 @@ class Server:
         buffer = io.BytesIO()
         self.algorithm.impl.save_model(buffer)
         return buffer.getvalue()
-
-    def load(self, parameters: bytes) -> None:
-        """What :meth:`save` returned."""
-        self.algorithm.impl.load_model(io.BytesIO(parameters))
 
 
 def serve(server: Any) -> None:

@@ -1,8 +1,5 @@
-"""Offline methods of d3rlpy, evaluated as every other algorithm is.
-
-Each trains and acts in a process of its own (:mod:`sb3_actpc.baselines.d3rlpy_server`), in a virtual environment that
-:func:`install` makes, because d3rlpy pins other versions than this package. The episodes are played here.
-"""
+"""Offline methods of d3rlpy, which pins other versions than this package: each trains and acts in a process of its own
+(:mod:`sb3_actpc.baselines.d3rlpy_server`), in a virtual environment that :func:`install` makes."""
 
 import os
 import shutil
@@ -104,15 +101,13 @@ class ServedAlgorithm(OfflineAlgorithm):
     """What the served methods share.
 
     The other process gets observations normalized by the demonstrations' mean and standard deviation, and actions scaled to
-    [-1, 1]. It starts when it is first needed, computes on the CPU, and holds the networks, which are fetched to be saved. It
-    ends with :meth:`close`, or with the agent.
+    [-1, 1]. It starts when it is first needed, computes on the CPU, holds the networks, and ends with the agent.
 
     :param args: policy and env of :class:`~sb3_actpc.baselines.bc.OfflineAlgorithm`
     :param batch_size: B
     :param method_kwargs: the method's own settings, by d3rlpy's names, and ``net_arch``, the hidden sizes of all networks
     :param options: further keywords as there; the learning rates are among ``method_kwargs``
     :raises ValueError: as there
-    :raises ImportError: when d3rlpy's environment has not been made; the message names the command that does it
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": ServedPolicy}
@@ -123,81 +118,71 @@ class ServedAlgorithm(OfflineAlgorithm):
         if "learning_rate" in options:
             raise ValueError("learning_rate has no effect: set actor_learning_rate, ... in method_kwargs")
         self.method_kwargs = method_kwargs or {}
+        self.trained = b""  # the networks, when the agent was last saved
         self._process: ServerProcess | None = None
         super().__init__(*args, batch_size=batch_size, **options)
-
-    def _setup_model(self) -> None:
-        self.trained = th.empty(0, dtype=th.uint8)  # the networks as bytes, when they were last fetched
-        if self.env is not None:
-            self.check_installed()  # before anything of a run is written
-        super()._setup_model()
-
-    def _new_policy(self) -> ServedPolicy:
-        policy = ServedPolicy(self.observation_space, self.action_space).to(self.device)  # type: ignore[arg-type]
-        policy.owner = self
-        return policy
-
-    def _take(self, demonstrations: Demonstrations) -> None:
-        if not len(self.trained):  # a loaded agent keeps the normalization that its networks learned with
-            self.policy.fit_normalization(demonstrations.observations)
-        self._transitions = {
-            "observations": self.policy.normalized(demonstrations.observations).cpu().numpy(),
-            "next_observations": self.policy.normalized(demonstrations.next_observations).cpu().numpy(),
-            "actions": scaled_actions(demonstrations, self.action_space),  # type: ignore[arg-type]
-            "rewards": demonstrations.rewards[:, None],
-            "terminals": demonstrations.terminations[:, None].astype(np.float32),
-        }
 
     @classmethod
     def check_installed(cls) -> None:
         """:raises ImportError: when d3rlpy's environment has not been made; the message names the command that does it"""
         environment_python()
 
+    def _new_policy(self) -> ServedPolicy:
+        policy = super()._new_policy()
+        policy.owner = self
+        return policy
+
+    def _take(self, demonstrations: Demonstrations) -> None:
+        if not self.trained:  # a loaded agent keeps the normalization that its networks learned with
+            self.policy.fit_normalization(demonstrations.observations)
+        self._transitions = {
+            "observations": demonstrations.observations,
+            "next_observations": demonstrations.next_observations,
+            "actions": scaled_actions(demonstrations, self.action_space),  # type: ignore[arg-type]
+            "rewards": demonstrations.rewards[:, None],
+            "terminals": demonstrations.terminations[:, None].astype(np.float32),
+        }
+
     @property
     def server(self) -> ServerProcess:
-        """The other process, started when it is not running: with the networks as they were last fetched, or new ones."""
+        """The other process, started when it is not running.
+
+        :raises ImportError: as :meth:`check_installed`
+        """
         if self._process is None:
             process = ServerProcess([str(environment_python()), "-I", str(SERVER)])
             # without a seed every agent has another; one that goes on does not draw the same batches again
             seed = int(np.random.randint(2**31)) if self.seed is None else self.seed + self._n_updates
             self._random = np.random.default_rng(seed)
             sizes = self.policy.n_inputs, self.policy.n_outputs
-            process.call("build", self.method, *sizes, self.batch_size, seed, self.method_kwargs)
-            if len(self.trained):
-                process.call("load", self.trained.cpu().numpy().tobytes())
+            process.call("build", self.method, *sizes, self.batch_size, seed, self.method_kwargs, self.trained)
             self._process = process
         return self._process
-
-    def close(self) -> None:
-        """End the other process; what it has learned since the agent was last saved is lost."""
-        if self._process is not None:
-            self._process.close()
-            self._process = None
 
     def _gradient_step(self) -> dict[str, float]:
         server = self.server
         rows = self._random.integers(len(self._transitions["actions"]), size=self.batch_size)
-        return server.call("train", {name: part[rows] for name, part in self._transitions.items()})
+        batch = {name: part[rows] for name, part in self._transitions.items()}
+        for name in ("observations", "next_observations"):
+            batch[name] = self.policy.normalized(batch[name]).cpu().numpy()
+        return server.call("train", batch)
 
     def save(self, path: Any, exclude: Any = None, include: Any = None) -> None:
         """As SB3's; the networks are fetched first."""
-        self.trained = th.tensor(list(self.server.call("save")), dtype=th.uint8)
+        self.trained = self.server.call("save")
         super().save(path, exclude, include)
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_process", "_transitions", "_random"]
 
-    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
-        return ["policy"], ["trained"]
-
 
 class BCQ(ServedAlgorithm):
     """Batch-constrained Q-learning (Fujimoto et al., arXiv 1812.02900) by d3rlpy, as it is there."""
 
-    method = "bcq"
+    method = "BCQ"
 
 
 class CQL(ServedAlgorithm):
     """Conservative Q-learning (Kumar et al., arXiv 2006.04779) by d3rlpy, as it is there."""
 
-    method = "cql"
+    method = "CQL"

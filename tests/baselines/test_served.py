@@ -24,8 +24,8 @@ import numpy as np
 from d3rlpy_server import serve
 
 class Fake:
-    def build(self, method, n_observations, n_actions, batch_size, seed, kwargs):
-        self.n, self.kwargs = 0, kwargs
+    def build(self, method, n_observations, n_actions, batch_size, seed, kwargs, trained):
+        self.n, self.kwargs = sum(trained), kwargs
         print("libraries print what they like", flush=True)
         if "refuse" in kwargs:
             raise ValueError("net_arch must be a list")
@@ -42,9 +42,6 @@ class Fake:
 
     def save(self):
         return bytes([self.n])
-
-    def load(self, parameters):
-        self.n = parameters[0]
 
 serve(Fake())
 """
@@ -82,9 +79,6 @@ def test_every_step_is_one_gradient_step_of_the_other_process(fake: Path) -> Non
 def test_a_saved_agent_acts_the_same_and_learns_on(fake: Path, tmp_path: Path) -> None:
     model = make().learn(5)
     model.save(tmp_path / "model.zip")
-    model.learn(1, reset_num_timesteps=False)
-    model.close()  # what it has learned since it was saved is lost
-    assert scaled_action(model) == pytest.approx(0.05, abs=1e-6)
     loaded = CQL.load(tmp_path / "model.zip")
     assert scaled_action(loaded) == pytest.approx(0.05, abs=1e-6)
     loaded.set_env(gym.make("Pendulum-v1"))
@@ -151,7 +145,7 @@ def test_the_package_learns_and_is_loaded_again(algorithm: type[ServedAlgorithm]
         environment_python()
     except ImportError as error:
         pytest.skip(str(error))
-    settings = load_preset(algorithm.method, "default")["method_kwargs"]
+    settings = load_preset(algorithm.method.lower(), "default")["method_kwargs"]
     shown = replace(record("Pendulum-v1", 4, 40), actions=np.ones((160, 1)))  # one action, whatever is observed
     options: dict[str, Any] = {"demonstrations": shown, "seed": 0, "batch_size": 16}
     model = algorithm("MlpPolicy", "Pendulum-v1", method_kwargs=settings, **options)
