@@ -115,17 +115,6 @@ def test_what_a_package_keeps_to_itself_is_imported_by_no_other() -> None:
     assert [entry for entry in private if package(entry.module) != package(entry.target)] == []
 
 
-def test_servers_import_nothing_that_only_this_environment_has() -> None:
-    """They run in virtual environments where neither this package nor what it needs is installed."""
-    allowed = {"numpy", "d3rlpy", *sys.stdlib_module_names}
-    imports = imports_in("sb3_actpc.baselines.d3rlpy_server")
-    others = [entry for entry in imports if entry.target.split(".")[0] not in allowed]
-    assert others == []
-    heavy = {"d3rlpy"}
-    at_once = [entry for entry in imports if not entry.is_lazy]
-    assert [entry for entry in at_once if entry.target.split(".")[0] in heavy] == []
-
-
 def test_nobody_imports_the_command_line() -> None:
     importers = {entry.module for entry in IMPORTS if is_within(entry.target, "sb3_actpc.cli")}
     assert {name for name in importers if not is_within(name, "sb3_actpc.cli")} == {"sb3_actpc.__main__"}

@@ -293,8 +293,6 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
             self._last_obs = None
         if isinstance(self.action_noise, VectorizedActionNoise) and self.action_noise.n_envs != self.n_envs:
             self.action_noise = self.action_noise.base_noise  # of a loaded agent; SB3 makes it one for each environment
-        if reset_num_timesteps or self._last_obs is None:
-            self._cut_running_episodes()
         total_timesteps, callback = super()._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )

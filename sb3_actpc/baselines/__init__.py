@@ -6,7 +6,7 @@ from sb3_actpc.baselines.bc import BC, BCRNN
 from sb3_actpc.baselines.her import HER
 from sb3_actpc.baselines.ibrl import IBRL
 from sb3_actpc.baselines.logo import LOGO
-from sb3_actpc.baselines.served import BCQ, CQL
+from sb3_actpc.baselines.offline_rl import BCQ, CQL
 from sb3_actpc.baselines.td3 import DDPGDemo, TD3Demo
 from sb3_actpc.utils.extras import import_extra
 

@@ -20,7 +20,6 @@ from sb3_actpc.utils.arguments import Positive, Share, Weight, checked
 SMALLEST_SPREAD = 1e-3  # an entry that hardly varies in the demonstrations is not blown up
 LARGEST_INPUT = 10.0  # as in SB3's VecNormalize
 VALIDATION_INTERVAL = 100  # steps; ``learn`` ends with one too
-State = tuple[np.ndarray, np.ndarray]  # of a GRU, (n_layers, n, hidden_size), and the steps since it began, (n,)
 
 
 class NormalizingPolicy(BasePolicy):
@@ -30,8 +29,8 @@ class NormalizingPolicy(BasePolicy):
     mean: th.Tensor
     spread: th.Tensor
 
-    def __init__(self, observation_space: spaces.Space, action_space: spaces.Box, **options: Any) -> None:
-        super().__init__(observation_space, action_space, normalize_images=False, squash_output=True, **options)
+    def __init__(self, observation_space: spaces.Space, action_space: spaces.Box, lr_schedule: Schedule) -> None:
+        super().__init__(observation_space, action_space, normalize_images=False, squash_output=True)
         self.n_inputs, self.n_outputs = (int(np.prod(space.shape or ())) for space in (observation_space, action_space))
         self.register_buffer("mean", th.zeros(self.n_inputs))
         self.register_buffer("spread", th.ones(self.n_inputs))
@@ -46,6 +45,10 @@ class NormalizingPolicy(BasePolicy):
         """Normalized observations (B, obs_dim), of any shape (B, *shape)."""
         rows = th.as_tensor(observations, dtype=th.float32, device=self.device).flatten(1)
         return ((rows - self.mean) / self.spread).clamp(-LARGEST_INPUT, LARGEST_INPUT)
+
+    def save(self, path: str) -> None:
+        """:raises ValueError: always, since the agent knows what its policy is made of"""
+        raise ValueError(f"a {type(self).__name__} cannot be saved without its agent: use agent.save(path)")
 
 
 class OfflineAlgorithm(LearnsFromDemonstrations):
@@ -93,9 +96,9 @@ class OfflineAlgorithm(LearnsFromDemonstrations):
         if self.env is not None:
             self._load_demonstrations()
 
-    @abstractmethod
     def _new_policy(self) -> Any:
-        """An untrained policy."""
+        policy = self.policy_class(self.observation_space, self.action_space, self.lr_schedule, **self.policy_kwargs)
+        return policy.to(self.device)
 
     @abstractmethod
     def _take(self, demonstrations: Demonstrations) -> None:
@@ -161,7 +164,7 @@ class BCPolicy(NormalizingPolicy):
     :param action_space: of the environment
     :param lr_schedule: of the optimiser, AdamW
     :param net_arch: hidden sizes, by default two of 256
-    :param optimizer_kwargs: of AdamW
+    :param optimizer_kwargs: of AdamW, which has no ``weight_decay`` unless given
     """
 
     def __init__(
@@ -172,9 +175,10 @@ class BCPolicy(NormalizingPolicy):
         net_arch: list[int] | None = None,
         optimizer_kwargs: dict[str, Any] | None = None,
     ) -> None:
-        super().__init__(observation_space, action_space)
+        super().__init__(observation_space, action_space, lr_schedule)
         self._build([256, 256] if net_arch is None else net_arch)
-        self.optimizer = th.optim.AdamW(self.parameters(), lr=lr_schedule(1), **(optimizer_kwargs or {}))
+        optimizer_kwargs = {"weight_decay": 0.0, **(optimizer_kwargs or {})}
+        self.optimizer = th.optim.AdamW(self.parameters(), lr=lr_schedule(1), **optimizer_kwargs)
 
     def _build(self, net_arch: list[int]) -> None:
         self.network = nn.Sequential(*create_mlp(self.n_inputs, self.n_outputs, net_arch, nn.ReLU))
@@ -188,13 +192,12 @@ class BCPolicy(NormalizingPolicy):
 
 
 class BCRNNPolicy(BCPolicy):
-    """A recurrent network, whose state begins anew after as many steps as the sequences that it learned from have.
+    """A GRU, whose state begins anew after as many steps as the sequences that it learned from have.
 
     :param args: spaces and schedule, as :class:`BCPolicy`'s
-    :param hidden_size: units of each GRU layer
-    :param n_layers: GRU layers
+    :param hidden_size: H, units of the GRU
     :param restart_every: steps after which the state begins anew
-    :param optimizer_kwargs: of AdamW
+    :param optimizer_kwargs: as :class:`BCPolicy`'s
     :raises ValueError: for a keyword with a value that is not allowed
     """
 
@@ -203,16 +206,14 @@ class BCRNNPolicy(BCPolicy):
         self,
         *args: Any,
         hidden_size: Positive = 256,
-        n_layers: Positive = 1,
         restart_every: Positive = 10,
         optimizer_kwargs: dict[str, Any] | None = None,
     ) -> None:
-        self.hidden_size, self.n_layers, self.restart_every = hidden_size, n_layers, restart_every
-        observed, acted, lr_schedule = args
-        super().__init__(observed, acted, lr_schedule, optimizer_kwargs=optimizer_kwargs)
+        self.hidden_size, self.restart_every = hidden_size, restart_every
+        super().__init__(*args, optimizer_kwargs=optimizer_kwargs)  # type: ignore[misc]
 
     def _build(self, net_arch: list[int]) -> None:
-        self.memory = nn.GRU(self.n_inputs, self.hidden_size, self.n_layers, batch_first=True)
+        self.memory = nn.GRU(self.n_inputs, self.hidden_size, batch_first=True)
         self.head = nn.Linear(self.hidden_size, self.n_outputs)
 
     def forward(self, inputs: th.Tensor) -> th.Tensor:
@@ -225,28 +226,27 @@ class BCRNNPolicy(BCPolicy):
         state: Any = None,
         episode_start: np.ndarray | None = None,
         deterministic: bool = False,
-    ) -> tuple[np.ndarray, State]:
-        """As SB3's: actions in the environment's units, and the next state; ``deterministic`` has no effect.
+    ) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
+        """As SB3's; ``deterministic`` has no effect.
 
         :param observation: of n environments, or of one
         :param state: what the last call returned; None begins n episodes
         :param episode_start: (n,), true where the state begins anew
+        :return: actions in the environment's units, and the state: the GRU's, (n, H), and the steps since it began, (n,)
         """
         self.set_training_mode(False)
         rows, is_batch = self.obs_to_tensor(observation)
         n = len(rows)
-        if state is None:
-            state = np.zeros((self.n_layers, n, self.hidden_size), dtype=np.float32), np.zeros(n, dtype=np.int64)
-        hidden, steps = state
+        hidden, steps = (np.zeros((n, self.hidden_size)), np.zeros(n, dtype=np.int64)) if state is None else state
         begins = steps >= self.restart_every
         if episode_start is not None:
             begins = begins | np.ravel(episode_start).astype(bool)
-        kept = th.as_tensor(np.where(begins[None, :, None], np.float32(0.0), hidden), device=self.device)
+        kept = th.as_tensor(np.where(begins[:, None], 0.0, hidden), dtype=th.float32, device=self.device)
         with th.no_grad():
-            outputs, after = self.memory(self.normalized(rows)[:, None], kept)
+            outputs, after = self.memory(self.normalized(rows)[:, None], kept[None])
             scaled = self.head(outputs)[:, 0].clamp(-1, 1).cpu().numpy().reshape(-1, *(self.action_space.shape or ()))
         actions = np.asarray(self.unscale_action(scaled))
-        return actions if is_batch else actions[0], (after.cpu().numpy(), np.where(begins, 0, steps) + 1)
+        return actions if is_batch else actions[0], (after[0].cpu().numpy(), np.where(begins, 0, steps) + 1)
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         """The first step of an episode; :meth:`predict` carries the state."""
@@ -263,9 +263,8 @@ class BC(OfflineAlgorithm):
     :param args: policy and env of :class:`OfflineAlgorithm`
     :param n_seeds: networks trained side by side
     :param held_out_fraction: share of the episodes to hold out, at least one of several; 0 for none
-    :param weight_decay: decoupled from the gradient (AdamW)
     :param input_noise: standard deviation of Gaussian noise on the normalized observations of each batch
-    :param options: further keywords as there; ``policy_kwargs`` takes ``net_arch``
+    :param options: further keywords as there; ``policy_kwargs`` are those of :class:`BCPolicy`
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": BCPolicy}
@@ -277,20 +276,13 @@ class BC(OfflineAlgorithm):
         *args: Any,
         n_seeds: Positive = 4,
         held_out_fraction: Share = 0.1,
-        weight_decay: Weight = 0.0,
         input_noise: Weight = 0.0,
         **options: Any,
     ) -> None:
         self.n_seeds = n_seeds
         self.held_out_fraction = held_out_fraction
-        self.weight_decay = weight_decay
         self.input_noise = input_noise
         super().__init__(*args, **options)
-
-    def _new_policy(self, **options: Any) -> BCPolicy:
-        kwargs = {"optimizer_kwargs": {"weight_decay": self.weight_decay}, **options, **self.policy_kwargs}
-        policy: Any = self.policy_class(self.observation_space, self.action_space, self.lr_schedule, **kwargs)
-        return policy.to(self.device)
 
     def _take(self, demonstrations: Demonstrations) -> None:
         assert isinstance(self.action_space, spaces.Box)
@@ -312,9 +304,10 @@ class BC(OfflineAlgorithm):
 
     def _copy(self) -> BCPolicy:
         """A network of its own with the policy's normalization; of an agent that was loaded, with all of the policy."""
-        network = self._new_policy()
-        state = network.state_dict() | {"mean": self.policy.mean, "spread": self.policy.spread}
-        network.load_state_dict(self.policy.state_dict() if self._n_updates else state)
+        network, kept = self._new_policy(), self.policy.state_dict()
+        if not self._n_updates:
+            kept = {name: kept[name] for name in ("mean", "spread")}
+        network.load_state_dict(kept, strict=False)
         return network
 
     def _gradient_step(self) -> dict[str, th.Tensor]:
@@ -380,12 +373,12 @@ class BCRNN(BC):
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": BCRNNPolicy}
 
     @checked
-    def __init__(self, *args: Any, sequence_length: Positive = 10, **options: Any) -> None:
+    def __init__(
+        self, *args: Any, sequence_length: Positive = 10, policy_kwargs: dict[str, Any] | None = None, **options: Any
+    ) -> None:
         self.sequence_length = sequence_length
-        super().__init__(*args, **options)
-
-    def _new_policy(self, **options: Any) -> BCPolicy:
-        return super()._new_policy(**{"restart_every": self.sequence_length, **options})
+        policy_kwargs = {"restart_every": sequence_length, **(policy_kwargs or {})}
+        super().__init__(*args, policy_kwargs=policy_kwargs, **options)
 
     def _loss(self, network: BCPolicy, rows: th.Tensor, noise: float = 0.0) -> th.Tensor:
         """Mean squared error of the actions over the steps, from (B,) rows on, that lie within an episode."""

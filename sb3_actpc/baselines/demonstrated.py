@@ -8,8 +8,7 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
-from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.type_aliases import GymEnv, RolloutReturn
+from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
@@ -174,21 +173,6 @@ class DemonstratedAlgorithm(LearnsFromDemonstrations, StoresLastTransition):
             demonstration_fraction=self.demonstration_fraction,
             **kwargs,
         )
-
-    def collect_rollouts(self, *args: Any, **options: Any) -> RolloutReturn:
-        """As SB3's. After an exception or Ctrl-C the state of the environment is unknown: the next ``learn`` resets it."""
-        try:
-            return super().collect_rollouts(*args, **options)
-        except BaseException:
-            self._last_obs = None
-            raise
-
-    def _setup_learn(
-        self, total_timesteps: int, callback: Any = None, reset_num_timesteps: bool = True, *args: Any, **options: Any
-    ) -> tuple[int, BaseCallback]:
-        if reset_num_timesteps or self._last_obs is None:  # SB3 resets the environment
-            self._cut_running_episodes()
-        return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, *args, **options)
 
     def _cut_running_episodes(self) -> None:
         assert isinstance(self.replay_buffer, WithDemonstrations)

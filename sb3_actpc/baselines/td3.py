@@ -54,8 +54,8 @@ class TD3Demo(DemonstratedAlgorithm, TD3):
         bc_steps: Count = 0,
         **options: Any,
     ) -> None:
-        self.actor_kwargs = actor_kwargs
-        self.critic_kwargs = critic_kwargs
+        self.actor_kwargs = actor_kwargs or {}
+        self.critic_kwargs = critic_kwargs or {}
         self.policy_gradient_weight = policy_gradient_weight
         self.cloning_weight = cloning_weight
         self.q_filter = q_filter
@@ -77,7 +77,7 @@ class TD3Demo(DemonstratedAlgorithm, TD3):
                 network.optimizer = kind(network.parameters(), lr=rate)  # type: ignore[call-arg]
 
     def _networks(self) -> list[tuple[BaseModel, dict[str, Any]]]:
-        return [(self.actor, self.actor_kwargs or {}), (self.critic, self.critic_kwargs or {})]
+        return [(self.actor, self.actor_kwargs), (self.critic, self.critic_kwargs)]
 
     def train(self, gradient_steps: int, batch_size: int = 100) -> None:
         """TD3's updates: so many of the critic; the actor and the targets follow every ``policy_delay``."""
@@ -179,7 +179,7 @@ class TD3Demo(DemonstratedAlgorithm, TD3):
 
     def _follow(self, name: str) -> None:
         """Move a network's target towards it."""
-        tau = (getattr(self, f"{name}_kwargs") or {}).get("tau", self.tau)
+        tau = getattr(self, f"{name}_kwargs").get("tau", self.tau)
         polyak_update(getattr(self, name).parameters(), getattr(self, f"{name}_target").parameters(), tau)
 
     def _excluded_save_params(self) -> list[str]:

@@ -75,6 +75,8 @@ class StoresLastTransition(OffPolicyAlgorithm):
         **options: Any,
     ) -> tuple[int, BaseCallback]:
         self._is_reset = reset_num_timesteps or self._last_obs is None  # by SB3, before it prepares the callbacks
+        if self._is_reset:
+            self._cut_running_episodes()
         result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, *args, **options)
         self._last_obs = copied(self._last_obs)
         self._last_original_obs = copied(self._last_original_obs)
@@ -104,13 +106,17 @@ class StoresLastTransition(OffPolicyAlgorithm):
     def collect_rollouts(
         self, env: VecEnv, callback: BaseCallback, train_freq: TrainFreq, *args: Any, **options: Any
     ) -> RolloutReturn:
-        """As SB3's."""
+        """As SB3's. After an exception the state of the environment is unknown: the next ``learn`` resets it."""
         # SB3's, but the frequency can fall to 0: then SB3 finishes the present step and collects no more
         frequency: Any = SimpleNamespace(frequency=train_freq.frequency, unit=train_freq.unit)
         deferred = _Deferred(callback, frequency, self._watch())
-        rollout = super().collect_rollouts(self._watch(), cast(BaseCallback, deferred), frequency, *args, **options)
-        if deferred.error is not None:
-            raise deferred.error
+        try:
+            rollout = super().collect_rollouts(self._watch(), cast(BaseCallback, deferred), frequency, *args, **options)
+            if deferred.error is not None:
+                raise deferred.error
+        except BaseException:
+            self._last_obs = None
+            raise
         return RolloutReturn(rollout.episode_timesteps, rollout.n_episodes, not deferred.stops)
 
     def _excluded_save_params(self) -> list[str]:

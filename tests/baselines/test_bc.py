@@ -84,7 +84,7 @@ def test_demonstrated_observations_have_mean_zero_and_standard_deviation_one() -
 
 
 def test_the_state_begins_anew_after_as_many_steps_as_a_sequence_has() -> None:
-    model = make(BCRNN, sequence_length=4, policy_kwargs={**SMALL_RNN, "n_layers": 2}).learn(20)
+    model = make(BCRNN, sequence_length=4).learn(20)
     observations = record(ENV, n_episodes=1, n_steps=8).observations
     with th.no_grad():
         halves = model.policy(model.policy.normalized(th.as_tensor(observations)).reshape(2, 4, 3)).clamp(-1, 1)
@@ -125,6 +125,8 @@ def test_it_plays_the_same_after_loading_and_goes_on_learning(kind: type[BC], tm
     loaded.set_env(make_vec_env(ENV))
     loaded.learn(1)
     assert not np.array_equal(model.predict(rows)[0], loaded.predict(rows)[0])
+    with pytest.raises(ValueError, match="cannot be saved without its agent"):
+        model.policy.save(str(tmp_path / "policy.pth"))
 
 
 def test_a_saved_agent_names_its_demonstrations_as_they_were_given(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -162,7 +164,7 @@ def test_the_shared_evaluation_carries_the_state() -> None:
     [
         (BC, {"demonstrations": None}, "demonstrations=None.*: an offline method needs a file"),
         (BC, {"batch_size": 0}, "batch_size=0 must be at least 1"),
-        (BC, {"weight_decay": float("nan")}, "weight_decay=nan must be a finite number"),
+        (BC, {"input_noise": float("nan")}, "input_noise=nan must be a finite number"),
         (BC, {"n_demonstrations": 99}, "n_demonstrations=99.*: n_episodes must be"),
         (BCRNN, {"policy_kwargs": {"hidden_size": 0}}, "hidden_size=0 must be at least 1"),
         (BC, {"env": VecNormalize(make_vec_env(ENV))}, "or VecNormalize: an offline method .* normalizes by it itself"),

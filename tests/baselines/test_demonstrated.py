@@ -12,7 +12,6 @@ from gymnasium import spaces
 from stable_baselines3 import DDPG, SAC, TD3
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_actpc.baselines import BC, LOGO, DDPGDemo, TD3Demo
 from sb3_actpc.baselines.demonstrated import DemonstrationNStepReplayBuffer, DemonstrationReplayBuffer
@@ -47,14 +46,9 @@ def test_the_share_of_demonstrations_is_the_asked_one_and_they_come_last(fractio
     assert shown.tolist() == [False] * (16 - n_shown) + [True] * n_shown
     assert buffer.n_demonstrated(16) == n_shown
     assert (batch.rewards[:, 0] == 7.0).tolist() == shown.tolist()
+    assert (batch.actions[:, 0] == 0.5).tolist() == shown.tolist()  # scaled
+    assert (batch.dones == 0).all()  # a time limit is no end
     assert th.equal(batch.next_observations, batch.observations + 1)
-
-
-def test_demonstrated_actions_are_scaled_and_a_time_limit_is_no_end() -> None:
-    buffer = DemonstrationReplayBuffer(50, BOX, WIDE, demonstrations=numbered(5), demonstration_fraction=1.0)
-    batch = buffer.sample(64)
-    assert (batch.actions == 0.5).all()
-    assert (batch.dones == 0).all()
 
 
 def test_n_step_returns_of_demonstrations_are_n_step_returns() -> None:
@@ -87,16 +81,6 @@ def test_demonstrations_are_paid_by_the_environment_that_learns() -> None:
     env.close()
 
 
-def test_demonstrations_of_another_task_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"SparseHopper-v5.*SparseWalker2d-v5|SparseWalker2d-v5.*SparseHopper-v5"):
-        TD3Demo("MlpPolicy", "SparseHopper-v5", demonstrations=record("SparseWalker2d-v5"))
-
-
-def test_another_buffer_is_refused() -> None:
-    with pytest.raises(ValueError, match="must be None; for hindsight replay use HER"):
-        TD3Demo("MultiInputPolicy", "GoalReacher-v5", replay_buffer_class=HerReplayBuffer)
-
-
 def test_an_agent_loaded_to_play_has_no_buffer_until_it_has_an_environment(tmp_path) -> None:
     """rl-zoo3 plays agents without one: neither the memory nor the demonstrations' file may be needed."""
     path = tmp_path / "shown.npz"
@@ -113,6 +97,11 @@ def test_an_agent_loaded_to_play_has_no_buffer_until_it_has_an_environment(tmp_p
     loaded.set_env(model.env)
     assert loaded.replay_buffer.buffer_size == model.buffer_size
     assert loaded.replay_buffer.demonstrated.buffer_size == 24
+
+
+def test_demonstrations_of_another_task_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"SparseHopper-v5.*SparseWalker2d-v5|SparseWalker2d-v5.*SparseHopper-v5"):
+        TD3Demo("MlpPolicy", "SparseHopper-v5", demonstrations=record("SparseWalker2d-v5"))
 
 
 class Interrupts(BaseCallback):

@@ -6,9 +6,9 @@ import torch as th
 from stable_baselines3 import DDPG, TD3
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.utils import LinearSchedule
+from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_actpc.baselines import DDPGDemo, TD3Demo
-from tests.checkpoints.runs import assert_same, learn_in_two, learn_straight
 from tests.recordings import record
 
 SMALL = {"policy_kwargs": {"net_arch": [16]}, "learning_starts": 10, "batch_size": 16, "seed": 1}
@@ -48,6 +48,7 @@ def test_actor_and_critic_have_rates_optimisers_and_targets_of_their_own() -> No
         ({"critic_kwargs": {"optimizer": "sgd"}}, "sgd.* of a network: choose from .*optimizers .'adam', 'adamw'"),
         ({"demonstration_fraction": 1.5}, "demonstration_fraction=1.5 must be between 0 and 1"),
         ({"demonstrations": 3}, "demonstrations must be a file path"),
+        ({"replay_buffer_class": HerReplayBuffer}, "must be None; for hindsight replay use HER"),
     ],
 )
 def test_wrong_settings_are_named(options: dict, message: str) -> None:
@@ -101,18 +102,6 @@ def test_cloning_alone_brings_the_actor_to_the_demonstrations() -> None:
     before = distance()
     model.train(300, 32)
     assert distance() < 0.7 * before
-
-
-@pytest.mark.parametrize("kind", [TD3Demo, DDPGDemo])
-def test_a_stopped_run_goes_on_bit_for_bit(kind: type, tmp_path) -> None:
-    shown = record("Pendulum-v1")
-
-    def make() -> TD3Demo:
-        given = {"demonstrations": shown, "buffer_size": 100, "actor_kwargs": {"optimizer": "adamw"}}
-        return kind("MlpPolicy", "Pendulum-v1", **given, **SMALL)
-
-    straight = learn_straight(make, tmp_path / "straight", 40)
-    assert_same(straight, learn_in_two(make, tmp_path / "two", 40, 25))
 
 
 def test_the_number_of_demonstrations_can_be_limited() -> None:

@@ -195,6 +195,7 @@ def test_sb3s_evaluation_callback_remembers_its_best_and_its_rows(tmp_path: Path
 def test_a_bc_policy_is_trained_once(tmp_path: Path, stop_at: int) -> None:
     """Also where the run stops before its first update."""
     sizes = {"policy_kwargs": {"net_arch": [8], "n_critics": 3}, "batch_size": 8, "buffer_size": 200, "bc_steps": 20}
+    sizes["actor_kwargs"] = {"optimizer": "adamw"}
 
     def make() -> IBRL:
         env = DummyVecEnv([CountingEnv])
