@@ -184,8 +184,11 @@ def test_bringing_a_run_to_its_end_begins_goes_on_or_does_nothing() -> None:
         lines.clear()
         assert finish_run(Run(**{**run.model_dump(), "n_timesteps": steps}), lines.append)["timesteps"] == end
     assert lines == []
-    for changed, name in (({"settings": {"gamma": 0.5}}, "of other settings"), ({"keep": "best"}, "keep=last and not best")):
-        with pytest.raises(ValueError, match=f"mine holds another run.*{name}"):
+    for changed, difference in (
+        ({"settings": {"gamma": 0.5}}, "gamma=None and not 0.5"),
+        ({"keep": "best"}, "keep=last and not best"),
+    ):
+        with pytest.raises(ValueError, match=f"mine holds another run, with {difference}"):
             finish_run(Run(**{**run.model_dump(), **changed}))
 
 

@@ -112,17 +112,15 @@ def test_settings_given_on_the_command_line_replace_the_presets() -> None:
     assert record["settings"]["learning_starts"] == 20
 
 
-def test_a_finished_run_is_not_overwritten_and_an_unfinished_one_is() -> None:
+def test_a_finished_run_is_not_overwritten_and_an_unfinished_one_is(capsys: pytest.CaptureFixture[str]) -> None:
     arguments = ["--demonstrations", "none", "--steps", "20", "--checkpoint-freq", "0"]
     assert train(*arguments) == 0
     before = (RUN / "result.json").read_bytes()
-    assert train(*arguments) == 0
-    second = RUN.with_name(f"{RUN.name}_2")
+    assert train(*arguments) == 2
+    assert "already holds a finished run: choose another folder (--output)" in capsys.readouterr().err
     assert (RUN / "result.json").read_bytes() == before
-    (second / "result.json").unlink()
+    (RUN / "result.json").unlink()
     assert train(*arguments) == 0
-    assert (second / "result.json").exists()
-    assert not RUN.with_name(f"{RUN.name}_3").exists()
 
 
 def test_a_folder_that_was_named_is_refused_while_another_process_trains_in_it(capsys: pytest.CaptureFixture[str]) -> None:
@@ -261,6 +259,16 @@ def test_presets_are_plain_and_an_entry_replaces_the_default() -> None:
     Path("p.yml").write_text("default: !!python/object/apply:os.getcwd []", encoding="utf-8")
     with pytest.raises(ValueError, match="not YAML of plain values"):
         load_preset("p.yml", ENV_ID)
+
+
+@pytest.mark.parametrize("command", [["train", "--env", ENV_ID, "--preset", "p.yml"], ["compare", "p.yml"]])
+def test_a_key_that_is_given_twice_is_named_with_its_file_and_line(
+    command: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    Path("p.yml").write_text("default:\n  gamma: 0.9\n  tau: 0.1\n  gamma: 0.8\n", encoding="utf-8")
+    assert main(command) == 2
+    message = "p.yml: not YAML of plain values with unique keys (line 4: the key 'gamma' is given twice)"
+    assert message in capsys.readouterr().err
 
 
 # mean dense returns that the shipped demonstrators must reach; the paper's agents are compared with such ones

@@ -40,15 +40,16 @@ def write_report(folder: Path, target: Path | None = None, steps: Sequence[int] 
         text.append(f"## {task}\n\n![{task}]({picture.name})")
         for measure, table in task_tables(results, task, steps).items():
             text.append(f"### {measure.replace('_', ' ').capitalize()}\n\n{markdown(table)}")
-    if scores := _on_every_task(results.finished, "normalized"):
+    scores = _on_every_task(results.finished, "normalized")
+    if scores:
         draw_summary(scores, target / "summary.png")
         files.append(target / "summary.png")
         text.append(f"## Across tasks\n\n{markdown(_aggregate_table(scores))}\n\n![Across tasks](summary.png)")
     improvement = improvement_table(results, steps)
-    if len(improvement):
+    if not improvement.empty:
         text.append(f"## Probability of improvement\n\nOf the return on a task drawn at random.\n\n{markdown(improvement)}")
     missing = results.runs.loc[results.runs["status"] != "finished", ["task", "variant", "seed", "status", "steps", "error"]]
-    if len(missing):
+    if not missing.empty:
         text.append(f"## Runs that are not in the tables\n\n{markdown(missing)}")
     with atomic_write(target / "report.md", "w") as file:
         file.write("\n\n".join(text) + "\n")
@@ -103,7 +104,8 @@ def _aggregate_table(scores: dict[str, list[np.ndarray]]) -> pd.DataFrame:
 def improvement_table(results: Results, steps: Sequence[int]) -> pd.DataFrame:
     """Probability that a run of the first variant has a higher return than one of the second on a task drawn at random, for
     every pair and step; a run that ended before counts with its last evaluation."""
-    rows, runs = [], results.finished
+    runs = results.finished
+    rows = []
     for step in sorted({step for step in steps if step <= runs["steps"].max()}):
         ended = runs["return"].where(runs["steps"] < step)
         scores = _on_every_task(runs.assign(at_step=runs[f"return_at_{step}"].fillna(ended)), "at_step")
@@ -149,9 +151,9 @@ def markdown(table: pd.DataFrame) -> str:
 def draw_curves(results: Results, task: str, path: Path) -> None:
     """Draw means and 95 % intervals over environment steps, at the steps that all seeds of a variant have."""
     figure = Figure(figsize=(8.0, 4.2), layout="constrained")
-    axes, measure = figure.subplots(), "dense_return"
-    if (reference := reference_score(results.runs.loc[results.runs["task"] == task, "env"].iloc[0])) is not None:
-        measure = reference.measure
+    axes = figure.subplots()
+    reference = reference_score(results.runs.loc[results.runs["task"] == task, "env"].iloc[0])
+    measure = "dense_return" if reference is None else reference.measure
     for index, (label, runs) in enumerate(results.groups(task).items()):
         rows = results.curves[results.curves["run"].isin(runs.index)]
         table = rows.pivot(index="timesteps", columns="run", values=measure).dropna()
@@ -182,7 +184,8 @@ def draw_summary(scores: Mapping[str, Scores], path: Path) -> None:
 
 def _band(axes: Any, x: np.ndarray, values: Any, label: str, index: int) -> None:
     """A line, and the band between two others around it: (3, n)."""
-    color, marker = COLORS[index % len(COLORS)], MARKERS[index % len(MARKERS)]
+    color = COLORS[index % len(COLORS)]
+    marker = MARKERS[index % len(MARKERS)]
     axes.plot(x, values[0], label=label, color=color, marker=marker, markevery=max(1, len(x) // 8))
     axes.fill_between(x, values[1], values[2], color=color, alpha=0.15, linewidth=0)
 

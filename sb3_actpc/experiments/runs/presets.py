@@ -34,7 +34,18 @@ _ACTIVATIONS: dict[str, type[nn.Module]] = {"relu": nn.ReLU, "tanh": nn.Tanh, "e
 
 
 class _PlainLoader(yaml.SafeLoader):
-    """YAML 1.1 of plain values, in which ``1e-3`` is a number, as in YAML 1.2."""
+    """YAML 1.1 of plain values, in which ``1e-3`` is a number, as in YAML 1.2, and every key is given once."""
+
+    def compose_mapping_node(self, anchor: Any) -> yaml.MappingNode:
+        """A mapping, with the text of its keys; PyYAML would silently take the last of two values."""
+        node = super().compose_mapping_node(anchor)
+        known = set()
+        for key, _ in node.value:
+            text = str(key.value)
+            if text in known:
+                raise ValueError(f"line {key.start_mark.line + 1}: the key {text!r} is given twice")
+            known.add(text)
+        return node
 
 
 _PlainLoader.add_implicit_resolver(
@@ -43,11 +54,11 @@ _PlainLoader.add_implicit_resolver(
 
 
 def read_yaml(text: str | bytes, source: str) -> Any:
-    """The one reader of YAML: plain values, nothing in it is run; a ValueError names the source."""
+    """The one reader of YAML that users write: plain values, nothing in it is run; a ValueError names the source."""
     try:
         return yaml.load(text, Loader=_PlainLoader)
     except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise ValueError(f"{source}: not YAML of plain values ({' '.join(str(error).split())})") from error
+        raise ValueError(f"{source}: not YAML of plain values with unique keys ({' '.join(str(error).split())})") from error
 
 
 def load_preset(preset: str, env_id: str) -> dict[str, Any]:
@@ -146,7 +157,8 @@ def agent_keywords(run: Run, observation_space: gym.Space[Any], action_space: gy
         if activation not in _ACTIVATIONS:
             raise ValueError(f"activation_fn={activation!r} is unknown: choose one of {', '.join(_ACTIVATIONS)}")
         keywords["policy_kwargs"]["activation_fn"] = _ACTIVATIONS[activation]
-    if takes_demonstrations(run) and (found := find_demonstrations(run.env, run.demonstrations)) is not None:
+    found = find_demonstrations(run.env, run.demonstrations) if takes_demonstrations(run) else None
+    if found is not None:
         keywords["demonstrations"] = found
     if run.noise_type is not None:
         size = int(np.prod(action_space.shape or (1,)))
