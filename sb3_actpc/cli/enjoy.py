@@ -15,8 +15,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
     add("--env", required=True, help="Gymnasium id, such as SparseReacher-v5")
     add("--episodes", type=count, default=3, metavar="N", help="episodes to play (default: %(default)s)")
     add("--seed", type=int, default=0, help="seed of the first episode (default: %(default)s)")
-    add("--video", type=Path, metavar="FILE", help="video of the first episode, .mp4, .gif or .png, instead of a window")
-    add("--frames", type=count, default=300, metavar="N", help="its most frames (default: %(default)s)")
+    add("--video", type=Path, metavar="FILE", help="video of the first episode, .mp4 or .gif, instead of a window")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -44,5 +43,5 @@ def run(args: argparse.Namespace) -> int:
     for number, value in enumerate(played.returns):
         print(f"episode {number}: return {value:.1f}, {int(played.lengths[number])} steps")
     if video is not None:
-        print(video_note(model, args.env, row["env_kwargs"], video, args.seed, args.frames))
+        print(video_note(model, args.env, row["env_kwargs"], video, args.seed))
     return 0

@@ -103,11 +103,10 @@ def _settings(env_id: str, ours: argparse.Namespace) -> dict[str, Any]:
     """The entry of rl_zoo3's settings file: the preset's, the demonstrations, and the log of successes."""
     from sb3_actpc.experiments.runs import Run, resolve
     from sb3_actpc.experiments.runs.environments import make_env
-    from sb3_actpc.experiments.runs.presets import RUN_KEYS, find_demonstrations, fitting_policy, takes_demonstrations
+    from sb3_actpc.experiments.runs.presets import find_demonstrations, fitting_policy, preset_entry, takes_demonstrations
 
     run = resolve(Run(env=env_id, algo=ours.algo, preset=ours.preset, demonstrations=ours.demonstrations or "shipped"))
-    settings = {name: getattr(run, name) for name in RUN_KEYS if getattr(run, name)} | run.settings
-    settings |= {} if run.normalize is None else {"normalize": run.normalize or True}
+    settings = preset_entry(run)
     found = find_demonstrations(env_id, run.demonstrations) if takes_demonstrations(run) else None
     if found is not None:
         settings["demonstrations"] = str(found.absolute()) if isinstance(found, Path) else found

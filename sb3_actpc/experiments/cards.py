@@ -14,8 +14,8 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_actpc.actpc import ActPC
 from sb3_actpc.experiments.runs.evaluation import NormalizedPredictor
-from sb3_actpc.experiments.runs.presets import RUN_KEYS
-from sb3_actpc.experiments.runs.record import CONFIG, read_config, read_result, write_json
+from sb3_actpc.experiments.runs.presets import preset_entry
+from sb3_actpc.experiments.runs.record import CONFIG, read_result, write_json
 from sb3_actpc.experiments.runs.run import evaluate_run, load_run
 from sb3_actpc.experiments.runs.schema import Run
 from sb3_actpc.experiments.runs.video import video_note
@@ -64,10 +64,8 @@ def write_card(folder: Path, target: Path, n_episodes: int = 10, seed: int = 0, 
     write_json(target / "results.json", measured)
     if video:
         notes.append(video_note(model, run.env, run.env_kwargs, target / VIDEO, seed))
-    record = read_config(folder)
-    own = {key: record[key] for key in RUN_KEYS if record[key]}
     with atomic_write(target / PRESET, "w") as file:
-        yaml.safe_dump({run.env: {**own, **record["settings"]}}, file, sort_keys=True)
+        yaml.safe_dump({run.env: preset_entry(run)}, file, sort_keys=True)
     with atomic_write(target / "README.md", "w") as file:
         file.write(_card_text(run, result, name, (target / VIDEO).is_file()))
     return notes

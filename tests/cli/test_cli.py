@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
-import imageio.v2 as imageio
 import numpy as np
 import pytest
 from stable_baselines3 import TD3
@@ -200,8 +199,6 @@ def test_evaluate_replays_a_run_and_writes_a_video(capsys: pytest.CaptureFixture
     assert "20.0 ± 0.0" in printed
     assert "3 episodes" in printed
     assert Path("line.gif").read_bytes().startswith(b"GIF8")
-    assert main(["evaluate", str(RUN), "--episodes", "1", "--video", "line.png"]) == 0
-    assert imageio.imread("line.png").shape == (16, 6 * 24, 3)  # six pictures at half the size
     assert main(["evaluate", str(RUN), "--episodes", "1"]) == 0
     assert (RUN / "video.mp4").stat().st_size > 0
     assert "not finished" not in capsys.readouterr().out
@@ -236,7 +233,7 @@ def test_evaluate_replays_a_run_and_writes_a_video(capsys: pytest.CaptureFixture
         (["train", "--env", "Own-v0", "--gym-packages", "no_such_task"], "No module named 'no_such_task'"),
         (["train", "--env", "CartPole-v1", "--algo", "td3", "--preset", "small.yml"], "only supports"),
         (["evaluate", "nowhere"], "no run in nowhere: config.json is missing"),
-        (["evaluate", "nowhere", "--video", "film.avi"], "must end in .mp4, .gif or .png"),
+        (["evaluate", "nowhere", "--video", "film.avi"], "must end in .mp4 or .gif"),
     ],
 )
 def test_mistakes_give_one_line_and_exit_code_2(

@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 
 from sb3_actpc.experiments.comparison.schedule import ERROR, FINISHED, read_error, run_status
-from sb3_actpc.experiments.runs.evaluation import EPISODES, OF_ACTOR, PROGRESS
+from sb3_actpc.experiments.runs.evaluation import OF_ACTOR, PROGRESS
 from sb3_actpc.experiments.runs.record import CONFIG, read_config
 from sb3_actpc.experiments.runs.schema import content_id
 from sb3_actpc.utils.files import atomic_write
@@ -142,8 +142,6 @@ def _run_row(folder: Path, curve: pd.DataFrame, chosen_steps: Sequence[int]) -> 
     config = read_config(folder) if (folder / CONFIG).is_file() else {}
     task = config.get("task") or folder.parent.parent.name
     env_id = config.get("env") or task
-    reference = config.get("demonstrators_return")
-    episodes = _read_rows(folder / EPISODES)
     return {
         "task": task,
         "env": env_id,
@@ -154,11 +152,8 @@ def _run_row(folder: Path, curve: pd.DataFrame, chosen_steps: Sequence[int]) -> 
         "seed": int(folder.name.partition("_")[0].removeprefix("seed")),
         "status": run_status(folder),
         "steps": int(curve["timesteps"].iloc[-1]) if len(curve) else 0,
-        "planned_steps": config.get("n_timesteps", 0),
         "eval_episodes": config.get("eval_episodes", 0),
         **run_measures(env_id if reference_score(task) is None else task, curve, chosen_steps),
-        "episodes": len(episodes),
-        "demonstrators_return": math.nan if reference is None else reference,
         "version": dict(config.get("versions", {})).get("sb3-actpc", ""),
         "commit": (config.get("git_commit") or "")[:10],
         "dirty": bool(config.get("dirty")),

@@ -148,6 +148,14 @@ def preset(env_id: str, name: str | None = None, algo: str = "actpc") -> dict[st
         return agent_keywords(run, env.observation_space, env.action_space)
 
 
+def preset_entry(run: Run) -> dict[str, Any]:
+    """What a filled run's settings file would say of its task."""
+    entry = {name: getattr(run, name) for name in RUN_KEYS if getattr(run, name)} | run.settings
+    if run.normalize == {}:
+        entry["normalize"] = True
+    return entry
+
+
 def agent_keywords(run: Run, observation_space: gym.Space[Any], action_space: gym.Space[Any]) -> dict[str, Any]:
     """Keywords of a filled run's algorithm's constructor, all but the environment, the seed and the device."""
     keywords = _parsed(run.settings)
