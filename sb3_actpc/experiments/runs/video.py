@@ -61,9 +61,8 @@ def record_video(
     model: Any, env_id: str, env_kwargs: dict[str, Any], path: Path, seed: int, n_frames: int = MAX_FRAMES
 ) -> int:
     """Write a video of the first steps, at most ``n_frames``, of an episode with the deterministic policy: the number of
-    frames, each (height, width, 3) uint8. ``env_kwargs`` are the environment's, ``width`` and ``height`` in pixels where it takes
-    them. RenderingUnavailable when rendering does not work here, ValueError when the path ends in neither ``.mp4`` nor ``.gif``.
-    """
+    frames, each (height, width, 3) uint8. ``env_kwargs`` are the environment's, ``width`` and ``height`` in pixels where it
+    takes them. RenderingUnavailable when rendering does not work here, ValueError when the path is not one of a video."""
     check_video_path(path)
     imageio = import_extra("imageio.v2", "experiments")
     if path.suffix.lower() == ".mp4":
