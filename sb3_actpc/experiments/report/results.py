@@ -60,9 +60,7 @@ class Results:
 
 def load_results(folder: Path, chosen_steps: Sequence[int] = CHOSEN_STEPS) -> Results:
     """Read a comparison's run folders, or the two files that :func:`write_results` left where there are no run folders.
-
-    :raises FileNotFoundError: when the folder holds neither
-    """
+    FileNotFoundError when the folder holds neither."""
     found = {path.parent for name in (CONFIG, ERROR) for path in folder.glob(f"*/*/seed*/{name}")}
     folders = sorted(path for path in found if RUN_FOLDER.fullmatch(path.name))
     if not folders and (folder / CURVES).is_file():
@@ -105,11 +103,8 @@ def _read_rows(path: Path) -> pd.DataFrame:
 
 
 def run_measures(env_id: str, curve: pd.DataFrame, chosen_steps: Sequence[int] = CHOSEN_STEPS) -> dict[str, float]:
-    """What one run reached; NaN where it is undefined.
-
-    For each of ``MEASURES``: the last evaluation, the evaluation at each chosen step, the worst
-    evaluation from 5,000 steps on, and the area under the curve divided by its length (the mean over steps).
-    """
+    """What one run reached; NaN where it is undefined. For each of ``MEASURES``: the last evaluation, that at each chosen
+    step, the worst from 5,000 steps on, and the area under the curve divided by its length (the mean over steps)."""
     values: dict[str, float] = {}
     steps = curve["timesteps"] if len(curve) else pd.Series(dtype=float)
     for name in MEASURES:

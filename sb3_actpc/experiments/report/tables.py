@@ -22,13 +22,9 @@ MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 
 
 def write_report(folder: Path, target: Path | None = None, steps: Sequence[int] = CHOSEN_STEPS) -> list[Path]:
-    """Write ``results.csv``, ``curves.csv.gz``, ``report.md`` and the figures of a comparison.
-
-    :param folder: of the comparison, or one that holds its two CSV files
-    :param target: where the files go, by default the same folder
-    :param steps: the environment steps whose evaluations the tables show
-    :raises FileNotFoundError: when there are no runs
-    """
+    """Write ``results.csv``, ``curves.csv.gz``, ``report.md`` and the figures of a comparison's folder, or of one that holds
+    its two CSV files, into the target, by default the same. The tables show the evaluations at the environment steps given.
+    FileNotFoundError when there are no runs."""
     target = folder if target is None else target
     results = load_results(folder, steps)
     files = write_results(results, target)

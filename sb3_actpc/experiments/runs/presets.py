@@ -130,18 +130,13 @@ def resolve(run: Run) -> Run:
 
 
 def preset(env_id: str, name: str | None = None, algo: str = "actpc") -> dict[str, Any]:
-    """A preset as keywords of the agent's constructor: ``ActPC(env=env, **preset("SparseHopper-v5"))``.
+    """A preset (a name as in ``--preset``, by default the algorithm's own) as keywords of the agent's constructor, without the
+    environment: ``ActPC(env=env, **preset("SparseHopper-v5"))``.
 
     ``noise_type`` and ``noise_std`` become ``action_noise``, ``lin_4e-4`` a schedule, and the demonstrations are those in the
     package. Left out is what is not the agent's: ``n_timesteps`` (of ``learn``), ``n_envs``, ``env_kwargs`` and ``normalize``
-    (of the environment).
-
-    :param env_id: Gymnasium id of the task
-    :param name: as in ``--preset``, by default the algorithm's own
-    :param algo: key of ``ALGORITHMS``
-    :return: the keywords, without the environment
-    :raises FileNotFoundError: when there is no such preset
-    :raises ValueError: when one of its settings is unknown or wrong
+    (of the environment). FileNotFoundError when there is no such preset, ValueError when one of its settings is unknown or
+    wrong.
     """
     run = resolve(Run(env=env_id, algo=algo, preset=name))
     with closing(make_env(env_id, run.env_kwargs)) as env:

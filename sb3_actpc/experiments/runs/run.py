@@ -196,13 +196,9 @@ def _begun(run: Run, model: BaseAlgorithm, report: Report) -> Run:
     source = presets.find_demonstrations(run.env, run.demonstrations)
     returns = None if source is None else resolve_demonstrations(source).dense_returns
     commit, dirty = record.git_state()
-    known = {
-        "policy": presets.fitting_policy(run.policy or "MlpPolicy", model.observation_space),
-        "demonstrators_return": None if returns is None else float(returns.mean()),
-        "versions": record.package_versions(),
-        "git_commit": commit,
-        "dirty": dirty,
-    }
+    known: dict[str, Any] = {"versions": record.package_versions(), "git_commit": commit, "dirty": dirty}
+    known["demonstrators_return"] = None if returns is None else float(returns.mean())
+    known["policy"] = presets.fitting_policy(run.policy or "MlpPolicy", model.observation_space)
     return run.model_copy(update=known)
 
 
@@ -216,14 +212,10 @@ def _logger(model: BaseAlgorithm, folder: Path) -> Logger:
 
 
 def evaluate_run(folder: Path, n_episodes: int = 10, seed: int = 0) -> dict[str, Any]:
-    """Play episodes with the policy of a run, the first from ``seed``. Its ``model.zip`` is unpickled: open only runs that you
-    trust.
-
-    :return: means and standard deviations over the episodes, where those without success ended, and what identifies the run
-    :raises FileNotFoundError: when the folder is not that of a run
-    :raises ValueError: when its files are damaged
-    :raises gymnasium.error.Error: when the environment is unknown
-    """
+    """Play episodes with the policy of a run, the first from ``seed``: means and standard deviations over the episodes, where
+    those without success ended, and what identifies the run. Its ``model.zip`` is unpickled: open only runs that you trust.
+    FileNotFoundError when the folder is not that of a run, ValueError when its files are damaged, gymnasium.error.Error when
+    the environment is unknown."""
     run, model = load_run(folder)
     with ExitStack() as stack:
         stack.callback(getattr(model, "close", lambda: None))
