@@ -11,10 +11,11 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from sb3_actpc.experiments.report import statistics
-from sb3_actpc.experiments.report.results import CHOSEN_STEPS, MEASURES, Results, load_results, reference_score, write_results
+from sb3_actpc.experiments.report.results import MEASURES, Results, load_results, reference_score, write_results
 from sb3_actpc.experiments.report.statistics import Scores
 from sb3_actpc.utils.files import atomic_write, folder_name
 
+CHOSEN_STEPS = (10_000, 25_000, 50_000)
 UNDEFINED = "n/a"
 # Okabe and Ito's color-blind safe palette; markers tell curves apart without color
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
@@ -26,7 +27,7 @@ def write_report(folder: Path, target: Path | None = None, steps: Sequence[int] 
     its two CSV files, into the target, by default the same. The tables show the evaluations at the environment steps given.
     FileNotFoundError when there are no runs."""
     target = folder if target is None else target
-    results = load_results(folder, steps)
+    results = load_results(folder)
     files = write_results(results, target)
     text = [f"# Comparison {folder.name}\n\n{_overview(results.runs)}"]
     for task in results.finished["task"].unique():
@@ -57,12 +58,13 @@ def task_tables(results: Results, task: str, steps: Sequence[int]) -> dict[str, 
     groups = results.groups(task)
     tables = {}
     for measure in MEASURES:
-        columns = {f"at {step:,}": f"{measure}_at_{step}" for step in steps}
-        columns |= {"last": measure, "area": f"{measure}_area", "worst after 5,000": f"{measure}_worst"}
+        columns = {"last": measure, "area": f"{measure}_area", "worst after 5,000": f"{measure}_worst"}
         form = ".2f" if measure.endswith("success") else ".1f"
         rows = []
         for label, runs in groups.items():
-            cells = {title: mean_and_deviation(runs[column].to_numpy(), form) for title, column in columns.items()}
+            values = {f"at {step:,}": results.at_step(runs, measure, step) for step in steps}
+            values |= {title: runs[column] for title, column in columns.items()}
+            cells = {title: mean_and_deviation(own.to_numpy(), form) for title, own in values.items()}
             if any(cell != UNDEFINED for cell in cells.values()):
                 rows.append({"variant": label, **cells})
         if rows:
@@ -104,7 +106,7 @@ def improvement_table(results: Results, steps: Sequence[int]) -> pd.DataFrame:
     rows = []
     for step in sorted({step for step in steps if step <= runs["steps"].max()}):
         ended = runs["return"].where(runs["steps"] < step)
-        scores = _on_every_task(runs.assign(at_step=runs[f"return_at_{step}"].fillna(ended)), "at_step")
+        scores = _on_every_task(runs.assign(at_step=results.at_step(runs, "return", step).fillna(ended)), "at_step")
         for name, other in combinations(scores, 2):
             value, low, high = statistics.probability_of_improvement(scores[name], scores[other])
             rows.append([f"{name} over {other}", f"{step:,}", f"{value:.2f}", interval(low, high, ".2f")])
