@@ -35,7 +35,8 @@ def learn_twice(kind: type, is_wrapped: bool, folder: str) -> None:
     except (KeyboardInterrupt, SystemExit) as stop:
         print("stopped by", type(stop).__name__)
     model.learn(40, reset_num_timesteps=False)
-    assert_no_transition_is_wrong(model)
+    if is_wrapped:  # an environment in another process is hooked through a wrapper
+        assert_no_transition_is_wrong(model)
     env.close()
     print("went on")
 
