@@ -20,7 +20,10 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
 
 def run(args: argparse.Namespace) -> int:
     """Play; a machine that cannot render is no error."""
+    from sb3_actpc.experiments.runs.environments import make_env
+    from sb3_actpc.experiments.runs.evaluation import play_episodes
     from sb3_actpc.experiments.runs.video import check_video_path, choose_gl_backend, video_note
+    from sb3_actpc.pretrained import find_agent, load_pretrained
 
     video = args.video
     has_display = sys.platform in ("win32", "darwin") or any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY")))
@@ -28,12 +31,7 @@ def run(args: argparse.Namespace) -> int:
         video = Path(f"{args.env.replace(':', '_')}.mp4")
     if video is not None:
         check_video_path(video)
-        choose_gl_backend()  # before MuJoCo is imported
-
-    from sb3_actpc.experiments.runs.environments import make_env
-    from sb3_actpc.experiments.runs.evaluation import play_episodes
-    from sb3_actpc.pretrained import find_agent, load_pretrained
-
+        choose_gl_backend()
     row = find_agent(args.env)
     model = load_pretrained(args.env)
     print(f"{args.env}: {row['timesteps']} steps, seed {row['seed']}, return {row['return']:.1f} ± {row['return_std']:.1f}")

@@ -19,18 +19,16 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
 
 def run(args: argparse.Namespace) -> int:
     """Play, print the table, record; a machine that cannot render is no error."""
+    from sb3_actpc.experiments.runs import evaluate_run, load_run
+    from sb3_actpc.experiments.runs.record import is_finished
+    from sb3_actpc.experiments.runs.run import result_table
     from sb3_actpc.experiments.runs.video import check_video_path, choose_gl_backend, video_note
 
     folder = args.folder
     video = Path(args.video or folder / "video.mp4")
     if not args.no_video:
         check_video_path(video)
-        choose_gl_backend()  # before MuJoCo is imported
-
-    from sb3_actpc.experiments.runs import evaluate_run, load_run
-    from sb3_actpc.experiments.runs.record import is_finished
-    from sb3_actpc.experiments.runs.run import result_table
-
+        choose_gl_backend()
     print(result_table(evaluate_run(folder, args.episodes, args.seed)), flush=True)
     if not is_finished(folder):
         print(f"{folder} is not finished: this was the agent of its last evaluation (sb3-actpc train --resume {folder})")

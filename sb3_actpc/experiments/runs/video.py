@@ -29,11 +29,13 @@ class RenderingUnavailable(RuntimeError):
 
 def choose_gl_backend() -> str | None:
     """Find a way for MuJoCo to render without a window and select it for this process (environment variables); None when
-    nothing works. Call it before MuJoCo is imported: what ``MUJOCO_GL`` names is tried first, and unset when nothing works,
-    since MuJoCo cannot be imported with a name that does not work."""
+    nothing works. Call it before an environment is made, with which some read the variables: what ``MUJOCO_GL`` names is tried
+    first, and unset when nothing works."""
     chosen = os.environ.get("MUJOCO_GL", "")
     for backend in dict.fromkeys(filter(None, (chosen, *GL_BACKENDS))):
-        variables = dict.fromkeys(("MUJOCO_GL", *(["PYOPENGL_PLATFORM"] if backend in GL_BACKENDS else [])), backend)
+        variables = {"MUJOCO_GL": backend}
+        if backend in GL_BACKENDS:
+            variables["PYOPENGL_PLATFORM"] = backend
         with contextlib.suppress(subprocess.SubprocessError):
             command = [sys.executable, "-c", _PROBE]
             subprocess.run(command, env={**os.environ, **variables}, capture_output=True, timeout=60, check=True)
