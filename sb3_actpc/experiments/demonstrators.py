@@ -118,8 +118,11 @@ def record_demonstrators(
     """Record demonstrators, who take turns, in the task itself, see ``Demonstrations.record``; ``stochastic`` samples the
     actions instead of taking the most likely ones."""
     set_random_seed(seed)
-    steps, returns = [one.n_steps for one in demonstrators], [one.mean_return for one in demonstrators]
-    kept = {"demonstrator_steps": steps, "demonstrator_returns": returns, **(metadata or {})}
+    kept = {
+        "demonstrator_steps": [one.n_steps for one in demonstrators],
+        "demonstrator_returns": [one.mean_return for one in demonstrators],
+        **(metadata or {}),
+    }
     policies = [one.policy for one in demonstrators]
     options = {"deterministic": not stochastic, "seed": seed, **options}
     return Demonstrations.record(policies, env_id, n_episodes, metadata=kept, **options)

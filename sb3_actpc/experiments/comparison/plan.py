@@ -68,7 +68,8 @@ def read_comparison_file(path: Path) -> dict[str, Any]:
 def with_options(content: Mapping[str, Any], options: Mapping[str, Any]) -> dict[str, Any]:
     """The content of a file, with options instead of its values; a name of its own variants stands for that variant.
     ValueError for a name that neither the file nor the package knows."""
-    content, options = dict(content), dict(options)
+    content = dict(content)
+    options = dict(options)
     if "steps" in options:  # a file may call them n_timesteps
         content.pop("n_timesteps", None)
     if "algos" in options:

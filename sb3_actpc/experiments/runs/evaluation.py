@@ -86,7 +86,8 @@ class EpisodeStatistics:
 
     def summary(self) -> dict[str, float | None]:
         """Means and standard deviations over the episodes; ``success`` is None where it is not reported."""
-        dense, own = self.dense_returns, self.returns
+        dense = self.dense_returns
+        own = self.returns
         values = (dense.mean(), dense.std(), own.mean(), own.std(), self.successes.mean(), self.lengths.mean())
         return {name: None if np.isnan(value) else float(value) for name, value in zip(SUMMARY, values, strict=True)}
 

@@ -99,19 +99,23 @@ def _continued(folder: Path, more_steps: int, changes: Mapping[str, Any]) -> Run
 
 
 def _check_same(stored: Run, run: Run) -> None:
-    """:raises ValueError: where the folder holds another run than this one; the policy may have been fitted to the
-    observations, and ``eval_freq`` to the steps"""
-    old, new = (one.model_dump(mode="json", include={*CONTENT, "seed"}) for one in (stored, run))
-    for name in ("n_timesteps", "policy", "eval_freq"):
-        del old[name], new[name]
-    old |= old.pop("settings")
-    new |= new.pop("settings")
+    """:raises ValueError: where the folder holds another run than this one"""
+    old = _decisive(stored)
+    new = _decisive(run)
     for name in sorted(old.keys() | new.keys()):
         if old.get(name) != new.get(name):
             raise ValueError(
                 f"{run.folder} holds another run, with {name}={old.get(name)} and not {new.get(name)}: remove it, choose "
                 f"another folder (--output; of `demos collect` --work-dir), or give the old {name}"
             )
+
+
+def _decisive(run: Run) -> dict[str, Any]:
+    """What must not change in a run that is gone on with, its settings one by one; the policy may have been fitted to the
+    observations, and ``eval_freq`` to the steps."""
+    values = run.model_dump(mode="json", include={*CONTENT, "seed"} - {"n_timesteps", "policy", "eval_freq"})
+    settings = values.pop("settings")
+    return {**values, **settings}
 
 
 def _run(
