@@ -254,4 +254,7 @@ def missing_demonstrations(run: Run) -> str:
 def demonstrations_hash(run: Run) -> str | None:
     """SHA-256 of what a run's demonstrations hold, None for none; FileNotFoundError when they are not there."""
     found = find_demonstrations(run.env, run.demonstrations)
-    return None if found is None else file_hash(*(minari_files(found) if isinstance(found, str) else [found]))
+    if found is None:
+        return None
+    files = minari_files(found) if isinstance(found, str) else [found]
+    return file_hash(*files)

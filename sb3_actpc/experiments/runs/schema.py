@@ -41,7 +41,9 @@ def _number(value: Any) -> Any:
 
 def _keywords(value: Any) -> Any:
     """As in rl-zoo3: true, false, or keywords."""
-    return ({} if value else None) if isinstance(value, bool) else value
+    if value is True:
+        return {}
+    return None if value is False else value
 
 
 Count = Annotated[int, BeforeValidator(_number), Field(ge=1)]
