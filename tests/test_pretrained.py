@@ -94,7 +94,7 @@ def test_enjoy_plays_an_agent_and_writes_a_video(
     monkeypatch.chdir(tmp_path)
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
-    assert main(["enjoy", "--env", ENV_ID, "--episodes", "2", "--frames", "5"]) == 0
+    assert main(["enjoy", "--env", ENV_ID, "--episodes", "2"]) == 0
     assert capsys.readouterr().out.count("episode ") == 2
     assert Path(f"{ENV_ID}.mp4").stat().st_size > 0
 

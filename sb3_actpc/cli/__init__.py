@@ -61,7 +61,8 @@ def add_run_options(parser: argparse.ArgumentParser) -> None:
 
 def count(text: str) -> int:
     """A whole number of at least 1, as argparse asks for it."""
-    if (number := int(text)) < 1:
+    number = int(text)
+    if number < 1:
         raise argparse.ArgumentTypeError(f"{text} must be at least 1")
     return number
 

@@ -22,8 +22,10 @@ def run(args: argparse.Namespace) -> int:
         th.set_num_threads(args.threads)
     sizes = f"batch {timing.BATCH_SIZE}, {timing.TASK}, {th.get_num_threads()} threads"
     print(f"{sizes}; median ratios to {timing.BASE}")
-    kinds = {"update": timing.updates, "step of training": timing.training}
-    for kind, entries in kinds.items() if args.training else [("update", timing.updates)]:
+    kinds = {"update": timing.updates}
+    if args.training:
+        kinds["step of training"] = timing.training
+    for kind, entries in kinds.items():
         for name, ratio in timing.measure(entries(), args.rounds).items():
             print(f"{kind:16s}  {name:22s} {ratio:6.2f}")
     return 0

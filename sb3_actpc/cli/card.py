@@ -19,13 +19,11 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
 
 def run(args: argparse.Namespace) -> int:
     """Write it and list the files; a machine that cannot render is no error."""
+    from sb3_actpc.experiments.cards import write_card
     from sb3_actpc.experiments.runs.video import choose_gl_backend
 
     if not args.no_video:
-        choose_gl_backend()  # before MuJoCo is imported
-
-    from sb3_actpc.experiments.cards import write_card
-
+        choose_gl_backend()
     target = args.output or args.folder / "card"
     for note in write_card(args.folder, target, args.episodes, args.seed, video=not args.no_video):
         print(note)

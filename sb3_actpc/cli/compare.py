@@ -45,7 +45,8 @@ def run(args: argparse.Namespace) -> int:
         raise ValueError(f"--address {args.address} is of a Ray cluster: give --engine ray, or leave it out")
     from_file = {} if args.file is None else read_comparison_file(Path(args.file))
     comparison = read_comparison(with_options(from_file, given(args, (*OWN_KEYS, *Run.known_keys()))))
-    runs, folder = plan_runs(comparison), Path(comparison.output)
+    runs = plan_runs(comparison)
+    folder = Path(comparison.output)
     for missing in dict.fromkeys(filter(None, map(missing_demonstrations, runs))):
         print(missing)
     if args.dry_run:
@@ -61,7 +62,8 @@ def run(args: argparse.Namespace) -> int:
     unfinished = [run for run in runs if schedule.run_status(run.folder) != schedule.FINISHED]
     print(f"{len(runs) - len(unfinished)} of {len(runs)} runs are finished; see them with: sb3-actpc report {folder}")
     for run in unfinished:
-        if error := schedule.read_error(run.folder):
+        error = schedule.read_error(run.folder)
+        if error:
             print(f"sb3-actpc: failed (--retry-failed tries again): {run.label} ({run.folder}): {error}", file=sys.stderr)
     if stopped_by is not None:
         left = f"{len(unfinished)} runs are left, the same command goes on with them"

@@ -10,13 +10,13 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
     add = parser.add_argument
     add("folder", type=Path, metavar="DIR", help="folder of sb3-actpc compare, or one with results.csv and curves.csv.gz")
     add("--output", type=Path, metavar="DIR", help="folder for the files (default: the same)")
-    add("--steps", type=int, nargs="+", default=[10_000, 25_000, 50_000], metavar="N", help="of the evaluations in the tables")
+    add("--steps", type=int, nargs="+", metavar="N", help="of the evaluations in the tables (10000 25000 50000)")
 
 
 def run(args: argparse.Namespace) -> int:
     """Write the report."""
-    from sb3_actpc.experiments.report.tables import write_report
+    from sb3_actpc.experiments.report.tables import CHOSEN_STEPS, write_report
 
-    for path in write_report(args.folder, args.output, args.steps):
+    for path in write_report(args.folder, args.output, args.steps or CHOSEN_STEPS):
         print(path)
     return 0

@@ -36,14 +36,15 @@ def run(args: argparse.Namespace) -> int:
     report = partial(print, flush=True)
     try:
         if args.resume is None:
-            settings, env_kwargs = parse_assignments(args.set or ()), parse_assignments(args.env_kwarg or ())
             chosen = given(args, Run.known_keys())
-            run = Run(**chosen, settings=settings, env_kwargs=env_kwargs, progress=not args.no_progress)
-            result = train_run(run, report)
+            chosen["settings"] = parse_assignments(args.set or ())
+            chosen["env_kwargs"] = parse_assignments(args.env_kwarg or ())
+            result = train_run(Run(**chosen, progress=not args.no_progress), report)
         else:
             others = set(vars(args)) - {"resume", "steps", "no_progress", "command", "debug"}
-            if wrong := sorted(name for name in others if getattr(args, name) is not None):
-                raise ValueError(f"--{wrong[0].replace('_', '-')} cannot be given with --resume: leave it out")
+            for name in sorted(others):
+                if getattr(args, name) is not None:
+                    raise ValueError(f"--{name.replace('_', '-')} cannot be given with --resume: leave it out")
             more_steps = Run(**given(args, ["steps"])).n_timesteps or 0
             result = resume_run(Path(args.resume), report, not args.no_progress, more_steps=more_steps)
     except TrainingStopped as stop:

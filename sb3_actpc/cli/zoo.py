@@ -39,13 +39,10 @@ def run(args: argparse.Namespace) -> int:
         parser.add_argument(*options)
     ours, rest = parser.parse_known_args(args.arguments)
     module, _, name = SCRIPTS[args.zoo_command].partition(":")
-    function, given = getattr(import_extra(f"rl_zoo3.{module}", "zoo"), name), sys.argv
+    function = getattr(import_extra(f"rl_zoo3.{module}", "zoo"), name)
     with tempfile.TemporaryDirectory(prefix="sb3_actpc_zoo_") as folder:
-        try:
-            sys.argv = [f"sb3-actpc zoo {args.zoo_command}", *_arguments(args.zoo_command, ours, rest, Path(folder))]
-            function()
-        finally:
-            sys.argv = given
+        sys.argv = [f"sb3-actpc zoo {args.zoo_command}", *_arguments(args.zoo_command, ours, rest, Path(folder))]
+        function()
     if ours.output is not None:
         import_extra("matplotlib.pyplot", "experiments").savefig(ours.output)
         print(f"written to {ours.output}")
@@ -54,14 +51,10 @@ def run(args: argparse.Namespace) -> int:
 
 def _arguments(command: str, ours: argparse.Namespace, rest: Sequence[str], folder: Path) -> list[str]:
     """rl_zoo3's arguments. An id ``module:Name-v0`` becomes ``--gym-packages module``, a preset ``--conf-file``."""
-    from sb3_actpc.experiments.runs.algorithms import ALGORITHMS, load_algorithm
     from sb3_actpc.experiments.runs.environments import check_env_id
+    from sb3_actpc.experiments.runs.presets import read_yaml
 
-    zoo, search = import_extra("rl_zoo3", "zoo"), import_extra("rl_zoo3.hyperparams_opt", "zoo")
-    for name in ALGORITHMS:
-        with suppress(ImportError):  # of an extra that is not installed
-            zoo.ALGOS[name] = load_algorithm(name)
-    search.HYPERPARAMS_SAMPLER["actpc"], search.HYPERPARAMS_CONVERTER["actpc"] = _sample_actpc, dict
+    _register_algorithms()
     if {"-h", "--help"} & set(rest):
         return ["--help"]
     if not ours.env:
@@ -84,7 +77,21 @@ def _arguments(command: str, ours: argparse.Namespace, rest: Sequence[str], fold
     settings = Path(ours.conf_file or folder / "settings.yml")
     if ours.conf_file is None:
         settings.write_text(yaml.safe_dump({env_id: _settings(env_id, ours)}, sort_keys=False), encoding="utf-8")
+    elif settings.suffix in (".yml", ".yaml"):
+        read_yaml(settings.read_bytes(), str(settings))  # rl_zoo3 takes the last value of a key that is given twice
     return [*passed, "--conf-file", str(settings), *(["--optimize-hyperparameters"] if command == "optimize" else [])]
+
+
+def _register_algorithms() -> None:
+    from sb3_actpc.experiments.runs.algorithms import ALGORITHMS, load_algorithm
+
+    zoo = import_extra("rl_zoo3", "zoo")
+    search = import_extra("rl_zoo3.hyperparams_opt", "zoo")
+    for name in ALGORITHMS:
+        with suppress(ImportError):  # of an extra that is not installed
+            zoo.ALGOS[name] = load_algorithm(name)
+    search.HYPERPARAMS_SAMPLER["actpc"] = _sample_actpc
+    search.HYPERPARAMS_CONVERTER["actpc"] = dict
 
 
 def _sample_actpc(trial: Any, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> dict[str, Any]:
@@ -96,12 +103,12 @@ def _settings(env_id: str, ours: argparse.Namespace) -> dict[str, Any]:
     """The entry of rl_zoo3's settings file: the preset's, the demonstrations, and the log of successes."""
     from sb3_actpc.experiments.runs import Run, resolve
     from sb3_actpc.experiments.runs.environments import make_env
-    from sb3_actpc.experiments.runs.presets import RUN_KEYS, find_demonstrations, fitting_policy, takes_demonstrations
+    from sb3_actpc.experiments.runs.presets import find_demonstrations, fitting_policy, preset_entry, takes_demonstrations
 
     run = resolve(Run(env=env_id, algo=ours.algo, preset=ours.preset, demonstrations=ours.demonstrations or "shipped"))
-    settings = {name: getattr(run, name) for name in RUN_KEYS if getattr(run, name)} | run.settings
-    settings |= {} if run.normalize is None else {"normalize": run.normalize or True}
-    if takes_demonstrations(run) and (found := find_demonstrations(env_id, run.demonstrations)) is not None:
+    settings = preset_entry(run)
+    found = find_demonstrations(env_id, run.demonstrations) if takes_demonstrations(run) else None
+    if found is not None:
         settings["demonstrations"] = str(found.absolute()) if isinstance(found, Path) else found
     with closing(make_env(env_id, run.env_kwargs)) as env:
         settings["policy"] = fitting_policy(settings["policy"], env.observation_space)

@@ -14,8 +14,8 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_actpc.actpc import ActPC
 from sb3_actpc.experiments.runs.evaluation import NormalizedPredictor
-from sb3_actpc.experiments.runs.presets import RUN_KEYS
-from sb3_actpc.experiments.runs.record import CONFIG, read_config, read_result, write_json
+from sb3_actpc.experiments.runs.presets import preset_entry
+from sb3_actpc.experiments.runs.record import CONFIG, read_result, write_json
 from sb3_actpc.experiments.runs.run import evaluate_run, load_run
 from sb3_actpc.experiments.runs.schema import Run
 from sb3_actpc.experiments.runs.video import video_note
@@ -28,17 +28,11 @@ RESULT_KEYS = ("return", "return_std", "dense_return", "dense_return_std", "succ
 
 
 def write_card(folder: Path, target: Path, n_episodes: int = 10, seed: int = 0, video: bool = True) -> list[str]:
-    """
-    Write a model repository of a finished run. Its ``model.zip`` is unpickled: open only runs that you trust.
+    """Write a model repository of a finished run. Its ``model.zip`` is unpickled: open only runs that you trust.
 
-    :param folder: of the run
-    :param target: folder to write; it must be empty or missing
-    :param n_episodes: evaluation episodes for ``results.json``
-    :param seed: of the first of them
-    :param video: whether to record ``replay.mp4``
-    :return: lines on the video, and on what was left out and why
-    :raises FileNotFoundError: when the folder is not that of a finished run
-    :raises ValueError: when the target holds files
+    ``results.json`` is of ``n_episodes`` evaluation episodes, the first from ``seed``, which ``replay.mp4`` shows where asked
+    for. Returns lines on the video, and on what was left out and why. FileNotFoundError when the folder is not that of a
+    finished run, ValueError when the target holds files.
     """
     if target.is_dir() and any(target.iterdir()):
         raise ValueError(f"{target} holds files: choose an empty folder")
@@ -64,10 +58,8 @@ def write_card(folder: Path, target: Path, n_episodes: int = 10, seed: int = 0, 
     write_json(target / "results.json", measured)
     if video:
         notes.append(video_note(model, run.env, run.env_kwargs, target / VIDEO, seed))
-    record = read_config(folder)
-    own = {key: record[key] for key in RUN_KEYS if record[key]}
     with atomic_write(target / PRESET, "w") as file:
-        yaml.safe_dump({run.env: {**own, **record["settings"]}}, file, sort_keys=True)
+        yaml.safe_dump({run.env: preset_entry(run)}, file, sort_keys=True)
     with atomic_write(target / "README.md", "w") as file:
         file.write(_card_text(run, result, name, (target / VIDEO).is_file()))
     return notes
@@ -117,15 +109,9 @@ def _usage(run: Run, name: str) -> str:
 
 
 def bundle_agent(folder: Path, target: Path = AGENTS) -> Path:
-    """
-    Put the agent of a finished run of ActPC among those of the package, in the place of the one of its task.
-
-    :param folder: of the run
-    :param target: folder of the agents, with its index
-    :return: the agent's file
-    :raises FileNotFoundError: when the folder is not that of a finished run
-    :raises ValueError: when the run is of another algorithm, normalizes observations, or its file would be too large
-    """
+    """Put the agent of a finished run of ActPC among those of the package (``target``, with its index), in the place of the
+    one of its task: the agent's file. FileNotFoundError when the folder is not that of a finished run, ValueError when the
+    run is of another algorithm, normalizes observations, or its file would be too large."""
     result = read_result(folder)
     run, model = load_run(folder)
     if not isinstance(model, ActPC):

@@ -45,18 +45,11 @@ def demonstrator_run(
     gym_packages: Sequence[str] = (),
     **options: Any,
 ) -> Run:
-    """The run that trains a demonstrator, with the settings in ``DEMONSTRATOR_ALGORITHMS``.
-
-    :param env_id: Gymnasium id of the task to demonstrate. A sparse MuJoCo task is learned by its dense base task, any other
-        by its own rewards
-    :param algo: one of ``DEMONSTRATOR_ALGORITHMS``
-    :param n_timesteps: environment steps; None for 2000 full episodes
-    :param target_return: stop at the first evaluation whose mean dense return reaches it, None for never
-    :param gym_packages: modules that register the environment
-    :param options: further fields of a :class:`~sb3_actpc.experiments.runs.schema.Run`
-    :raises ValueError: for an unknown algorithm, a task of robosuite, or one without a time limit and ``n_timesteps``
-    :raises gymnasium.error.Error: when the environment is unknown
-    """
+    """The run that trains a demonstrator, with the settings in ``DEMONSTRATOR_ALGORITHMS``. A sparse MuJoCo task is learned by
+    its dense base task, any other by its own rewards, for so many environment steps, by default 2000 full episodes, or until
+    the mean dense return of an evaluation reaches the target. The options are further fields of a
+    :class:`~sb3_actpc.experiments.runs.schema.Run`. ValueError for an unknown algorithm, a task of robosuite, or one without a
+    time limit and ``n_timesteps``, gymnasium.error.Error when the environment is unknown."""
     if algo not in DEMONSTRATOR_ALGORITHMS:
         raise ValueError(f"algo={algo!r} is not one of {', '.join(DEMONSTRATOR_ALGORITHMS)}: choose one of these")
     known = sparse_env_id(env_id.rpartition(":")[2])  # this package's ids may come with its module
@@ -125,8 +118,11 @@ def record_demonstrators(
     """Record demonstrators, who take turns, in the task itself, see ``Demonstrations.record``; ``stochastic`` samples the
     actions instead of taking the most likely ones."""
     set_random_seed(seed)
-    steps, returns = [one.n_steps for one in demonstrators], [one.mean_return for one in demonstrators]
-    kept = {"demonstrator_steps": steps, "demonstrator_returns": returns, **(metadata or {})}
+    kept = {
+        "demonstrator_steps": [one.n_steps for one in demonstrators],
+        "demonstrator_returns": [one.mean_return for one in demonstrators],
+        **(metadata or {}),
+    }
     policies = [one.policy for one in demonstrators]
     options = {"deterministic": not stochastic, "seed": seed, **options}
     return Demonstrations.record(policies, env_id, n_episodes, metadata=kept, **options)

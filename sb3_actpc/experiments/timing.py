@@ -3,6 +3,7 @@
 import statistics
 import time
 from collections.abc import Callable
+from functools import partial
 from importlib.util import find_spec
 from typing import Any
 
@@ -48,13 +49,12 @@ def ratios(times: dict[str, list[float]]) -> dict[str, float]:
 
 def updates() -> Entries:
     """Two updates of each learner (TD3 moves its actor every other time), on random transitions."""
-
-    def entry(model: Any) -> Callable[[], object]:
+    entries: Entries = {}
+    for name, model in _learners().items():
         model.learning_starts = 2 * N_FILLED
         model.learn(N_FILLED)
-        return lambda: model.train(gradient_steps=2, batch_size=model.batch_size)
-
-    return {name: entry(model) for name, model in _learners().items()}
+        entries[name] = partial(model.train, gradient_steps=2, batch_size=model.batch_size)
+    return entries
 
 
 def training() -> Entries:
@@ -65,12 +65,9 @@ def training() -> Entries:
 
         learners["SBX SAC"] = sbx.SAC("MlpPolicy", TASK, batch_size=BATCH_SIZE, learning_starts=2 * N_STEPS, seed=0)
         learners["SBX SAC"].set_logger(configure(None, []))
-
-    def entry(model: Any) -> Callable[[], object]:
+    for model in learners.values():
         model.learn(2 * N_STEPS)
-        return lambda: model.learn(N_STEPS, reset_num_timesteps=False)
-
-    return {name: entry(model) for name, model in learners.items()}
+    return {name: partial(model.learn, N_STEPS, reset_num_timesteps=False) for name, model in learners.items()}
 
 
 def _learners() -> dict[str, Any]:

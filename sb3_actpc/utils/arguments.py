@@ -128,7 +128,8 @@ def check_learning_rate(name: str, learning_rate: Any) -> None:
 
 def check_train_freq(name: str, train_freq: Any) -> None:
     """A number of steps, or a number with its unit."""
-    frequency, unit = train_freq if isinstance(train_freq, tuple) and len(train_freq) == 2 else (train_freq, "step")
+    is_pair = isinstance(train_freq, tuple) and len(train_freq) == 2
+    frequency, unit = train_freq if is_pair else (train_freq, "step")
     is_known = isinstance(train_freq, TrainFreq) or unit in ("step", "episode")
     if not is_known or not isinstance(frequency, int) or not 1 <= frequency <= LARGEST_SIZE:
         raise ValueError(f"{name}={train_freq!r} must be a whole number of at least 1, or (number, 'step' or 'episode')")

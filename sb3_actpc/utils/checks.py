@@ -46,11 +46,7 @@ KINDS: dict[Any, tuple[Callable[[Any], bool], str]] = {
 
 
 def check_kind(name: str, value: Any, kind: Any) -> None:
-    """:param name: the keyword
-    :param value: what it was given
-    :param kind: its annotation, one of ``KINDS``
-    :raises ValueError: naming a value of another kind
-    """
+    """ValueError that names a keyword and its value, where that is not of the kind: one of ``KINDS``."""
     is_kind, wanted = KINDS[kind]
     if not is_kind(value):
         raise ValueError(f"{name}={value!r} must be {wanted}")

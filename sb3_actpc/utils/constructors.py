@@ -8,10 +8,12 @@ def constructors(kind: type) -> Iterator[Callable[..., None]]:
     """A class's constructor and, where it ends in ``**options``, that of the next class in the order of inheritance, and so
     on."""
     for base in kind.__mro__:
-        if (init := vars(base).get("__init__")) is not None:
-            yield init
-            if not any(one.kind is one.VAR_KEYWORD for one in inspect.signature(init).parameters.values()):
-                return
+        if "__init__" not in vars(base):
+            continue
+        init = vars(base)["__init__"]
+        yield init
+        if not any(one.kind is one.VAR_KEYWORD for one in inspect.signature(init).parameters.values()):
+            return
 
 
 def constructor_keywords(kind: type) -> list[str]:

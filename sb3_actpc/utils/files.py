@@ -48,10 +48,8 @@ def atomic_write(path: str | os.PathLike[str], mode: Literal["wb", "w"] = "wb") 
     """Open ``path`` for writing, as bytes (``"wb"``) or UTF-8 text with ``\\n`` line ends (``"w"``); the file appears, or
     replaces the old one, only when the block ends without an error. The data goes to a temporary name in the same folder, is
     flushed to the disk and then renamed; when the block raises, an old file stays as it was. Missing folders are created, a
-    link is followed, an old file's permissions are kept. ValueError for another mode, OSError when the folder cannot be
+    link is followed, an old file's permissions are kept. OSError when the folder cannot be
     written, or ``path`` is a folder."""
-    if mode not in ("wb", "w"):
-        raise ValueError(f"mode must be 'wb' or 'w', found {mode!r}")
     target = Path(os.path.realpath(path))
     if target.is_dir():
         raise IsADirectoryError(f"cannot write a file over the folder {target}")

@@ -9,12 +9,9 @@ _WRITTEN_ID = re.compile(r"<([^<>\s]+)>+$")
 
 
 def task_id(env: VecEnv) -> str | None:
-    """
-    The Gymnasium id of its first environment; None where it has none.
-
-    It is asked for what it is written as: a spec holds the keywords that the environment was made with, and not all of these
-    can be sent from another process (a function without a name, say).
-    """
+    """The Gymnasium id of its first environment; None where it has none. It is asked for what it is written as: a spec holds
+    the keywords that the environment was made with, and not all of these can be sent from another process (a function without
+    a name, say)."""
     try:
         written = str(env.env_method("__str__", indices=0)[0])
     except (AttributeError, NotImplementedError):  # not every kind of vectorised environment can be asked

@@ -35,14 +35,9 @@ def check_weights(model: BaseAlgorithm) -> None:
 
 
 def save_weights(model: OffPolicyAlgorithm, path: str | os.PathLike[str]) -> Path:
-    """
-    Write the weights and the constructor's settings, by name, into one safetensors file; VecNormalize's statistics with them.
-
-    :param model: the agent
-    :param path: file to write; ``.safetensors`` is added where it is missing
-    :return: the file
-    :raises ValueError: when a weight is not finite, or the policy or a setting is of a class without a name
-    """
+    """Write an agent's weights and its constructor's settings, by name, into one safetensors file, with VecNormalize's
+    statistics: the file; ``.safetensors`` is added to its name where it is missing. ValueError when a weight is not finite, or
+    the policy or a setting is of a class without a name."""
     check_weights(model)
     settings = constructor_settings(model)
     settings["keywords"].pop("tensorboard_log", None)  # a folder of this machine
@@ -65,8 +60,7 @@ def save_weights(model: OffPolicyAlgorithm, path: str | os.PathLike[str]) -> Pat
     tensors = {name: tensor.detach().cpu().contiguous().clone() for name, tensor in model.policy.state_dict().items()}
     for name, statistics in _normalizers(model).items():
         tensors |= {f"{name}.{part}": th.tensor(getattr(statistics, part), dtype=th.float64) for part in _STATISTICS}
-    path = Path(path)
-    path = path if path.suffix == _SUFFIX else path.with_name(path.name + _SUFFIX)
+    path = _with_suffix(Path(path))
     with atomic_write(path) as file:
         file.write(safetensors.torch.save(tensors, metadata={"sb3_actpc": json.dumps(header)}))
     return path
@@ -80,17 +74,13 @@ def load_weights(
     without: tuple[str, ...] = (),
     **overrides: Any,
 ) -> SelfAlgorithm:
-    """Make an agent from a file of :func:`save_weights`. Nothing in the file is run: it holds numbers and names.
-
-    :param path: the file; ``.safetensors`` may be left out
-    :param without: stored keywords that are left at the constructor's defaults
-    :param overrides: constructor keywords that replace the stored ones
-    :return: the agent; its replay buffer is empty
-    :raises FileNotFoundError: when there is no such file
-    :raises ValueError: when it is no such file, of a newer version, names an unknown class or does not fit the environment
-    """
+    """Make an agent, with an empty replay buffer, from a file of :func:`save_weights`, whose ``.safetensors`` may be left out.
+    Nothing in the file is run: it holds numbers and names. The stored keywords in ``without`` are left at the constructor's
+    defaults, ``overrides`` replace the others. FileNotFoundError when there is no such file, ValueError when it is of another
+    kind or version, names an unknown class or does not fit the environment."""
     path = Path(path)
-    path = path if path.exists() or path.suffix == _SUFFIX else path.with_name(path.name + _SUFFIX)
+    if not path.exists():
+        path = _with_suffix(path)
     header, tensors = _read(path)
     if header["algorithm"] != algorithm.__name__:
         raise ValueError(f"{path} holds weights of {header['algorithm']}, not {algorithm.__name__}")
@@ -108,6 +98,10 @@ def load_weights(
         hint = f"; leave out {', '.join(sorted(overrides))}" if overrides else ""
         raise ValueError(f"{path} does not fit these settings{hint}: {' '.join(str(error).split())}") from error
     return model
+
+
+def _with_suffix(path: Path) -> Path:
+    return path if path.suffix == _SUFFIX else path.with_name(path.name + _SUFFIX)
 
 
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, th.Tensor]]:

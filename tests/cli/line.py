@@ -12,6 +12,7 @@ from sb3_actpc.cli import main
 EPISODE_LENGTH = 10
 ENV_ID = "SparseLine-v0"
 TRAIN = ["train", "--env", ENV_ID, "--algo", "td3", "--preset", "small.yml"]
+PLAIN = [*TRAIN, "--demonstrations", "none"]
 RESULTS = {"dense_return": 20.0, "dense_return_std": 0.0, "return": 10.0, "return_std": 0.0}
 RESULTS |= {"success": 1.0, "episode_length": 10.0}
 
@@ -48,8 +49,8 @@ class LineEnv(gym.Env[np.ndarray, np.ndarray]):
 
 
 def train(*arguments: str) -> int:
-    """``sb3-actpc train`` with TD3 on the line."""
-    return main([*TRAIN, "--no-progress", *arguments])
+    """``sb3-actpc train`` with TD3 on the line, without demonstrations."""
+    return main([*PLAIN, "--no-progress", *arguments])
 
 
 def rows_of(folder: str | Path) -> list[dict[str, str]]:

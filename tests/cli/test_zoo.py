@@ -47,6 +47,7 @@ MISTAKES = {
     "train --env SparseReacher-v5 --demonstrations no.npz": "no demonstrations file at no.npz",
     "train --env SparseReacher-v5 -conf c.yml --demonstrations none": "without --conf-file",
     "optimize --env SparseReacher-v5 -conf c.yml --preset td3": "without --conf-file",
+    "train --env SparseReacher-v5 -conf twice.yml": "(line 2: the key 'gamma' is given twice)",
 }
 CODE = """
 import contextlib, json, sys
@@ -67,6 +68,7 @@ def ran(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, str]]
     record("SparseReacher-v5").save(folder / "shown.npz")
     for name, settings in PRESETS.items():
         (folder / f"{name}.yml").write_text(yaml.safe_dump({"default": settings}), encoding="utf-8")
+    (folder / "twice.yml").write_text("default: {gamma: 0.9,\n  gamma: 0.8}", encoding="utf-8")
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT), "CUDA_VISIBLE_DEVICES": ""}
     command = [sys.executable, "-c", CODE, json.dumps(SCRIPT | {text: text.split() for text in MISTAKES})]
     done = subprocess.run(command, capture_output=True, text=True, cwd=folder, env=environment, timeout=600, check=False)

@@ -13,6 +13,7 @@ from sb3_actpc.experiments.runs import Run, play_episodes, resolve, train_run
 from sb3_actpc.experiments.runs.environments import make_env, make_train_env
 from sb3_actpc.experiments.runs.evaluation import NormalizedPredictor
 from sb3_actpc.experiments.runs.run import build_model
+from tests.cli.line import LineEnv
 from tests.recordings import record_file
 
 OFF_POLICY = ("actpc", "td3", "ddpg")
@@ -70,25 +71,15 @@ def test_algorithms_are_given_the_same_demonstrations(tmp_path: Path) -> None:
         env.close()
 
 
-class LoggedEnv(gym.Env[np.ndarray, np.ndarray]):
-    """Five steps; remembers what it was reset with and what it then showed."""
+class LoggedEnv(LineEnv):
+    """Remembers what it was reset with and what it then drew."""
 
     log: list[tuple[int | None, float]] = []  # noqa: RUF012
 
-    def __init__(self) -> None:
-        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (1,), np.float32)
-        self.action_space = gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
-
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
-        super().reset(seed=seed)
-        self.n_steps = 0
-        observation = self.np_random.normal(size=1).astype(np.float32)
-        LoggedEnv.log.append((seed, float(observation[0])))
-        return observation, {}
-
-    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        self.n_steps += 1
-        return self.np_random.normal(size=1).astype(np.float32), 1.0, self.n_steps == 5, False, {"is_success": True}
+        observation, info = super().reset(seed=seed)
+        LoggedEnv.log.append((seed, self.drawn))
+        return observation, info
 
 
 def test_algorithms_are_evaluated_on_the_same_episodes_at_the_same_steps(tmp_path: Path) -> None:

@@ -45,10 +45,12 @@ def read_comparison(given: Mapping[str, Any]) -> Comparison:
     variants = [parse_variant(entry) for entry in _list(own, "algos")]
     tasks = [part_of_run({"env": entry} if isinstance(entry, str) else entry, OF_VARIANTS) for entry in _list(own, "envs")]
     for names in ([task.task or task.env for task in tasks], [str(variant.name) for variant in variants]):
-        if twice := sorted({name for name in names if names.count(name) > 1}):
-            raise ValueError(f"{twice[0]!r} is given twice: leave one out, or give it another name")
+        for name in names:
+            if names.count(name) > 1:
+                raise ValueError(f"{name!r} is given twice: leave one out, or give it another name")
     comparison = Comparison(tasks=tuple(tasks), variants=tuple(variants), shared=shared, **own)
-    if (last := comparison.first_seed + comparison.seeds - 1) > MAX_SEED:
+    last = comparison.first_seed + comparison.seeds - 1
+    if last > MAX_SEED:
         raise ValueError(f"the last seed, {last}, must be at most {MAX_SEED}")
     return comparison
 
@@ -66,7 +68,8 @@ def read_comparison_file(path: Path) -> dict[str, Any]:
 def with_options(content: Mapping[str, Any], options: Mapping[str, Any]) -> dict[str, Any]:
     """The content of a file, with options instead of its values; a name of its own variants stands for that variant.
     ValueError for a name that neither the file nor the package knows."""
-    content, options = dict(content), dict(options)
+    content = dict(content)
+    options = dict(options)
     if "steps" in options:  # a file may call them n_timesteps
         content.pop("n_timesteps", None)
     if "algos" in options:

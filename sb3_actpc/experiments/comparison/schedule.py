@@ -61,21 +61,30 @@ def run_comparison(
     """
     tqdm = import_extra("tqdm", "experiments").tqdm
     with folder_lock(folder, COMMAND_WAIT, print):
-        to_do = [run for run in runs if run_status(run.folder) not in (FINISHED, *(() if retry_failed else (FAILED,)))]
+        to_do = [run for run in runs if run_status(run.folder) in (NEW, UNFINISHED)]
+        if retry_failed:
+            to_do = [run for run in runs if run_status(run.folder) != FINISHED]
         n_finished = sum(is_finished(run.folder) for run in runs)
         print(f"{n_finished} runs are done, {len(to_do)} to do")
         for run in to_do:
             (run.folder / ERROR).unlink(missing_ok=True)
+        if not to_do:
+            return None
         bar = tqdm(initial=n_finished, total=len(runs), unit="run", disable=None if progress else True)
         with bar, StopSignals() as signals:
-            for run, outcome in engine(to_do, lambda: signals.received is not None) if to_do else ():
-                word, reason = "started", ""
-                if outcome is not None:
-                    word, reason = outcome.status, outcome.message and f": {outcome.message}"
-                if word == FINISHED:
+            for run, outcome in engine(to_do, lambda: signals.received is not None):
+                bar.write(_line(run, outcome))
+                if outcome is not None and outcome.status == FINISHED:
                     bar.update()
-                bar.write(f"{word:9s} {run.label}{reason}")
             return signals.received
+
+
+def _line(run: Run, outcome: Outcome | None) -> str:
+    """What is printed of a run that begins or ends."""
+    if outcome is None:
+        return f"started   {run.label}"
+    reason = f": {outcome.message}" if outcome.message else ""
+    return f"{outcome.status:9s} {run.label}{reason}"
 
 
 def run_status(folder: Path) -> str:
@@ -118,7 +127,9 @@ def run_in_processes(
     n_workers = n_workers or max(1, cores // threads)
     os.environ.update(dict.fromkeys(_THREAD_VARIABLES, str(threads)))
     context = multiprocessing.get_context("spawn")
-    waiting, losses, is_told = deque(runs), Counter[str](), False
+    waiting = deque(runs)
+    losses = Counter[str]()
+    is_told = False
     under_way: dict[Any, tuple[Run, BaseProcess]] = {}  # by the end of a pipe that it speaks into
     try:
         while under_way or (waiting and not is_stopped()):

@@ -4,7 +4,6 @@ import gzip
 import io
 import math
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -14,7 +13,7 @@ import numpy as np
 import pandas as pd
 
 from sb3_actpc.experiments.comparison.schedule import ERROR, FINISHED, read_error, run_status
-from sb3_actpc.experiments.runs.evaluation import EPISODES, OF_ACTOR, PROGRESS
+from sb3_actpc.experiments.runs.evaluation import OF_ACTOR, PROGRESS
 from sb3_actpc.experiments.runs.record import CONFIG, read_config
 from sb3_actpc.experiments.runs.schema import content_id
 from sb3_actpc.utils.files import atomic_write
@@ -23,7 +22,6 @@ RESULTS, CURVES = "results.csv", "curves.csv.gz"
 RUN_FOLDER = re.compile(r"seed\d+_[0-9a-f]+")
 MEASURES = ("return", "dense_return", "success", *OF_ACTOR.values())  # columns of progress.csv
 SETTLED = 5000  # the worst evaluation is taken from this step on
-CHOSEN_STEPS = (10_000, 25_000, 50_000)
 # of random actions and of the shipped demonstrations; ``python benchmarks/reference_scores.py`` measures them again
 SCORES_FILE = Path(__file__).with_name("reference_scores.csv")
 _TEXTS = ["task", "env", "variant", "algorithm", "settings", "demonstrations", "status", "version", "commit", "error"]
@@ -57,34 +55,29 @@ class Results:
         runs = self.finished[self.finished["task"] == task].sort_values("seed", kind="stable")
         return {str(name): rows for name, rows in runs.groupby("label")}
 
+    def at_step(self, runs: pd.DataFrame, measure: str, step: int) -> pd.Series:
+        """What some of the runs reached in the evaluation at a step, NaN where they have none."""
+        rows = self.curves[self.curves["timesteps"] == step].drop_duplicates("run", keep="last").set_index("run")
+        return rows.reindex(index=runs.index, columns=[measure])[measure]
 
-def load_results(folder: Path, chosen_steps: Sequence[int] = CHOSEN_STEPS) -> Results:
+
+def load_results(folder: Path) -> Results:
     """Read a comparison's run folders, or the two files that :func:`write_results` left where there are no run folders.
-
-    :raises FileNotFoundError: when the folder holds neither
-    """
+    FileNotFoundError when the folder holds neither."""
     found = {path.parent for name in (CONFIG, ERROR) for path in folder.glob(f"*/*/seed*/{name}")}
     folders = sorted(path for path in found if RUN_FOLDER.fullmatch(path.name))
     if not folders and (folder / CURVES).is_file():
         runs = pd.read_csv(folder / RESULTS, index_col="run", dtype=dict.fromkeys(_TEXTS, str))
         runs[_TEXTS] = runs[_TEXTS].fillna("")
-        stored = pd.read_csv(folder / CURVES)
-        return Results(_labelled(_with_steps(runs, stored, chosen_steps)), stored)
+        return Results(_labelled(runs), pd.read_csv(folder / CURVES))
     if not folders:
         raise FileNotFoundError(f"no runs in {folder}: make some with sb3-actpc compare --output {folder}")
     names = [path.relative_to(folder).as_posix() for path in folders]
     curves = [_read_rows(path / PROGRESS) for path in folders]
-    rows = [_run_row(path, own, chosen_steps) for path, own in zip(folders, curves, strict=True)]
+    rows = [_run_row(path, own) for path, own in zip(folders, curves, strict=True)]
     named = [own.assign(run=name) for name, own in zip(names, curves, strict=True) if len(own)]
     joined = pd.concat(named, ignore_index=True) if named else pd.DataFrame(columns=["run", "timesteps", *MEASURES])
     return Results(_labelled(pd.DataFrame(rows, index=pd.Index(names, name="run"))), joined)
-
-
-def _with_steps(runs: pd.DataFrame, curves: pd.DataFrame, chosen_steps: Sequence[int]) -> pd.DataFrame:
-    """Add the measures at steps that the file was not written for."""
-    columns = [f"{name}_at_{step}" for step in chosen_steps for name in MEASURES]
-    values = [run_measures(env, curves[curves["run"] == run], chosen_steps) for run, env in runs["env"].items()]
-    return runs.assign(**{column: [one[column] for one in values] for column in columns if column not in runs})
 
 
 def write_results(results: Results, folder: Path) -> list[Path]:
@@ -93,7 +86,7 @@ def write_results(results: Results, folder: Path) -> list[Path]:
     with atomic_write(folder / RESULTS, "w") as file:
         results.runs.drop(columns="label").to_csv(file, float_format="%.8g")
     with atomic_write(folder / CURVES) as binary, gzip.GzipFile("", "wb", fileobj=binary, mtime=0) as packed:
-        packed.write(results.curves[columns].to_csv(index=False, float_format="%.6g").encode())
+        packed.write(results.curves[columns].to_csv(index=False, float_format="%.8g").encode())
     return [folder / RESULTS, folder / CURVES]
 
 
@@ -104,18 +97,14 @@ def _read_rows(path: Path) -> pd.DataFrame:
     return pd.read_csv(io.StringIO(whole)).apply(pd.to_numeric, errors="coerce") if whole else pd.DataFrame()
 
 
-def run_measures(env_id: str, curve: pd.DataFrame, chosen_steps: Sequence[int] = CHOSEN_STEPS) -> dict[str, float]:
-    """What one run reached; NaN where it is undefined.
-
-    For each of ``MEASURES``: the last evaluation, the evaluation at each chosen step, the worst
-    evaluation from 5,000 steps on, and the area under the curve divided by its length (the mean over steps).
-    """
+def run_measures(env_id: str, curve: pd.DataFrame) -> dict[str, float]:
+    """What one run reached; NaN where it is undefined. For each of ``MEASURES``: the last evaluation, the worst from 5,000
+    steps on, and the area under the curve divided by its length (the mean over steps)."""
     values: dict[str, float] = {}
     steps = curve["timesteps"] if len(curve) else pd.Series(dtype=float)
     for name in MEASURES:
         column = curve[name] if name in curve else pd.Series(math.nan, index=curve.index)
-        chosen = {name: column, **{f"{name}_at_{step}": column[steps == step] for step in chosen_steps}}
-        values |= {key: float(rows.iloc[-1]) if len(rows) else math.nan for key, rows in chosen.items()}
+        values[name] = float(column.iloc[-1]) if len(column) else math.nan
         values[f"{name}_worst"] = column[steps >= SETTLED].min()
         values[f"{name}_area"] = area(steps.to_numpy(), column.to_numpy())
     reference = reference_score(env_id)
@@ -137,13 +126,11 @@ def area(steps: np.ndarray, values: np.ndarray) -> float:
     return float(np.sum(widths * (values[1:] + values[:-1]) / 2.0) / np.sum(widths))
 
 
-def _run_row(folder: Path, curve: pd.DataFrame, chosen_steps: Sequence[int]) -> dict[str, Any]:
+def _run_row(folder: Path, curve: pd.DataFrame) -> dict[str, Any]:
     """A row of :class:`Results`' runs. A run that failed before it wrote its settings has little more than a name."""
     config = read_config(folder) if (folder / CONFIG).is_file() else {}
     task = config.get("task") or folder.parent.parent.name
     env_id = config.get("env") or task
-    reference = config.get("demonstrators_return")
-    episodes = _read_rows(folder / EPISODES)
     return {
         "task": task,
         "env": env_id,
@@ -154,11 +141,8 @@ def _run_row(folder: Path, curve: pd.DataFrame, chosen_steps: Sequence[int]) -> 
         "seed": int(folder.name.partition("_")[0].removeprefix("seed")),
         "status": run_status(folder),
         "steps": int(curve["timesteps"].iloc[-1]) if len(curve) else 0,
-        "planned_steps": config.get("n_timesteps", 0),
         "eval_episodes": config.get("eval_episodes", 0),
-        **run_measures(env_id if reference_score(task) is None else task, curve, chosen_steps),
-        "episodes": len(episodes),
-        "demonstrators_return": math.nan if reference is None else reference,
+        **run_measures(env_id if reference_score(task) is None else task, curve),
         "version": dict(config.get("versions", {})).get("sb3-actpc", ""),
         "commit": (config.get("git_commit") or "")[:10],
         "dirty": bool(config.get("dirty")),

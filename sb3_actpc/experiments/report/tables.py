@@ -11,10 +11,11 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from sb3_actpc.experiments.report import statistics
-from sb3_actpc.experiments.report.results import CHOSEN_STEPS, MEASURES, Results, load_results, reference_score, write_results
+from sb3_actpc.experiments.report.results import MEASURES, Results, load_results, reference_score, write_results
 from sb3_actpc.experiments.report.statistics import Scores
 from sb3_actpc.utils.files import atomic_write, folder_name
 
+CHOSEN_STEPS = (10_000, 25_000, 50_000)
 UNDEFINED = "n/a"
 # Okabe and Ito's color-blind safe palette; markers tell curves apart without color
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
@@ -22,15 +23,11 @@ MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 
 
 def write_report(folder: Path, target: Path | None = None, steps: Sequence[int] = CHOSEN_STEPS) -> list[Path]:
-    """Write ``results.csv``, ``curves.csv.gz``, ``report.md`` and the figures of a comparison.
-
-    :param folder: of the comparison, or one that holds its two CSV files
-    :param target: where the files go, by default the same folder
-    :param steps: the environment steps whose evaluations the tables show
-    :raises FileNotFoundError: when there are no runs
-    """
+    """Write ``results.csv``, ``curves.csv.gz``, ``report.md`` and the figures of a comparison's folder, or of one that holds
+    its two CSV files, into the target, by default the same. The tables show the evaluations at the environment steps given.
+    FileNotFoundError when there are no runs."""
     target = folder if target is None else target
-    results = load_results(folder, steps)
+    results = load_results(folder)
     files = write_results(results, target)
     text = [f"# Comparison {folder.name}\n\n{_overview(results.runs)}"]
     for task in results.finished["task"].unique():
@@ -40,15 +37,16 @@ def write_report(folder: Path, target: Path | None = None, steps: Sequence[int] 
         text.append(f"## {task}\n\n![{task}]({picture.name})")
         for measure, table in task_tables(results, task, steps).items():
             text.append(f"### {measure.replace('_', ' ').capitalize()}\n\n{markdown(table)}")
-    if scores := _on_every_task(results.finished, "normalized"):
+    scores = _on_every_task(results.finished, "normalized")
+    if scores:
         draw_summary(scores, target / "summary.png")
         files.append(target / "summary.png")
         text.append(f"## Across tasks\n\n{markdown(_aggregate_table(scores))}\n\n![Across tasks](summary.png)")
     improvement = improvement_table(results, steps)
-    if len(improvement):
+    if not improvement.empty:
         text.append(f"## Probability of improvement\n\nOf the return on a task drawn at random.\n\n{markdown(improvement)}")
     missing = results.runs.loc[results.runs["status"] != "finished", ["task", "variant", "seed", "status", "steps", "error"]]
-    if len(missing):
+    if not missing.empty:
         text.append(f"## Runs that are not in the tables\n\n{markdown(missing)}")
     with atomic_write(target / "report.md", "w") as file:
         file.write("\n\n".join(text) + "\n")
@@ -60,12 +58,13 @@ def task_tables(results: Results, task: str, steps: Sequence[int]) -> dict[str, 
     groups = results.groups(task)
     tables = {}
     for measure in MEASURES:
-        columns = {f"at {step:,}": f"{measure}_at_{step}" for step in steps}
-        columns |= {"last": measure, "area": f"{measure}_area", "worst after 5,000": f"{measure}_worst"}
+        columns = {"last": measure, "area": f"{measure}_area", "worst after 5,000": f"{measure}_worst"}
         form = ".2f" if measure.endswith("success") else ".1f"
         rows = []
         for label, runs in groups.items():
-            cells = {title: mean_and_deviation(runs[column].to_numpy(), form) for title, column in columns.items()}
+            values = {f"at {step:,}": results.at_step(runs, measure, step) for step in steps}
+            values |= {title: runs[column] for title, column in columns.items()}
+            cells = {title: mean_and_deviation(own.to_numpy(), form) for title, own in values.items()}
             if any(cell != UNDEFINED for cell in cells.values()):
                 rows.append({"variant": label, **cells})
         if rows:
@@ -103,10 +102,11 @@ def _aggregate_table(scores: dict[str, list[np.ndarray]]) -> pd.DataFrame:
 def improvement_table(results: Results, steps: Sequence[int]) -> pd.DataFrame:
     """Probability that a run of the first variant has a higher return than one of the second on a task drawn at random, for
     every pair and step; a run that ended before counts with its last evaluation."""
-    rows, runs = [], results.finished
+    runs = results.finished
+    rows = []
     for step in sorted({step for step in steps if step <= runs["steps"].max()}):
         ended = runs["return"].where(runs["steps"] < step)
-        scores = _on_every_task(runs.assign(at_step=runs[f"return_at_{step}"].fillna(ended)), "at_step")
+        scores = _on_every_task(runs.assign(at_step=results.at_step(runs, "return", step).fillna(ended)), "at_step")
         for name, other in combinations(scores, 2):
             value, low, high = statistics.probability_of_improvement(scores[name], scores[other])
             rows.append([f"{name} over {other}", f"{step:,}", f"{value:.2f}", interval(low, high, ".2f")])
@@ -149,9 +149,9 @@ def markdown(table: pd.DataFrame) -> str:
 def draw_curves(results: Results, task: str, path: Path) -> None:
     """Draw means and 95 % intervals over environment steps, at the steps that all seeds of a variant have."""
     figure = Figure(figsize=(8.0, 4.2), layout="constrained")
-    axes, measure = figure.subplots(), "dense_return"
-    if (reference := reference_score(results.runs.loc[results.runs["task"] == task, "env"].iloc[0])) is not None:
-        measure = reference.measure
+    axes = figure.subplots()
+    reference = reference_score(results.runs.loc[results.runs["task"] == task, "env"].iloc[0])
+    measure = "dense_return" if reference is None else reference.measure
     for index, (label, runs) in enumerate(results.groups(task).items()):
         rows = results.curves[results.curves["run"].isin(runs.index)]
         table = rows.pivot(index="timesteps", columns="run", values=measure).dropna()
@@ -182,7 +182,8 @@ def draw_summary(scores: Mapping[str, Scores], path: Path) -> None:
 
 def _band(axes: Any, x: np.ndarray, values: Any, label: str, index: int) -> None:
     """A line, and the band between two others around it: (3, n)."""
-    color, marker = COLORS[index % len(COLORS)], MARKERS[index % len(MARKERS)]
+    color = COLORS[index % len(COLORS)]
+    marker = MARKERS[index % len(MARKERS)]
     axes.plot(x, values[0], label=label, color=color, marker=marker, markevery=max(1, len(x) // 8))
     axes.fill_between(x, values[1], values[2], color=color, alpha=0.15, linewidth=0)
 

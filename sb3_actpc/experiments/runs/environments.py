@@ -8,9 +8,9 @@ from typing import Any
 
 import gymnasium as gym
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecNormalize
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
-from sb3_actpc.envs import ROBOSUITE_IDS, register_envs
+from sb3_actpc.envs import register_envs
 from sb3_actpc.experiments.runs.algorithms import find_in_working_folder
 from sb3_actpc.utils.checks import named_in_errors, nearest
 
@@ -36,15 +36,9 @@ def make_train_env(
     env_id: str, env_kwargs: Mapping[str, Any], n_envs: int, seed: int, normalize: Mapping[str, Any] | None = None
 ) -> VecEnv:
     """The environment that an agent learns in: SB3's ``Monitor`` and ``DummyVecEnv``, and where asked for ``VecNormalize``.
-    The seed is the first's; the others have those that follow.
-
-    Several of robosuite's are put into processes of their own (``SubprocVecEnv``): a step there takes longer than an
-    update, one of a MuJoCo task less than the way to another process.
-    """
-    in_processes = n_envs > 1 and env_id.rpartition(":")[2] in ROBOSUITE_IDS
-    kind: type[VecEnv] = SubprocVecEnv if in_processes else DummyVecEnv
+    The seed is the first's; the others have those that follow."""
     arguments = {"env_id": env_id, "env_kwargs": env_kwargs}
-    env = make_vec_env(make_env, n_envs=n_envs, seed=seed, env_kwargs=arguments, vec_env_cls=kind)  # type: ignore[arg-type]
+    env = make_vec_env(make_env, n_envs=n_envs, seed=seed, env_kwargs=arguments)
     with named_in_errors(f"normalize={normalize}"):
         return env if normalize is None else VecNormalize(env, **normalize)
 

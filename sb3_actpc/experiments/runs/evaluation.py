@@ -86,7 +86,8 @@ class EpisodeStatistics:
 
     def summary(self) -> dict[str, float | None]:
         """Means and standard deviations over the episodes; ``success`` is None where it is not reported."""
-        dense, own = self.dense_returns, self.returns
+        dense = self.dense_returns
+        own = self.returns
         values = (dense.mean(), dense.std(), own.mean(), own.std(), self.successes.mean(), self.lengths.mean())
         return {name: None if np.isnan(value) else float(value) for name, value in zip(SUMMARY, values, strict=True)}
 
@@ -252,7 +253,7 @@ class EvaluationCallback(CsvCallback):
     """
 
     columns = ("timesteps", "updates", "seconds", "evaluation_seconds", *SUMMARY, *OF_ACTOR.values())
-    kept = ("evaluation_seconds", "best_return", "last_timesteps")
+    kept = ("evaluation_seconds", "best_return", "last_timesteps", "wall_seconds")
 
     def __init__(self, envs: Sequence[gym.Env[Any, Any]], run: Run, report: Callable[[str], None]) -> None:
         super().__init__(run.folder / PROGRESS)
@@ -279,14 +280,9 @@ class EvaluationCallback(CsvCallback):
         """Seconds since :meth:`begin`, the time while the run was stopped left out."""
         return time.perf_counter() - self._started
 
-    def checkpoint_state(self) -> dict[str, Any]:
-        """What a checkpoint keeps: timers, the best return and the rows written so far."""
-        return {**super().checkpoint_state(), "wall_seconds": self.wall_seconds}
-
-    def restore_checkpoint_state(self, state: dict[str, Any]) -> None:
-        """Go on where the checkpoint was taken, with its timers."""
-        super().restore_checkpoint_state(state)
-        self._started = time.perf_counter() - state["wall_seconds"]
+    @wall_seconds.setter
+    def wall_seconds(self, seconds: float) -> None:
+        self._started = time.perf_counter() - seconds
 
     def _on_rollout_start(self) -> None:
         """Step 0 is what an agent can do before its first one, after its warm start."""

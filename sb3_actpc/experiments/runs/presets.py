@@ -34,7 +34,18 @@ _ACTIVATIONS: dict[str, type[nn.Module]] = {"relu": nn.ReLU, "tanh": nn.Tanh, "e
 
 
 class _PlainLoader(yaml.SafeLoader):
-    """YAML 1.1 of plain values, in which ``1e-3`` is a number, as in YAML 1.2."""
+    """YAML 1.1 of plain values, in which ``1e-3`` is a number, as in YAML 1.2, and every key is given once."""
+
+    def compose_mapping_node(self, anchor: Any) -> yaml.MappingNode:
+        """A mapping, with the text of its keys; PyYAML would silently take the last of two values."""
+        node = super().compose_mapping_node(anchor)
+        known = set()
+        for key, _ in node.value:
+            text = str(key.value)
+            if text in known:
+                raise ValueError(f"line {key.start_mark.line + 1}: the key {text!r} is given twice")
+            known.add(text)
+        return node
 
 
 _PlainLoader.add_implicit_resolver(
@@ -43,11 +54,11 @@ _PlainLoader.add_implicit_resolver(
 
 
 def read_yaml(text: str | bytes, source: str) -> Any:
-    """The one reader of YAML: plain values, nothing in it is run; a ValueError names the source."""
+    """The one reader of YAML that users write: plain values, nothing in it is run; a ValueError names the source."""
     try:
         return yaml.load(text, Loader=_PlainLoader)
     except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise ValueError(f"{source}: not YAML of plain values ({' '.join(str(error).split())})") from error
+        raise ValueError(f"{source}: not YAML of plain values with unique keys ({' '.join(str(error).split())})") from error
 
 
 def load_preset(preset: str, env_id: str) -> dict[str, Any]:
@@ -119,22 +130,25 @@ def resolve(run: Run) -> Run:
 
 
 def preset(env_id: str, name: str | None = None, algo: str = "actpc") -> dict[str, Any]:
-    """A preset as keywords of the agent's constructor: ``ActPC(env=env, **preset("SparseHopper-v5"))``.
+    """A preset (a name as in ``--preset``, by default the algorithm's own) as keywords of the agent's constructor, without the
+    environment: ``ActPC(env=env, **preset("SparseHopper-v5"))``.
 
     ``noise_type`` and ``noise_std`` become ``action_noise``, ``lin_4e-4`` a schedule, and the demonstrations are those in the
     package. Left out is what is not the agent's: ``n_timesteps`` (of ``learn``), ``n_envs``, ``env_kwargs`` and ``normalize``
-    (of the environment).
-
-    :param env_id: Gymnasium id of the task
-    :param name: as in ``--preset``, by default the algorithm's own
-    :param algo: key of ``ALGORITHMS``
-    :return: the keywords, without the environment
-    :raises FileNotFoundError: when there is no such preset
-    :raises ValueError: when one of its settings is unknown or wrong
+    (of the environment). FileNotFoundError when there is no such preset, ValueError when one of its settings is unknown or
+    wrong.
     """
     run = resolve(Run(env=env_id, algo=algo, preset=name))
     with closing(make_env(env_id, run.env_kwargs)) as env:
         return agent_keywords(run, env.observation_space, env.action_space)
+
+
+def preset_entry(run: Run) -> dict[str, Any]:
+    """What a filled run's settings file would say of its task."""
+    entry = {name: getattr(run, name) for name in RUN_KEYS if getattr(run, name)} | run.settings
+    if run.normalize == {}:
+        entry["normalize"] = True
+    return entry
 
 
 def agent_keywords(run: Run, observation_space: gym.Space[Any], action_space: gym.Space[Any]) -> dict[str, Any]:
@@ -146,7 +160,8 @@ def agent_keywords(run: Run, observation_space: gym.Space[Any], action_space: gy
         if activation not in _ACTIVATIONS:
             raise ValueError(f"activation_fn={activation!r} is unknown: choose one of {', '.join(_ACTIVATIONS)}")
         keywords["policy_kwargs"]["activation_fn"] = _ACTIVATIONS[activation]
-    if takes_demonstrations(run) and (found := find_demonstrations(run.env, run.demonstrations)) is not None:
+    found = find_demonstrations(run.env, run.demonstrations) if takes_demonstrations(run) else None
+    if found is not None:
         keywords["demonstrations"] = found
     if run.noise_type is not None:
         size = int(np.prod(action_space.shape or (1,)))
@@ -239,4 +254,7 @@ def missing_demonstrations(run: Run) -> str:
 def demonstrations_hash(run: Run) -> str | None:
     """SHA-256 of what a run's demonstrations hold, None for none; FileNotFoundError when they are not there."""
     found = find_demonstrations(run.env, run.demonstrations)
-    return None if found is None else file_hash(*(minari_files(found) if isinstance(found, str) else [found]))
+    if found is None:
+        return None
+    files = minari_files(found) if isinstance(found, str) else [found]
+    return file_hash(*files)

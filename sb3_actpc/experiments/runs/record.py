@@ -56,7 +56,8 @@ def read_config(folder: Path) -> dict[str, Any]:
     JSON or lacks what identifies a run."""
     if not (folder / CONFIG).is_file():
         raise FileNotFoundError(f"no run in {folder}: {CONFIG} is missing (a run is a folder that sb3-actpc train wrote)")
-    record, needed = _read_json(folder / CONFIG), {"env", "env_kwargs", "algo", "seed"}
+    record = _read_json(folder / CONFIG)
+    needed = {"env", "env_kwargs", "algo", "seed"}
     if not isinstance(record, dict) or not needed <= record.keys():
         raise ValueError(f"{folder / CONFIG}: expected the settings of a run ({', '.join(sorted(needed))})")
     return record
@@ -88,7 +89,8 @@ def write_result(run: Run) -> dict[str, Any]:
     evaluations: Any = rows.to_dict("records")
     last = evaluations[-1]
     kept = last if run.keep == "last" else max(evaluations, key=lambda row: row["dense_return"])
-    seconds, evaluation_seconds = last["seconds"], last["evaluation_seconds"]
+    seconds = last["seconds"]
+    evaluation_seconds = last["evaluation_seconds"]
     names = ("env", "algo", "seed", "eval_episodes", "demonstrators_return", "versions", "git_commit", "dirty")
     result = {
         **{name: value for name, value in kept.items() if name not in ("seconds", "evaluation_seconds")},

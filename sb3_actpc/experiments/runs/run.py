@@ -3,7 +3,7 @@
 import importlib
 import shutil
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +22,9 @@ from sb3_actpc.experiments.runs.algorithms import load_algorithm
 from sb3_actpc.experiments.runs.environments import check_env_id, make_eval_envs, make_train_env
 from sb3_actpc.experiments.runs.evaluation import EpisodeLog, EvaluationCallback, NormalizedPredictor, Predictor
 from sb3_actpc.experiments.runs.record import is_finished, read_result, read_run
-from sb3_actpc.experiments.runs.schema import Run, content_id
+from sb3_actpc.experiments.runs.schema import CONTENT, Run
 from sb3_actpc.utils.extras import import_extra
-from sb3_actpc.utils.files import FolderBusy, atomic_write, folder_lock, folder_name
+from sb3_actpc.utils.files import atomic_write, folder_lock
 
 CHECKPOINTS = "checkpoints"  # folder in the run's folder
 DIAGNOSTICS = "diagnostics.csv"  # what the agent logs about itself
@@ -66,7 +66,8 @@ def finish_run(run: Run, report: Report = silent, callbacks: Sequence[BaseCallba
     whole checkpoint, given more steps when it was to have fewer, or left alone when it is done. The caller holds the folder.
     See :func:`train_run`; ValueError also when the folder holds another run."""
     check_env_id(run.env, run.gym_packages)
-    run, folder = presets.resolve(run), run.folder
+    run = presets.resolve(run)
+    folder = run.folder
     try:
         stored = read_run(folder)
     except FileNotFoundError:
@@ -98,25 +99,33 @@ def _continued(folder: Path, more_steps: int, changes: Mapping[str, Any]) -> Run
 
 
 def _check_same(stored: Run, run: Run) -> None:
-    """:raises ValueError: where the folder holds another run than this one; the policy may have been fitted to the
-    observations, and ``eval_freq`` to the steps"""
-    for name in ("target_return", "keep"):
-        old, new = getattr(stored, name), getattr(run, name)
-        if old != new:
+    """:raises ValueError: where the folder holds another run than this one"""
+    old = _decisive(stored)
+    new = _decisive(run)
+    for name in sorted(old.keys() | new.keys()):
+        if old.get(name) != new.get(name):
             raise ValueError(
-                f"{run.folder} holds another run, with {name}={old} and not {new}: remove it, choose another folder "
-                f"(--output; of `demos collect` --work-dir), or give the old {name}"
+                f"{run.folder} holds another run, with {name}={old.get(name)} and not {new.get(name)}: remove it, choose "
+                f"another folder (--output; of `demos collect` --work-dir), or give the old {name}"
             )
-    free = dict.fromkeys(("n_timesteps", "policy", "eval_freq"))
-    if len({content_id({**one.model_dump(), **free}, one.seed) for one in (stored, run)}) > 1:
-        raise ValueError(f"{run.folder} holds another run, of other settings: choose another folder")
+
+
+def _decisive(run: Run) -> dict[str, Any]:
+    """What must not change in a run that is gone on with, its settings one by one; the policy may have been fitted to the
+    observations, and ``eval_freq`` to the steps."""
+    values = run.model_dump(mode="json", include={*CONTENT, "seed"} - {"n_timesteps", "policy", "eval_freq"})
+    settings = values.pop("settings")
+    return {**values, **settings}
 
 
 def _run(
     run: Run, report: Report, callbacks: Sequence[BaseCallback], resumes: bool = False, is_held: bool = False
 ) -> dict[str, Any]:
     """A filled run; ``is_held`` where the caller holds its folder."""
-    for module in ("pandas", "matplotlib", *(("tqdm", "rich") if run.progress else ())):  # which the end of the run needs
+    needed = ["pandas", "matplotlib"]  # at the end of the run
+    if run.progress:
+        needed += ["tqdm", "rich"]
+    for module in needed:
         import_extra(module, "experiments")
     th.set_num_threads(run.threads)
     with ExitStack() as stack:
@@ -125,12 +134,10 @@ def _run(
         stack.callback(train_env.close)
         model = build_model(run, train_env)
         stack.callback(getattr(model, "close", lambda: None))  # its other process, where it has one
-        if run.output is None:
-            run = run.model_copy(update={"output": str(_default_folder(run, stack))})
-        elif not is_held:
+        if not is_held:
             stack.enter_context(folder_lock(run.folder))
-        if not resumes and (taken := _taken(run.folder)):
-            raise ValueError(taken)
+        if not resumes:
+            _check_free(run.folder)
         result = _train(run, model, eval_envs, report, callbacks, resumes)
     return {**result, "folder": str(run.folder)}
 
@@ -143,18 +150,12 @@ def _train(
     more: Sequence[BaseCallback],
     resumes: bool,
 ) -> dict[str, Any]:
-    folder, checkpoints = run.folder, run.folder / CHECKPOINTS
+    folder = run.folder
+    checkpoints = folder / CHECKPOINTS
     restored = restore(model, checkpoints, report) if resumes else None  # before any file of the run is touched
     folder.mkdir(parents=True, exist_ok=True)
     if not resumes:
-        if missing := presets.missing_demonstrations(run):
-            report(missing)
-        filled: dict[str, Any] = dict(zip(("git_commit", "dirty"), record.git_state(), strict=True))
-        filled["policy"] = presets.fitting_policy(run.policy or "MlpPolicy", model.observation_space)
-        source = presets.find_demonstrations(run.env, run.demonstrations)
-        returns = None if source is None else resolve_demonstrations(source).dense_returns
-        filled["demonstrators_return"] = None if returns is None else float(returns.mean())
-        run = run.model_copy(update={**filled, "versions": record.package_versions()})
+        run = _begun(run, model, report)
     (folder / record.RESULT).unlink(missing_ok=True)  # of a finished run that gets more steps, as the settings then say
     record.write_config(run)
     model.set_logger(_logger(model, folder))
@@ -191,6 +192,20 @@ def _train(
     return record.write_result(run)
 
 
+def _begun(run: Run, model: BaseAlgorithm, report: Report) -> Run:
+    """The run with what is known when it begins."""
+    missing = presets.missing_demonstrations(run)
+    if missing:
+        report(missing)
+    source = presets.find_demonstrations(run.env, run.demonstrations)
+    returns = None if source is None else resolve_demonstrations(source).dense_returns
+    commit, dirty = record.git_state()
+    known: dict[str, Any] = {"versions": record.package_versions(), "git_commit": commit, "dirty": dirty}
+    known["demonstrators_return"] = None if returns is None else float(returns.mean())
+    known["policy"] = presets.fitting_policy(run.policy or "MlpPolicy", model.observation_space)
+    return run.model_copy(update=known)
+
+
 def _logger(model: BaseAlgorithm, folder: Path) -> Logger:
     """Into the run's folder, and for TensorBoard where the settings say so."""
     formats: list[KVWriter] = [CSVOutputFormat(str(folder / DIAGNOSTICS))]
@@ -201,14 +216,10 @@ def _logger(model: BaseAlgorithm, folder: Path) -> Logger:
 
 
 def evaluate_run(folder: Path, n_episodes: int = 10, seed: int = 0) -> dict[str, Any]:
-    """Play episodes with the policy of a run, the first from ``seed``. Its ``model.zip`` is unpickled: open only runs that you
-    trust.
-
-    :return: means and standard deviations over the episodes, where those without success ended, and what identifies the run
-    :raises FileNotFoundError: when the folder is not that of a run
-    :raises ValueError: when its files are damaged
-    :raises gymnasium.error.Error: when the environment is unknown
-    """
+    """Play episodes with the policy of a run, the first from ``seed``: means and standard deviations over the episodes, where
+    those without success ended, and what identifies the run. Its ``model.zip`` is unpickled: open only runs that you trust.
+    FileNotFoundError when the folder is not that of a run, ValueError when its files are damaged, gymnasium.error.Error when
+    the environment is unknown."""
     run, model = load_run(folder)
     with ExitStack() as stack:
         stack.callback(getattr(model, "close", lambda: None))
@@ -234,32 +245,18 @@ def load_run(folder: Path) -> tuple[Run, Predictor]:
     return run, NormalizedPredictor.wrap_saved(model, folder)
 
 
-def _taken(folder: Path) -> str:
-    """What a folder holds that another run must not touch; empty where that is nothing."""
+def _check_free(folder: Path) -> None:
+    """:raises ValueError: where a new run would overwrite a finished or a stopped one"""
     if is_finished(folder):
-        return f"{folder} already holds a finished run: choose another folder"
+        raise ValueError(f"{folder} already holds a finished run: choose another folder (--output)")
     if list_bundles(folder / CHECKPOINTS):
-        return f"{folder} holds a stopped run: go on with --resume {folder}, or choose another folder"
-    return ""
-
-
-def _default_folder(run: Run, stack: ExitStack) -> Path:
-    """``runs/<env>/<algo>_<preset>_seed<seed>``, or with ``_2``, ``_3``, … where that holds a result or checkpoints, or
-    another process trains in it. No other process is given it until the stack ends."""
-    base = Path("runs") / folder_name(run.env) / f"{run.algo.rpartition(':')[2]}_{run.preset_name}_seed{run.seed}"
-    folder, number = base, 1
-    while True:
-        with suppress(FolderBusy):
-            if not _taken(folder):
-                stack.enter_context(folder_lock(folder))
-                return folder
-        number += 1
-        folder = base.with_name(f"{base.name}_{number}")
+        raise ValueError(f"{folder} holds a stopped run: go on with --resume {folder}, or choose another folder (--output)")
 
 
 def build_model(run: Run, env: VecEnv) -> BaseAlgorithm:
     """The agent of a filled run, not trained."""
-    algorithm, keywords = load_algorithm(run.algo), presets.agent_keywords(run, env.observation_space, env.action_space)
+    algorithm = load_algorithm(run.algo)
+    keywords = presets.agent_keywords(run, env.observation_space, env.action_space)
     try:
         return algorithm(env=env, seed=run.seed, device=run.device, **keywords)
     except (TypeError, AssertionError, RuntimeError) as error:

@@ -16,6 +16,7 @@ from pydantic import AfterValidator, AliasChoices, BaseModel, BeforeValidator, C
 
 from sb3_actpc.experiments.runs.algorithms import known_algorithm
 from sb3_actpc.utils.checks import check_device, nearest
+from sb3_actpc.utils.files import folder_name
 
 VERSION = 2  # of config.json
 MAX_SEED = 2**31 - 1  # other generators get a seed derived from it, which must be below 2**32
@@ -40,7 +41,9 @@ def _number(value: Any) -> Any:
 
 def _keywords(value: Any) -> Any:
     """As in rl-zoo3: true, false, or keywords."""
-    return ({} if value else None) if isinstance(value, bool) else value
+    if value is True:
+        return {}
+    return None if value is False else value
 
 
 Count = Annotated[int, BeforeValidator(_number), Field(ge=1)]
@@ -124,9 +127,10 @@ class Run(Schema):
 
     @property
     def folder(self) -> Path:
-        """The run's own, where it is said."""
-        assert self.output is not None
-        return Path(self.output)
+        """The run's own."""
+        if self.output is not None:
+            return Path(self.output)
+        return Path("runs") / folder_name(self.env) / f"{self.algo.rpartition(':')[2]}_{self.preset_name}_seed{self.seed}"
 
     @property
     def label(self) -> str:

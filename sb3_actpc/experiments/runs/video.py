@@ -1,4 +1,4 @@
-"""A video of one episode, or a strip of pictures, where the machine can render."""
+"""A video of one episode, where the machine can render."""
 
 import contextlib
 import os
@@ -14,8 +14,7 @@ from sb3_actpc.experiments.runs.evaluation import play_episodes
 from sb3_actpc.utils.extras import import_extra
 
 GL_BACKENDS = ("egl", "osmesa")
-VIDEO_SUFFIXES = (".mp4", ".gif", ".png")
-STRIP_LENGTH = 6
+VIDEO_SUFFIXES = (".mp4", ".gif")
 # of one episode; software rendering takes a twentieth of a second for each
 MAX_FRAMES = 300
 # with one of these the user has chosen the view
@@ -30,11 +29,13 @@ class RenderingUnavailable(RuntimeError):
 
 def choose_gl_backend() -> str | None:
     """Find a way for MuJoCo to render without a window and select it for this process (environment variables); None when
-    nothing works. Call it before MuJoCo is imported: what ``MUJOCO_GL`` names is tried first, and unset when nothing works,
-    since MuJoCo cannot be imported with a name that does not work."""
+    nothing works. Call it before an environment is made, with which some read the variables: what ``MUJOCO_GL`` names is tried
+    first, and unset when nothing works."""
     chosen = os.environ.get("MUJOCO_GL", "")
     for backend in dict.fromkeys(filter(None, (chosen, *GL_BACKENDS))):
-        variables = dict.fromkeys(("MUJOCO_GL", *(["PYOPENGL_PLATFORM"] if backend in GL_BACKENDS else [])), backend)
+        variables = {"MUJOCO_GL": backend}
+        if backend in GL_BACKENDS:
+            variables["PYOPENGL_PLATFORM"] = backend
         with contextlib.suppress(subprocess.SubprocessError):
             command = [sys.executable, "-c", _PROBE]
             subprocess.run(command, env={**os.environ, **variables}, capture_output=True, timeout=60, check=True)
@@ -47,7 +48,7 @@ def choose_gl_backend() -> str | None:
 def check_video_path(path: Path) -> None:
     """ValueError when a video cannot have this name: the suffix must be one of ``VIDEO_SUFFIXES``."""
     if path.suffix.lower() not in VIDEO_SUFFIXES:
-        raise ValueError(f"the video must end in .mp4, .gif or .png, found {str(path)!r}")
+        raise ValueError(f"the video must end in .mp4 or .gif, found {str(path)!r}")
 
 
 def video_note(*arguments: Any) -> str:
@@ -62,9 +63,8 @@ def record_video(
     model: Any, env_id: str, env_kwargs: dict[str, Any], path: Path, seed: int, n_frames: int = MAX_FRAMES
 ) -> int:
     """Write a video of the first steps, at most ``n_frames``, of an episode with the deterministic policy: the number of
-    frames, each (height, width, 3) uint8. The path ends in ``.mp4``, ``.gif``, or ``.png`` for ``STRIP_LENGTH`` pictures side
-    by side, at half the size; ``env_kwargs`` are the environment's, ``width`` and ``height`` in pixels where it takes them.
-    RenderingUnavailable when rendering does not work here, ValueError when the path has another suffix."""
+    frames, each (height, width, 3) uint8. ``env_kwargs`` are the environment's, ``width`` and ``height`` in pixels where it
+    takes them. RenderingUnavailable when rendering does not work here, ValueError when the path is not one of a video."""
     check_video_path(path)
     imageio = import_extra("imageio.v2", "experiments")
     if path.suffix.lower() == ".mp4":
@@ -74,10 +74,7 @@ def record_video(
         frames_per_second = float(env.metadata.get("render_fps", 30))
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}{path.suffix}")  # the suffix tells imageio the format
-    if path.suffix.lower() == ".png":
-        chosen = np.linspace(0, len(frames) - 1, STRIP_LENGTH).round().astype(int)
-        imageio.imwrite(temporary, np.concatenate([frames[index][::2, ::2] for index in chosen], axis=1))
-    elif path.suffix.lower() == ".gif":
+    if path.suffix.lower() == ".gif":
         # viewers slow down a GIF with delays below 20 ms
         stride = max(1, round(frames_per_second / 25))
         imageio.mimsave(temporary, frames[::stride], duration=1000 * stride / frames_per_second, loop=0)

@@ -15,16 +15,10 @@ import yaml
 from sb3_actpc.checkpoints import EXIT_STOPPED, list_bundles
 from sb3_actpc.experiments.comparison.schedule import FINISHED, run_status
 from sb3_actpc.experiments.runs.run import CHECKPOINTS
-from tests.experiments.comparison.tasks import ROOT, measured, small_comparison, small_runs, straight, write_preset
+from tests.experiments.comparison.tasks import ROOT, measured, small_comparison, small_runs, straight
 
 OUT = Path("out")
 PATIENCE = 300.0  # seconds
-
-
-@pytest.fixture(autouse=True)
-def empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    write_preset()
 
 
 def start_command(*options: str) -> subprocess.Popen[str]:

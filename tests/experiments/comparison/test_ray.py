@@ -12,16 +12,9 @@ from sb3_actpc.checkpoints import list_bundles
 from sb3_actpc.experiments.comparison.schedule import FINISHED, run_comparison, run_on_ray, run_status
 from sb3_actpc.experiments.runs import Run
 from sb3_actpc.experiments.runs.run import CHECKPOINTS
-from tests.experiments.comparison.tasks import ROOT, bring_to_end, measured, small_runs, straight, write_preset
+from tests.experiments.comparison.tasks import bring_to_end, measured, small_runs, straight
 
 pytest.importorskip("ray")
-
-
-@pytest.fixture(autouse=True)
-def empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("PYTHONPATH", str(ROOT))
-    write_preset(tmp_path / "small.yml")
 
 
 def once_saved(runs: list[Run], act: Callable[[], object]) -> None:

@@ -11,15 +11,9 @@ from sb3_actpc.experiments.comparison.schedule import FAILED, FINISHED, NEW, UNF
 from sb3_actpc.experiments.runs.record import read_run
 from sb3_actpc.experiments.runs.run import CHECKPOINTS
 from sb3_actpc.utils.files import FolderBusy, folder_lock
-from tests.experiments.comparison.tasks import bring_to_end, interrupt_after, measured, small_runs, straight, write_preset
+from tests.experiments.comparison.tasks import bring_to_end, interrupt_after, measured, small_runs, straight
 
 OUT = Path("out")
-
-
-@pytest.fixture(autouse=True)
-def empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    write_preset()
 
 
 def test_all_runs_are_brought_to_their_end_once(capsys: pytest.CaptureFixture[str]) -> None:

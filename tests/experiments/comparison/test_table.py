@@ -13,15 +13,8 @@ from sb3_actpc.demonstrations import shipped_demonstrations
 from sb3_actpc.experiments.comparison import plan_runs, read_comparison, variant_names
 from sb3_actpc.experiments.runs import ALGORITHMS, Run
 from sb3_actpc.experiments.runs.schema import content_id
-from tests.experiments.comparison.tasks import write_preset
 
 HOPPER = str(shipped_demonstrations("SparseHopper-v5"))
-
-
-@pytest.fixture(autouse=True)
-def empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    write_preset()
 
 
 def plan(**given: Any) -> list[Run]:

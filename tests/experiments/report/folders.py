@@ -33,7 +33,7 @@ def write_run(
     folder = out / folder_name(task) / variant / f"seed{seed}_{abs(hash((variant, seed, str(settings)))):010x}"
     folder.mkdir(parents=True)
     config = {"algo": "actpc", "env": task, "task": task, "env_kwargs": {}, "seed": seed, "n_timesteps": STEPS[-1]}
-    config |= {"eval_episodes": 20, "settings": settings, "demonstrators_return": 2000.0, "versions": {"sb3-actpc": "0.5.0"}}
+    config |= {"eval_episodes": 20, "settings": settings, "versions": {"sb3-actpc": "0.5.0"}}
     (folder / "config.json").write_text(json.dumps(config), encoding="utf-8")
     progress = {
         "timesteps": STEPS,
@@ -48,7 +48,6 @@ def write_run(
         "episode_length": [5.0] * 3,
     }
     write_csv(folder / "progress.csv", progress)
-    write_csv(folder / "episodes.csv", {"episode": [1, 2], "timesteps": [5, 10], "return": [1.0, 1.0]})
     if finished:
         result = {"env": task, "algo": "actpc", "seed": seed, "timesteps": STEPS[-1], "dense_return": dense[-1]}
         (folder / "result.json").write_text(json.dumps(result), encoding="utf-8")

@@ -14,10 +14,12 @@ from tests.experiments.report.folders import HOPPER, REACHER, write_run
 
 def test_a_row_holds_what_the_run_reached(tmp_path: Path) -> None:
     write_run(tmp_path, dense=(0.0, 50.0, 100.0))
-    [row] = load_results(tmp_path, (5_000, 10_000, 20_000)).runs.to_dict("records")
-    assert (row["dense_return"], row["dense_return_at_5000"], row["dense_return_at_10000"]) == (100.0, 50.0, 100.0)
-    assert np.isnan(row["dense_return_at_20000"])
-    assert (row["return"], row["success"]) == (2.0, 1.0)
+    results = load_results(tmp_path)
+    [row] = results.runs.to_dict("records")
+    assert [results.at_step(results.runs, "dense_return", step).item() for step in (5_000, 10_000)] == [50.0, 100.0]
+    assert np.isnan(results.at_step(results.runs, "dense_return", 20_000).item())
+    assert np.isnan(results.at_step(results.runs, "actor_return", 5_000).item())
+    assert (row["dense_return"], row["return"], row["success"]) == (100.0, 2.0, 1.0)
     assert row["dense_return_worst"] == 50.0, "the evaluation at step 0 does not count"
     assert row["dense_return_area"] == 50.0
     assert row["seconds"] == 10.0, "evaluations are left out"
@@ -51,7 +53,7 @@ def test_the_probability_of_improvement_is_of_returns_at_each_step(tmp_path: Pat
     for seed in range(2):
         write_run(tmp_path, variant="actpc", seed=seed, returns=(0.0, 3.0, 5.0))
         write_run(tmp_path, variant="bc", seed=seed, returns=(0.0, 4.0, 4.0))
-    table = improvement_table(load_results(tmp_path, (5_000, 10_000, 50_000)), (5_000, 10_000, 50_000))
+    table = improvement_table(load_results(tmp_path), (5_000, 10_000, 50_000))
     assert table[["pair", "steps", "probability"]].to_numpy().tolist() == [
         ["actpc over bc", "5,000", "0.00"],
         ["actpc over bc", "10,000", "1.00"],
