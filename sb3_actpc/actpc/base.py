@@ -21,7 +21,7 @@ from sb3_actpc.actpc.buffers import SignalReplay, combined_buffer_class
 from sb3_actpc.actpc.demonstration_replay import DemonstrationReplay
 from sb3_actpc.actpc.diagnostics import Diagnostics
 from sb3_actpc.actpc.policies import ActPCActor, ActPCPolicy
-from sb3_actpc.actpc.reward_signals import InternalSignals
+from sb3_actpc.actpc.reward_signals import InternalSignals, RewardWeights, check_reward_weights
 from sb3_actpc.actpc.self_imitation import Episodes, sample_union
 from sb3_actpc.actpc.validation import (
     check_keywords_agree,
@@ -35,12 +35,13 @@ from sb3_actpc.demonstrations.mixin import LearnsFromDemonstrations
 from sb3_actpc.guidance import ActorGuidance, BehaviorGuidance, GuidanceConfig, GuidanceContext
 from sb3_actpc.guidance.base import ImitationBatch
 from sb3_actpc.utils.checks import Settings, check_finite, named_in_errors
+from sb3_actpc.utils.noise import as_action_noise
 from sb3_actpc.utils.rollouts import StoresLastTransition
 from sb3_actpc.utils.weights import load_weights, save_weights
 
 SelfBase = TypeVar("SelfBase", bound="ActPCBase")
 RESCORING_INTERVAL = 1000  # updates between two evaluations of the demonstrations' signals
-NEED_DEMONSTRATIONS = ("demonstration_fraction", "n_demonstrations", "n_demonstration_transitions")
+NEED_DEMONSTRATIONS = ("demonstration_fraction", "n_demonstrations")
 _OF_POLICY = ("actor", "critic", "generator", "prior", "actor_target", "critic_target")
 _DERIVED = ("expert", "diagnostics", "epistemic", "instrumental", "actor_guidance", "_used_demonstrations", "_described")
 
@@ -61,16 +62,13 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
     guidance: ActorGuidance | str
     guidance_kwargs: Settings | None
     signal_kwargs: Settings | None
-    alpha_ext: float
-    alpha_ep: float
-    alpha_in: float
+    reward_weights: Settings
     bootstrap: str
-    critic_weight: float
+    critic_weight: float | None
     refresh_weight: float
     policy_delay: int
     demonstration_fraction: float
     observation_normalization: str
-    prior_updates: int
     only_acts = False  # a bundled agent, whose critic is not trained
     expert: DemonstrationReplay | None = None  # the demonstrations, fitted to the environment
     _used_demonstrations: tuple[Any, ...] = ()
@@ -95,9 +93,15 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
         return self.actor.with_circuit(self.actor_guidance.candidate(self._context()))
 
     @property
-    def reward_weights(self) -> tuple[float, float, float]:
-        """(α_ext, α_ep, α_in) as used: without demonstrations there is no prior."""
-        return self.alpha_ext, self.alpha_ep, 0.0 if self.demonstrations is None else self.alpha_in
+    def used_weights(self) -> RewardWeights:
+        """The weights of the reward's parts; without demonstrations there is no prior."""
+        weights = RewardWeights(**self.reward_weights)
+        return weights if self.demonstrations is not None else weights._replace(instrumental=0.0)
+
+    @property
+    def has_critic_term(self) -> bool:
+        """Whether the critic has a part in the actor's update; its own updates have no use without."""
+        return self.critic_weight != 0
 
     # ------------------------------------------------------------------ parts
 
@@ -105,7 +109,7 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
         if self.action_space is None:
             raise ValueError("env=None: an environment or the id of one is needed, such as 'Pendulum-v1'")
         self._check_actions()
-        check_keywords_agree(self.alpha_ep, self.optimize_memory_usage, self.bootstrap, self.n_steps)
+        self._check_settings()
         self.actor_guidance = make_guidance(self.guidance, self.guidance_kwargs)
         self._setup_lr_schedule()
         self.set_random_seed(self.seed)
@@ -119,11 +123,19 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
             signals = InternalSignals(**(self.signal_kwargs or {}))
         if signals.settings != self.signals.settings:
             self.signals = signals
+        self.signals.prior_updates = signals.prior_updates
         self.epistemic = signals.epistemic_class(self.policy.generator, self.diagnostics, signals.errors)
         self.instrumental = signals.instrumental_class(self.policy.prior, self.diagnostics, signals.errors)
         if self.replay_buffer is None:
             self.replay_buffer = self._make_replay_buffer()
         self._convert_train_freq()
+
+    def _check_settings(self) -> None:
+        """What can be set after the agent was made, too."""
+        check_reward_weights("reward_weights", self.reward_weights)
+        self.reward_weights = RewardWeights(**(self.reward_weights or {}))._asdict()
+        check_keywords_agree(self.used_weights.epistemic, self.optimize_memory_usage, self.bootstrap, self.n_steps)
+        self.action_noise = as_action_noise(self.action_noise, self.action_space.shape)
 
     def _make_policy(self) -> ActPCPolicy:
         if "activation_fn" in self.policy_kwargs:
@@ -182,7 +194,7 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
 
         :raises ValueError: for demonstrations that do not fit
         """
-        self._used_demonstrations = self.demonstrations, self.n_demonstrations, self.n_demonstration_transitions
+        self._used_demonstrations = self.demonstrations, self.n_demonstrations
         self.expert = None
         if self.demonstrations is not None:
             observed, acted = self.observation_space, self.action_space
@@ -202,7 +214,7 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
 
     def _update_demonstrations(self) -> None:
         """Use demonstrations that were set since. A prior and a normalizer that have learned stay as they are."""
-        now = self.demonstrations, self.n_demonstrations, self.n_demonstration_transitions
+        now = self.demonstrations, self.n_demonstrations
         used = self._used_demonstrations
         if self.demonstrations is not None and self.guidance == "none" and used and used[0] is None:
             warnings.warn(
@@ -219,13 +231,14 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
         if memory is not None:
             memory.takes_all = self.actor_guidance.stores == "positive" and self.expert is not None
         if self.demonstrations is None:
-            self.demonstration_fraction, self.n_demonstrations, self.n_demonstration_transitions = 0.0, None, None
+            self.demonstration_fraction, self.n_demonstrations = 0.0, None
         if self.demonstrations is None and self.is_pretrained and self.refresh_weight:
             warnings.warn(
                 "the agent was taught by demonstrations and goes on without them: pass demonstrations=", stacklevel=5
             )
-        if self.demonstrations is None and self.alpha_in:
-            warnings.warn(f"alpha_in={self.alpha_in:g} has no effect without demonstrations=", stacklevel=5)
+        unused = self.reward_weights["instrumental"]
+        if self.demonstrations is None and unused:
+            warnings.warn(f"reward_weights['instrumental']={unused:g} has no effect without demonstrations=", stacklevel=5)
 
     def pretrain(self) -> None:
         """Train the prior on the demonstrations and let guidance start, once; ``learn`` calls this."""
@@ -237,11 +250,13 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
                 warnings.warn("VecNormalize's statistics drift while the circuits learn: use norm_obs=False", stacklevel=3)
                 self._show_to_vec_normalize(expert)
             # without a weight the prior has no role
-            n_updates = self.prior_updates - int(self.policy.n_prior_updates) if self.alpha_in else 0
+            n_updates = 0
+            if self.used_weights.instrumental:
+                n_updates = self.signals.prior_updates - int(self.policy.n_prior_updates)
             batch_size = self.policy.batch_sizes(self.batch_size)["prior"]
             self.policy.set_learning_rate(self.lr_schedule(1.0))
             for _ in range(n_updates):
-                batch = expert.sample(batch_size, self.actor, env, self.reward_weights, self.gamma)
+                batch = expert.sample(batch_size, self.actor, env, self.used_weights, self.gamma)
                 self.instrumental.update(batch.features, batch.actions, batch.next_features, batch.memory)
                 self.policy.n_prior_updates.add_(1)
         # BC is of demonstrations: an agent without does not imitate its own episodes first
@@ -286,7 +301,7 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
         tb_log_name: str = "run",
         progress_bar: bool = False,
     ) -> tuple[int, BaseCallback]:
-        check_keywords_agree(self.alpha_ep, self.optimize_memory_usage, self.bootstrap, self.n_steps)
+        self._check_settings()
         check_own_learning_rates(self.policy, self.lr_schedule(1.0))
         # Running episodes are cut where SB3 resets the environments, or someone else has stepped in them since
         if self.is_disturbed:
@@ -349,7 +364,7 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
         (n_envs,) each."""
         newest = self.replay_buffer.sample(self.n_envs, self._vec_normalize_env, None, n_newest=self.n_envs)
         raw = self.raw_signals(Batch.of(newest, newest.rewards, self.actor))
-        epistemic, instrumental = self.signals.score(*raw, *self.reward_weights[1:])
+        epistemic, instrumental = self.signals.score(*raw, self.used_weights)
         check_finite("generator", "signals", epistemic, self.num_timesteps)
         check_finite("prior", "signals", instrumental, self.num_timesteps)
         self.diagnostics.follow(epistemic_signal=epistemic.mean(), instrumental_signal=instrumental.mean())
@@ -357,12 +372,12 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
 
     def raw_signals(self, batch: Batch) -> tuple[np.ndarray, np.ndarray]:
         """r̂^ep and r̂^in of transitions, (B,) each; zeros where the signal has no weight."""
-        _, alpha_ep, alpha_in = self.reward_weights
+        weights = self.used_weights
         scored = batch.features, batch.actions, batch.next_features, batch.memory
         epistemic, instrumental = np.zeros((2, len(batch.features)), dtype=np.float32)
-        if alpha_ep:
+        if weights.epistemic:
             epistemic = self.epistemic.score(*scored).cpu().numpy()
-        if alpha_in:
+        if weights.instrumental:
             instrumental = self.instrumental.score(*scored).cpu().numpy()
         return epistemic, instrumental
 
@@ -371,8 +386,8 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
         if n_batches < 1:
             return iter(())
         expert, actor, env = self.expert, self.actor, self._vec_normalize_env
-        weights = self.reward_weights
-        normalizers = self.signals.replayed if any(weights[1:]) else None
+        weights = self.used_weights
+        normalizers = self.signals.replayed if weights.epistemic or weights.instrumental else None
         # Now and then the signals of demonstrated transitions are computed anew, by the present generator
         if expert is not None and self.demonstration_fraction and normalizers is not None:
             if self._n_updates % RESCORING_INTERVAL == 1 or not expert.has_signals:
@@ -385,11 +400,12 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
         n_newest = self.replay_buffer.n_newest(largest - n_demonstrated)
         n_drawn = n_newest + n_batches * (largest - n_demonstrated - n_newest)
         samples = self.replay_buffer.sample(n_drawn, env, normalizers, n_newest)
-        if not weights[1]:  # nobody predicts one step
+        if not weights.epistemic:  # nobody predicts one step
             samples = samples._replace(following_observations=None)
-        signals = weights[1] * samples.epistemic + weights[2] * samples.instrumental
-        replayed = Batch.of(samples, weights[0] * samples.rewards + signals, actor)
-        self.diagnostics.rewards(self._n_updates, n_batches, self.policy_delay, replayed.rewards, samples.rewards, weights[0])
+        signals = weights.epistemic * samples.epistemic + weights.instrumental * samples.instrumental
+        replayed = Batch.of(samples, weights.task * samples.rewards + signals, actor)
+        internal = replayed.rewards - weights.task * samples.rewards
+        self.diagnostics.rewards(self._n_updates, n_batches, self.policy_delay, internal, samples.rewards)
         # Demonstrated transitions likewise
         demonstrated = None
         if expert is not None and n_demonstrated:
@@ -413,12 +429,12 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
     def describe(self) -> str:
         """What the reward is made of, from which demonstrations, and what is off; ``learn`` prints it with ``verbose=1``, and
         again when it has changed."""
-        ext, ep, inst = self.reward_weights
+        weights = self.used_weights
         parts = {
-            "the task's reward": ext,
-            "generator": ep,
-            "prior": inst,
-            "critic term": self.critic_weight,
+            "the task's reward": weights.task,
+            "generator": weights.epistemic,
+            "prior": weights.instrumental,
+            "critic term": self.has_critic_term,
             "refresh": self.refresh_weight,
             "self-imitation": self.replay_buffer.self_imitation is not None,
             "demonstrations in the critic's batch": self.demonstration_fraction,
@@ -427,7 +443,8 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
         off = ", ".join(name for name, value in parts.items() if not value) or "nothing"
         demonstrations = "none" if self.expert is None else repr(self.expert.demonstrations)
         return (
-            f"reward: {ext:g} x task (alpha_ext) + {ep:g} x epistemic (alpha_ep) + {inst:g} x instrumental signal (alpha_in)\n"
+            f"reward: {weights.task:g} x task + {weights.epistemic:g} x epistemic + {weights.instrumental:g} x instrumental "
+            "signal (reward_weights)\n"
             f"demonstrations: {demonstrations}\n{self.actor_guidance.describe()}\noff: {off}"
         )
 

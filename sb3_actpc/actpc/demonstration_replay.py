@@ -10,7 +10,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_actpc.actpc.batches import Batch, Observations, SignalReplaySamples, normalized, to_device
 from sb3_actpc.actpc.policies import ActPCActor
-from sb3_actpc.actpc.reward_signals import STORED, Normalize
+from sb3_actpc.actpc.reward_signals import STORED, Normalize, RewardWeights
 from sb3_actpc.actpc.self_imitation import Episodes
 from sb3_actpc.demonstrations import Demonstrations, scaled_actions
 from sb3_actpc.demonstrations.rows import split_observations
@@ -58,7 +58,7 @@ class DemonstrationReplay:
         rows: np.ndarray,
         actor: ActPCActor,
         env: VecNormalize | None,
-        weights: tuple[float, float, float],
+        weights: RewardWeights,
         gamma: float,
         n_steps: int = 1,
         signals: tuple[Normalize, Normalize] | None = None,
@@ -66,7 +66,7 @@ class DemonstrationReplay:
         """:param rows: (B,) which transitions
         :param actor: turns observations into features
         :param env: VecNormalize whose statistics normalise observations and the task's rewards
-        :param weights: (α_ext, α_ep, α_in)
+        :param weights: of the parts of the reward
         :param gamma: discount
         :param n_steps: length of the returns, which end with the episode
         :param signals: what the stored signals pay, epistemic and instrumental; None for themselves
@@ -82,8 +82,8 @@ class DemonstrationReplay:
         if env is not None:
             task = env.normalize_reward(task)
         epistemic, instrumental = signals or STORED
-        rewards = weights[0] * task + weights[1] * epistemic(self.epistemic[window])
-        rewards = rewards + weights[2] * instrumental(self.instrumental[window])
+        rewards = weights.task * task + weights.epistemic * epistemic(self.epistemic[window])
+        rewards = rewards + weights.instrumental * instrumental(self.instrumental[window])
         rewards = (rewards * counts * gamma ** np.arange(n_steps)).sum(1)
 
         def column(values: np.ndarray) -> np.ndarray:
@@ -101,7 +101,7 @@ class DemonstrationReplay:
             instrumental=None,
             history=normalized(samples.history, env),
             history_mask=samples.history_mask,
-            following_observations=normalized(self._next(rows), env) if n_steps > 1 and weights[1] else None,
+            following_observations=normalized(self._next(rows), env) if n_steps > 1 and weights.epistemic else None,
             next_history=normalized(next_history, env),
             next_history_mask=next_mask,
         )
@@ -166,6 +166,6 @@ class DemonstrationReplay:
         """
         for start in range(0, len(self), PART):
             rows = np.arange(start, min(start + PART, len(self)))
-            epistemic, instrumental = score(self.batch(rows, actor, env, (0.0, 0.0, 0.0), 0.0))
+            epistemic, instrumental = score(self.batch(rows, actor, env, RewardWeights(0.0, 0.0, 0.0), 0.0))
             self.epistemic[rows], self.instrumental[rows] = store[0](epistemic), store[1](instrumental)
         self.has_signals = True

@@ -1,18 +1,37 @@
 """The internal reward: epistemic and instrumental signals from the errors of settled circuits, and their normalisers."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
-from typing import Annotated, Any, Literal
+from collections.abc import Callable, Mapping
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 import torch as th
 
 from sb3_actpc.actpc.diagnostics import Diagnostics
 from sb3_actpc.ngc import NGCCircuit, SettledState
-from sb3_actpc.utils.arguments import checked
+from sb3_actpc.utils.arguments import Between, Count, checked
+from sb3_actpc.utils.checks import check_kind
 
 Normalize = Callable[[np.ndarray], np.ndarray]  # element by element, in any shape
 STORED: tuple[Normalize, Normalize] = (np.asarray, np.asarray)  # both signals pay what was stored
+
+
+class RewardWeights(NamedTuple):
+    """Weights of the parts of the reward: α_ep and α_in of the signals (paper, Algorithm 1, line 14), α_ext of the task's."""
+
+    task: float = 1.0
+    epistemic: float = 0.0
+    instrumental: float = 0.0
+
+
+def check_reward_weights(name: str, weights: Mapping[str, Any] | None) -> None:
+    """:raises ValueError: for another key than those of :class:`RewardWeights`, no number, or a negative weight of a signal"""
+    for key, value in (weights or {}).items():
+        if key not in RewardWeights._fields:
+            raise ValueError(f"{name} has an unknown key {key!r}: choose from {list(RewardWeights._fields)}")
+        check_kind(f"{name}[{key!r}]", value, float)
+        if key != "task":
+            Between(0)(f"{name}[{key!r}]", value)
 
 
 def summed_squared_errors(state: SettledState, which: str = "all") -> th.Tensor:
@@ -174,6 +193,8 @@ class InternalSignals:
     :param errors: the squared errors of "all" layers are summed (the paper) or of the "output" alone
     :param epistemic_class: what scores how new a transition is
     :param instrumental_class: what scores how far a transition is from the demonstrations
+    :param prior_updates: updates of the prior before learning starts, where the instrumental signal has a weight; then it is
+        frozen
     :raises ValueError: for another value
     """
 
@@ -186,21 +207,21 @@ class InternalSignals:
         errors: Literal["all", "output"] = "all",
         epistemic_class: Annotated[type[RewardSignal], check_signal] = GeneratorSurprise,
         instrumental_class: Annotated[type[RewardSignal], check_signal] = PriorError,
+        prior_updates: Count = 2000,
     ) -> None:
         self.settings = normalizer, normalization, instrumental_form, errors, epistemic_class, instrumental_class
         kinds: dict[str, type[Normalizer]] = {"max": RunningMaximum, "saturating": Saturating, "quantile": RunningQuantile}
         self.epistemic, self.instrumental = kinds[normalizer](), kinds[normalizer]()
         self.normalization, self.instrumental_form, self.errors = normalization, instrumental_form, errors
         self.epistemic_class, self.instrumental_class = epistemic_class, instrumental_class
+        self.prior_updates = prior_updates
 
-    def score(
-        self, epistemic: np.ndarray, instrumental: np.ndarray, alpha_ep: float, alpha_in: float
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def score(self, epistemic: np.ndarray, instrumental: np.ndarray, weights: RewardWeights) -> tuple[np.ndarray, np.ndarray]:
         """What the summed squared errors r̂ of generator and prior pay, (n_envs,) each; the normalisers follow them, and a
         signal without weight stays as it is."""
-        if alpha_ep:
+        if weights.epistemic:
             epistemic = self.epistemic(epistemic)
-        if alpha_in:
+        if weights.instrumental:
             instrumental = instrumental_reward(self.instrumental(instrumental), self.instrumental_form)
         return epistemic, instrumental
 

@@ -13,12 +13,12 @@ from sb3_actpc.utils.nested import map_observations
 LARGEST_BOUND = 1e6  # of an observation; larger ones stand for none
 
 
-def check_keywords_agree(alpha_ep: float, optimize_memory_usage: bool, bootstrap: str, n_steps: int) -> None:
+def check_keywords_agree(epistemic: float, optimize_memory_usage: bool, bootstrap: str, n_steps: int) -> None:
     """:raises ValueError: for keywords of the agent that do not go together"""
-    if alpha_ep and optimize_memory_usage:
+    if epistemic and optimize_memory_usage:
         raise ValueError(
-            f"alpha_ep={alpha_ep:g} does not work with optimize_memory_usage=True, which overwrites the last observations of "
-            "episodes: use optimize_memory_usage=False or alpha_ep=0"
+            f"reward_weights['epistemic']={epistemic:g} does not work with optimize_memory_usage=True, which "
+            "overwrites the last observations of episodes: use optimize_memory_usage=False or a weight of 0"
         )
     if bootstrap == "literal" and n_steps > 1:
         raise ValueError(

@@ -6,7 +6,7 @@ import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import wraps
-from numbers import Integral
+from numbers import Integral, Real
 from typing import Annotated, Any, Literal, ParamSpec, get_args, get_origin
 
 import gymnasium as gym
@@ -109,6 +109,26 @@ def _check(name: str, value: Any, annotation: Any) -> None:
 # ---------------------------------------------------------------------- of the agent
 
 
+def refuse_noise(name: str, noise: Any) -> None:
+    """In a preset, of an algorithm of SB3: its noises are no plain values."""
+    raise ValueError(f"{name!r} is not set here: use --set noise_type=normal --set noise_std=0.1")
+
+
+def check_limit(name: str, limit: Any) -> None:
+    """None, a number of episodes, or a number with its unit."""
+    if limit is None:
+        return
+    number, unit = limit if isinstance(limit, (tuple, list)) and len(limit) == 2 else (limit, "episodes")
+    is_number = isinstance(number, Integral) and not isinstance(number, bool) and int(number) >= 1
+    if not is_number or unit not in ("episodes", "transitions"):
+        raise ValueError(
+            f"{name}={limit!r} must be a whole number of at least 1, of episodes, or (number, 'episodes' or 'transitions')"
+        )
+
+
+DemonstrationLimit = Annotated[int | tuple[int, str] | None, check_limit]
+
+
 def check_env(name: str, env: Any) -> None:
     """None is for agents that are loaded to be played."""
     if env is not None and not isinstance(env, (str, gym.Env, VecEnv)):
@@ -135,9 +155,13 @@ def check_train_freq(name: str, train_freq: Any) -> None:
 
 
 def check_noise(name: str, noise: Any) -> None:
-    """One of SB3's."""
-    if noise is not None and not isinstance(noise, ActionNoise):
-        raise ValueError(f"{name}={noise!r} must be None or one of SB3's, such as NormalActionNoise(mean, sigma)")
+    """None, a standard deviation, or one of SB3's."""
+    if isinstance(noise, Real):
+        _check(name, noise, Weight)
+    elif noise is not None and not isinstance(noise, ActionNoise):
+        raise ValueError(
+            f"{name}={noise!r} must be None, a standard deviation, or one of SB3's, such as NormalActionNoise(mean, sigma)"
+        )
 
 
 def check_nudge(name: str, nudge: Any) -> None:
@@ -180,6 +204,7 @@ OF_SB3: dict[str, Any] = {
     "train_freq": Annotated[Any, check_train_freq],
     "gradient_steps": Annotated[int, Between(-1)],
     "target_kl": Annotated[float | None, Between(0)],
+    "action_noise": Annotated[Any, refuse_noise],
     "use_sde": bool,
     "tensorboard_log": str | None,
 }

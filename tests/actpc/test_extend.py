@@ -102,5 +102,5 @@ def test_overrides_of_all_updates_run_whatever_the_settings():
             ran.append("generator")
             super().update_generator(batch)
 
-    Own("MlpPolicy", "Pendulum-v1", learning_starts=1, critic_weight=0.0, alpha_ep=0.0, policy_delay=1).learn(3)
+    Own("MlpPolicy", "Pendulum-v1", learning_starts=1, critic_weight=0.0, policy_delay=1).learn(3)
     assert set(ran) == {"actor", "critic", "generator"}

@@ -11,7 +11,7 @@ from tests.actpc.envs import CountingEnv
 
 def test_numpys_numbers_are_numbers():
     settings = {"seed": np.int64(3), "learning_rate": np.float32(1e-3), "gamma": np.float64(0.9)}
-    model = make(train_freq=np.int64(2), stats_window_size=np.int64(5), **settings).learn(15)
+    model = make(train_freq=np.int64(2), **settings).learn(15)
     assert model.num_timesteps == 16 and model._n_updates > 0
     assert [type(getattr(model, name)) for name in settings] == [int, float, float]
     assert make(train_freq=(np.int64(2), "episode")).learn(15).train_freq.frequency == 2

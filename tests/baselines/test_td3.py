@@ -116,7 +116,7 @@ def test_a_stopped_run_goes_on_bit_for_bit(kind: type, tmp_path) -> None:
 
 
 def test_the_number_of_demonstrations_can_be_limited() -> None:
-    model = demonstrating(n_demonstration_transitions=7)
+    model = demonstrating(n_demonstrations=(7, "transitions"))
     assert model.replay_buffer.demonstrated.buffer_size == 7
     assert np.array_equal(model.replay_buffer.demonstrated.observations[:, 0], record("Pendulum-v1").observations[:7])
 

@@ -35,7 +35,7 @@ DEFAULT_ENV = {"her": "GoalHopper-v5", **dict.fromkeys(("ppo", "sac", "trpo"), "
 OFF_POLICY = {"learning_starts": 0, "buffer_size": 1000, "batch_size": 8}
 FEWER: dict[str, dict[str, Any]] = {
     **{served: {} for served in ("bcq", "cql")},
-    "actpc": {**OFF_POLICY, "prior_updates": 2},
+    "actpc": {**OFF_POLICY, "signal_kwargs.prior_updates": 2},
     "her": {**OFF_POLICY, "demonstration_fraction": 1.0},
     "bc": {"batch_size": 8},
     "bc_rnn": {"batch_size": 8},

@@ -134,7 +134,7 @@ def test_steps_are_imitated_by_the_return_of_their_episode(weighting, share):
 @pytest.mark.parametrize("n_envs", [1, 2])
 def test_predict_uses_the_deployed_policy_and_evaluation_episodes_have_no_noise(n_envs):
     env = DummyVecEnv([CountingEnv] * n_envs)
-    model = imitating(env, exploration_noise=0.5, train_freq=50)
+    model = imitating(env, action_noise=0.5, train_freq=50)
     model.learn(40)
     observations = np.random.default_rng(0).normal(size=(8, 3)).astype(np.float32)
     with th.no_grad():
