@@ -13,12 +13,12 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
-from sb3_actpc.actpc.base import NEED_DEMONSTRATIONS, ActPCBase
-from sb3_actpc.actpc.batches import Batch, last_observations
+from sb3_actpc.actpc.base import ActPCBase
+from sb3_actpc.actpc.batches import Batch
 from sb3_actpc.actpc.buffers import SignalReplay, relabels
 from sb3_actpc.actpc.policies import POLICIES, ActPCPolicy, check_policy
 from sb3_actpc.actpc.reward_signals import InternalSignals, check_reward_weights
-from sb3_actpc.actpc.validation import check_own_learning_rates, check_step
+from sb3_actpc.actpc.validation import check_step
 from sb3_actpc.demonstrations.dataset import Demonstrations
 from sb3_actpc.demonstrations.recording import ENDLESS
 from sb3_actpc.guidance import ActorGuidance
@@ -198,7 +198,7 @@ class ActPC(ActPCBase):
         self.settling = settling
         self.refresh_weight = refresh_weight
         self.demonstration_fraction = demonstration_fraction
-        self.reward_weights = reward_weights or {}
+        self.reward_weights = dict(reward_weights or {})
         self.signal_kwargs = signal_kwargs
         self.critic_weight = critic_weight
         self.policy_delay = policy_delay
@@ -209,13 +209,11 @@ class ActPC(ActPCBase):
         self.guidance = guidance
         self.guidance_kwargs = guidance_kwargs
         self.signals = InternalSignals()
+        self.was_made_without_demonstrations = not has_demonstrations
         if _init_setup_model:
             self._setup_model()
-            check_own_learning_rates(self.policy, self.lr_schedule(1.0))
-            needing = [name for name in NEED_DEMONSTRATIONS if getattr(self, name)]
-            if not has_demonstrations and (needing or observation_normalization == "demonstrations"):
-                needing = needing or ["observation_normalization"]
-                raise ValueError(f"{' and '.join(needing)}: give demonstrations=, or leave it out")
+            self._check_settings()
+            self._check_needs_met()
             self._setup_demonstrations()
 
     # ------------------------------------------------------------------ collecting (Algorithm 1, lines 8 to 16)
@@ -226,13 +224,15 @@ class ActPC(ActPCBase):
         """As in SB3: actions for the environments, and the same in [-1, 1]."""
         self._restart_if_disturbed()
         is_random = self.num_timesteps < learning_starts
-        context = self._context()
         # a_t = f_proj(o_t): the actor, or a circuit that guidance evaluates. The working memory follows random actions too
         if self.policy.memory_history or not is_random:
             assert self._last_obs is not None
-            observations, circuits = self.actor.obs_to_tensor(self._last_obs)[0], self.actor_guidance.acting_circuits(context)
-            state, starts = self._rollout_state, self._rollout_starts
-            actions, self._rollout_state = self.actor.roll_out(observations, state, starts, circuits)
+            actions, self._rollout_state = self.actor.roll_out(
+                self.actor.obs_to_tensor(self._last_obs)[0],
+                self._rollout_state,
+                self._rollout_starts,
+                self.actor_guidance.acting_circuits(self._context()),
+            )
         if is_random:
             actions = self.policy.scale_action(np.array([self.action_space.sample() for _ in range(n_envs)]))
         check_finite("actor", "actions", actions, self.num_timesteps)
@@ -252,25 +252,18 @@ class ActPC(ActPCBase):
         dones: np.ndarray,
         infos: list[dict[str, Any]],
     ) -> None:
+        """As in SB3: store (o_t, a_t, r_t, o_t+1), then its signals; and tell guidance of the step."""
         assert isinstance(replay_buffer, SignalReplay)
         check_step(new_obs, reward, infos, self.num_timesteps)
-        # Observations and rewards as the environment gave them, before VecNormalize and before its reset
-        normalize = self._vec_normalize_env
-        observations, next_observations, rewards = self._last_original_obs, new_obs, reward
-        if normalize is None:
-            observations = self._last_obs
-        else:
-            next_observations, rewards = normalize.get_original_obs(), normalize.get_original_reward()
-        last = last_observations(next_observations, dones, infos, normalize)
-        # Store (o_t, a_t, r_t, o_t+1), then its signals
-        replay_buffer.add(observations, last, buffer_action, rewards, dones, infos)
-        weights = self.used_weights
-        if weights.epistemic or weights.instrumental:
+        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+        if self.used_weights.has_signals:
             replay_buffer.store_signals(*self.score_newest())
-        self._last_obs, self._last_original_obs = new_obs, next_observations
-        starts, self._rollout_starts = self._rollout_starts, np.array(dones, dtype=bool)
+        starts = self._rollout_starts
+        self._rollout_starts = np.array(dones, dtype=bool)
         # Guidance counts steps of policies, not random ones
         if self.num_timesteps >= self.learning_starts + self.n_envs:
+            normalize = self._vec_normalize_env
+            rewards = reward if normalize is None else normalize.get_original_reward()
             self.actor_guidance.on_step(self._context(starts), rewards, dones, self._n_updates)
         if self.expert is not None and np.any(dones):
             self.expert.check_scale(replay_buffer.rewards[: replay_buffer.size()])
@@ -381,7 +374,7 @@ class ActPC(ActPCBase):
     def update_generator(self, batch: Batch) -> None:
         """The epistemic signal learns the next observation (line 24). Without weight in the reward it has no role."""
         if self.used_weights.epistemic:
-            self.epistemic.update(batch.features, batch.actions, batch.next_features, batch.memory)
+            self.epistemic.update(batch)
 
     def critic_targets(self, batch: Batch) -> th.Tensor:
         """t = r + γ c, or r alone when terminal; one and the same reward for every action output, (B, A)."""
@@ -408,6 +401,7 @@ class ActPC(ActPCBase):
 
     def _on_step(self) -> None:
         """Moves the targets where that goes by environment steps."""
-        interval, now = self.target_update_interval, self.num_timesteps
+        interval = self.target_update_interval
+        now = self.num_timesteps
         if interval > 1 and now // interval > (now - self.n_envs) // interval:
             self.update_targets()

@@ -51,7 +51,8 @@ class SignalReplay(ReplayBuffer):
         **kwargs: Any,
     ) -> None:
         super().__init__(*args, **kwargs)
-        self.combined, self.history = combined, history
+        self.combined = combined
+        self.history = history
         self.set_returns(n_steps, gamma)
         self.epistemic = np.zeros((self.buffer_size, self.n_envs), dtype=np.float32)
         self.instrumental = np.zeros((self.buffer_size, self.n_envs), dtype=np.float32)
@@ -117,7 +118,8 @@ class SignalReplay(ReplayBuffer):
             raise ValueError(
                 f"n_steps={n_steps} does not work with hindsight relabelling or optimize_memory_usage=True: use 1"
             )
-        self.n_steps, self.gamma = n_steps, gamma
+        self.n_steps = n_steps
+        self.gamma = gamma
 
     def forget_own_episodes(self) -> None:
         """Those of the self-imitation memory: in another environment their returns would differ."""

@@ -31,7 +31,8 @@ class DemonstrationReplay:
     def __init__(
         self, demonstrations: Demonstrations, observation_space: spaces.Space, action_space: spaces.Box, history: int
     ) -> None:
-        self.demonstrations, self.history = demonstrations, history
+        self.demonstrations = demonstrations
+        self.history = history
         bounds = demonstrations.episode_bounds
         lengths = bounds[:, 1] - bounds[:, 0]
         self.ends = np.repeat(bounds[:, 1], lengths)
@@ -42,16 +43,17 @@ class DemonstrationReplay:
             returns=np.repeat(demonstrations.episode_returns, lengths),
         )
         self.next_observations = split_observations(observation_space, demonstrations.next_observations)
-        self.epistemic, self.instrumental = np.zeros((2, len(demonstrations)), dtype=np.float32)
+        self.epistemic = np.zeros(len(demonstrations), dtype=np.float32)
+        self.instrumental = np.zeros(len(demonstrations), dtype=np.float32)
         self.has_signals = False
         self.has_scale = False  # whether rewards have been compared
 
     def __len__(self) -> int:
         return len(self.demonstrations)
 
-    def sample(self, n: int, *how: Any) -> Batch:
-        """``n`` transitions drawn uniformly; see :meth:`batch`."""
-        return self.batch(np.random.randint(0, len(self), size=n), *how)
+    def draw(self, n: int) -> np.ndarray:
+        """``n`` rows, uniformly."""
+        return np.random.randint(0, len(self), size=n)
 
     def batch(
         self,

@@ -19,7 +19,7 @@ class Diagnostics:
     def __init__(self, policy: ActPCPolicy) -> None:
         self.circuits = policy.circuits()
         self.active = False
-        self.values: dict[str, float] = {}
+        self.values: dict[str, float] = {}  # everything measured last
 
     def is_due(self, n_updates: int, delay: int = 1) -> bool:
         """Whether the update with this number, from 1 on, is measured."""
@@ -92,7 +92,3 @@ class Diagnostics:
         if self.active:
             for layer, change in enumerate(changes.weights):
                 self.values[f"actor_{name}_norm_{layer}"] = float(change.norm())
-
-    def summary(self) -> dict[str, float]:
-        """Everything measured last."""
-        return self.values
