@@ -81,7 +81,7 @@ class ActPC(ActPCBase):
     :param replay_buffer_kwargs: keywords of :class:`~sb3_actpc.actpc.buffers.SignalReplay` and of SB3's class
     :param optimize_memory_usage: as in SB3; not with an epistemic weight, as the generator learns where every step led
     :param n_steps: length of n-step returns; 1 by default with hindsight, ``optimize_memory_usage`` or
-        ``bootstrap="literal"``
+        ``target_policy_noise=None``
     :param settling: "scheduled" (one ordered sweep of the errors, Z-IL) or "iterative" (settle, then change; with
         ``circuit_kwargs=dict(dynamics="state")`` the paper's K steps of eq. 1)
     :param demonstrations: a path, a Minari id, or a :class:`~sb3_actpc.demonstrations.dataset.Demonstrations`; others can be
@@ -96,9 +96,8 @@ class ActPC(ActPCBase):
     :param critic_weight: weight of the critic term in the actor's update. None is TD3+BC's rule (arXiv 2106.06860), 2.5
         divided by the batch's mean absolute action-value (at least 1); 0 leaves imitation alone
     :param policy_delay: updates of the critic for each of the actor; the paper's is 1
-    :param bootstrap: "joint" (at the target actor's next action, the appendix) or "literal" (at the action taken, the main
-        text's equation)
-    :param target_policy_noise: standard deviation of the noise on the target actor's action
+    :param target_policy_noise: standard deviation of the noise on the target actor's next action, which bootstraps (the
+        paper's appendix); None for the action taken in its place (the main text's equation)
     :param target_update_interval: the targets move after every update (1), or every so many environment steps
     :param observation_normalization: "none" (the paper), "demonstrations" (their mean and standard deviation) or "bounds"
         (those of the observation space become -1 and 1)
@@ -142,8 +141,7 @@ class ActPC(ActPCBase):
         signal_kwargs: Settings | None = None,
         critic_weight: Annotated[float | None, Between(0)] = None,
         policy_delay: Size = 4,
-        bootstrap: Literal["joint", "literal"] = "joint",
-        target_policy_noise: Weight = 0.2,
+        target_policy_noise: Annotated[float | None, Between(0)] = 0.2,
         target_update_interval: Annotated[int, Between(1)] = 1,
         observation_normalization: Literal["none", "demonstrations", "bounds"] | None = None,
         guidance: ActorGuidance | str | None = None,
@@ -157,7 +155,7 @@ class ActPC(ActPCBase):
     ) -> None:
         # Keywords left at None have one value with demonstrations and one without
         has_demonstrations = demonstrations is not None
-        is_one_step = relabels(replay_buffer_class) or optimize_memory_usage or bootstrap == "literal"
+        is_one_step = relabels(replay_buffer_class) or optimize_memory_usage or target_policy_noise is None
         if learning_starts is None:
             learning_starts = 0 if has_demonstrations else 100
         if n_steps is None:
@@ -202,7 +200,6 @@ class ActPC(ActPCBase):
         self.signal_kwargs = signal_kwargs
         self.critic_weight = critic_weight
         self.policy_delay = policy_delay
-        self.bootstrap = bootstrap
         self.target_policy_noise = target_policy_noise
         self.target_update_interval = target_update_interval
         self.observation_normalization = observation_normalization
@@ -380,9 +377,9 @@ class ActPC(ActPCBase):
         """t = r + γ c, or r alone when terminal; one and the same reward for every action output, (B, A)."""
         # The action taken (main text), or the target actor's next one with clipped noise as in TD3 (appendix)
         next_actions = batch.actions
-        if self.bootstrap == "joint":
+        if self.target_policy_noise is not None:
             next_actions = self.actor_target.project(batch.bootstrap_features, batch.next_memory)
-        if self.bootstrap == "joint" and self.target_policy_noise:
+        if self.target_policy_noise:
             noise = th.randn_like(next_actions) * self.target_policy_noise
             bound = TARGET_NOISE_CLIP * self.target_policy_noise
             next_actions = (next_actions + noise.clamp(-bound, bound)).clamp(-1.0, 1.0)

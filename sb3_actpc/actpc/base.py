@@ -56,7 +56,7 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
     guidance_kwargs: Settings | None
     signal_kwargs: Settings | None
     reward_weights: Settings
-    bootstrap: str
+    target_policy_noise: float | None
     critic_weight: float | None
     refresh_weight: float
     policy_delay: int
@@ -136,9 +136,9 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
                 f"reward_weights['epistemic']={epistemic:g} does not work with optimize_memory_usage=True, which overwrites "
                 "the last observations of episodes: use optimize_memory_usage=False or a weight of 0"
             )
-        if self.bootstrap == "literal" and self.n_steps > 1:
+        if self.target_policy_noise is None and self.n_steps > 1:
             raise ValueError(
-                f"n_steps={self.n_steps} does not work with bootstrap='literal', which values the action taken: use n_steps=1"
+                f"n_steps={self.n_steps} does not work with target_policy_noise=None, which values the action taken: use 1"
             )
         for name in self.policy.circuits():
             own = self.policy.settings_of(name).get("learning_rate")

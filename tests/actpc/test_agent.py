@@ -255,7 +255,7 @@ def test_the_smaller_value_of_two_critics_drawn_at_random_bootstraps():
 
 
 def test_the_literal_bootstrap_values_the_action_taken():
-    model = make(bootstrap="literal")
+    model = make(target_policy_noise=None)
     model.learn(40)
     batch = next(model.sample_batches(1, 16))
     values = model.critic_target.project(th.cat([batch.next_features, batch.actions], dim=1))
@@ -736,7 +736,6 @@ def test_vec_normalize_relabels_the_task_reward_alone():
 @pytest.mark.parametrize(
     ("keywords", "named"),
     [
-        ({"bootstrap": "both"}, "bootstrap='both'"),
         ({"signal_kwargs": {"normalizer": "mean"}}, "signal_kwargs={'normalizer': 'mean'}: normalizer='mean'"),
         ({"signal_kwargs": {"normaliser": "max"}}, "signal_kwargs.*has no keyword 'normaliser'"),
         ({"target_update_interval": 0}, "target_update_interval=0"),
@@ -772,7 +771,7 @@ def test_vec_normalize_relabels_the_task_reward_alone():
         ({"replay_buffer_kwargs": {"combine": True}}, "replay_buffer_kwargs=.*'combine'"),
         ({"replay_buffer_kwargs": {"n_steps": 2}}, "replay_buffer_kwargs=.*'n_steps'"),
         ({"settling": "fast"}, "settling='fast'"),
-        ({"bootstrap": "literal", "n_steps": 3}, "n_steps=3 does not work with bootstrap='literal'.*use n_steps=1"),
+        ({"target_policy_noise": None, "n_steps": 3}, "n_steps=3 does not work with target_policy_noise=None.*use 1"),
         ({"optimize_memory_usage": True, **NO_TIMEOUTS}, "optimize_memory_usage=False or a weight of 0"),
         (
             {"reward_weights": {"epistemic": 0.0}, "optimize_memory_usage": True, "n_steps": 3, **NO_TIMEOUTS},
