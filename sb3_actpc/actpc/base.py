@@ -25,8 +25,9 @@ from sb3_actpc.actpc.self_imitation import Episodes, sample_union
 from sb3_actpc.actpc.validation import check_loaded_buffer, check_observations, finite_bounds
 from sb3_actpc.checkpoints import Restored, load_checkpoint
 from sb3_actpc.demonstrations.mixin import LearnsFromDemonstrations
-from sb3_actpc.guidance import ActorGuidance, GuidanceContext, make_guidance
+from sb3_actpc.guidance import ActorGuidance, GuidanceContext
 from sb3_actpc.guidance.base import ImitationBatch
+from sb3_actpc.guidance.guidance import make_guidance
 from sb3_actpc.utils.checks import Settings, check_finite, named_in_errors
 from sb3_actpc.utils.noise import as_action_noise
 from sb3_actpc.utils.rollouts import StoresLastTransition

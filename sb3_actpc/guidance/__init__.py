@@ -12,7 +12,7 @@ actions. The deployed policy, which ``predict`` uses, changes only after a test 
 """
 
 from sb3_actpc.guidance.base import ActorGuidance, GuidanceContext
-from sb3_actpc.guidance.guidance import BehaviorGuidance, GuidanceConfig, make_guidance
+from sb3_actpc.guidance.guidance import BehaviorGuidance, GuidanceConfig
 from sb3_actpc.guidance.policy_selection import PolicySelection
 
-__all__ = ["ActorGuidance", "BehaviorGuidance", "GuidanceConfig", "GuidanceContext", "PolicySelection", "make_guidance"]
+__all__ = ["ActorGuidance", "BehaviorGuidance", "GuidanceConfig", "GuidanceContext", "PolicySelection"]

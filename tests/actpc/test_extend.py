@@ -58,9 +58,9 @@ def test_a_learned_intrinsic_reward(tmp_path):
     names = example("A learned intrinsic reward")
     model, signal = names["model"], names["model"].epistemic
     assert model.replay_buffer.epistemic[:130].any() and model.diagnostics.values["distillation_error"] > 0.0
-    seen = th.as_tensor(model.replay_buffer.observations[:130, 0])
-    unseen = seen + 10.0
-    assert signal.score(None, None, seen, None).mean() < 0.1 * signal.score(None, None, unseen, None).mean()
+    seen = next(model.sample_batches(1, 64))
+    unseen = seen._replace(next_features=seen.next_features + 10.0)
+    assert signal.score(seen).mean() < 0.1 * signal.score(unseen).mean()
     model.save(tmp_path / "agent")
     loaded = ActPC.load(tmp_path / "agent")
     for mine, theirs in zip(weights_of(signal), weights_of(loaded.epistemic), strict=True):
