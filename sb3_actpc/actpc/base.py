@@ -529,7 +529,8 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
         """
         given = self.replay_buffer
         super().load_replay_buffer(path, truncate_last_traj)
-        loaded, self.replay_buffer = self.replay_buffer, given
+        loaded = self.replay_buffer
+        self.replay_buffer = given
         check_loaded_buffer(path, loaded, isinstance(loaded, SignalReplay), self)
         loaded.history = self.policy.memory_history
         self.replay_buffer = loaded

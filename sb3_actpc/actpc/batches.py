@@ -92,7 +92,8 @@ class Batch(NamedTuple):
             next_past = actor.past_features(samples.next_history, samples.next_history_mask)
             if next_past is None:  # one step on, the present observation is the newest of the past
                 next_past = th.cat([past[:, 1:], features[:, None]], dim=1)
-            memory, next_memory = actor.memory(past), actor.memory(next_past)
+            memory = actor.memory(past)
+            next_memory = actor.memory(next_past)
         observed = features, samples.actions, next_features, bootstrap_features
         return cls(*observed, memory, next_memory, rewards, samples.dones, samples.discounts)
 
@@ -117,15 +118,15 @@ def minibatches(
     :param n_newest: rows that all minibatches share
     :param is_shuffled: whether all but the newest rows come in random order
     """
-    n_replayed, n_demonstrated = len(replayed.features) - n_newest, 0
     everything = replayed
+    n_demonstrated = 0
     if demonstrated is not None:
         n_demonstrated = len(demonstrated.features)
         pairs: Any = zip(replayed, demonstrated, strict=True)
         columns: Any = [None if mine is None else th.cat([mine, theirs]) for mine, theirs in pairs]
         everything = Batch(*columns)
-    rows = th.arange(n_newest + n_replayed + n_demonstrated, device=replayed.features.device)
-    newest, own, shown = rows.split([n_newest, n_replayed, n_demonstrated])
+    rows = th.arange(len(everything.features), device=replayed.features.device)
+    newest, own, shown = rows.split([n_newest, len(replayed.features) - n_newest, n_demonstrated])
     for index in range(n_batches):
         parts = (part[index * len(part) // n_batches : (index + 1) * len(part) // n_batches] for part in (own, shown))
         order = th.cat([newest, *parts])

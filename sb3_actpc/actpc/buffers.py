@@ -162,10 +162,12 @@ class SignalReplay(ReplayBuffer):
         newest = np.arange(self.n_newest(batch_size) if n_newest is None else n_newest)
         if 0 < len(newest) < self.n_envs:
             newest = np.random.permutation(self.n_envs)[: len(newest)]
-        rows, envs = np.full(len(newest), self.newest), newest
+        rows = np.full(len(newest), self.newest)
+        envs = newest
         if len(newest) < batch_size:
-            drawn = self._draw(batch_size - len(newest))
-            rows, envs = np.concatenate([rows, drawn[0]]), np.concatenate([envs, drawn[1]])
+            drawn_rows, drawn_envs = self._draw(batch_size - len(newest))
+            rows = np.concatenate([rows, drawn_rows])
+            envs = np.concatenate([envs, drawn_envs])
         return self._relabel(self.gather(rows, envs, env, rewards_of), rows, envs, len(newest), env)
 
     def _relabel(

@@ -181,7 +181,8 @@ class ActPCActor(BasePolicy):
         :raises ValueError: for a state of another number of environments
         """
         with th.no_grad():
-            features, memory = self.features(observations), None
+            features = self.features(observations)
+            memory = None
             if self.memory is not None:
                 shape = len(features), self.memory.history, features.shape[1]
                 history = np.zeros(shape, dtype=np.float32) if state is None else state[0].copy()
