@@ -17,7 +17,7 @@ from sb3_actpc.utils.extras import import_extra
 
 SCRIPTS = {"train": "train:train", "optimize": "train:train", "enjoy": "enjoy:enjoy", "plot": "plots:plot_train"}
 OPTIMIZABLE = ("actpc", "ppo", "sac", "trpo")  # no setting in their presets overrides a sampled one
-RANGES = {"learning_rate": (1e-5, 2e-3), "tau": (1e-3, 0.15), "critic_weight": (0.01, 3.0), "refresh_weight": (0.1, 3.0)}
+RANGES = {"learning_rate": (1e-5, 2e-3), "tau": (1e-3, 0.15), "refresh_weight": (0.1, 3.0)}
 CHOICES = {"gamma": [0.95, 0.98, 0.99, 0.995], "batch_size": [64, 128, 256, 512], "epistemic": [0.0, 0.1, 1.0]}
 
 
