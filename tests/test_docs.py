@@ -60,11 +60,9 @@ class Keys(KVWriter):
 @pytest.mark.parametrize("settling", ["scheduled", "iterative"])
 def test_every_logged_key_is_in_the_table_of_metrics(settling: str) -> None:
     keys = Keys()
-    signals = {"alpha_ep": 0.1, "alpha_in": 0.1}
+    signals = {"reward_weights": {"epistemic": 0.1, "instrumental": 0.1}, "signal_kwargs": {"prior_updates": 5}}
     guidance = {"bc_updates": 5, "critic_warmup": 5}
-    model: ActPC = imitating(
-        lambda: Monitor(CountingEnv()), settling=settling, prior_updates=5, guidance_kwargs=guidance, **signals
-    )
+    model: ActPC = imitating(lambda: Monitor(CountingEnv()), settling=settling, guidance_kwargs=guidance, **signals)
     model.set_logger(Logger(None, [keys]))
     model.learn(200)
     keys_section = (ROOT / "docs" / "metrics.md").read_text(encoding="utf-8").split("\n## ")[1]

@@ -13,12 +13,12 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
-from sb3_actpc.actpc.base import NEED_DEMONSTRATIONS, ActPCBase
-from sb3_actpc.actpc.batches import Batch, last_observations
+from sb3_actpc.actpc.base import ActPCBase
+from sb3_actpc.actpc.batches import Batch
 from sb3_actpc.actpc.buffers import SignalReplay, relabels
 from sb3_actpc.actpc.policies import POLICIES, ActPCPolicy, check_policy
-from sb3_actpc.actpc.reward_signals import InternalSignals
-from sb3_actpc.actpc.validation import check_own_learning_rates, check_step
+from sb3_actpc.actpc.reward_signals import InternalSignals, check_reward_weights
+from sb3_actpc.actpc.validation import check_step
 from sb3_actpc.demonstrations.dataset import Demonstrations
 from sb3_actpc.demonstrations.recording import ENDLESS
 from sb3_actpc.guidance import ActorGuidance
@@ -26,7 +26,7 @@ from sb3_actpc.ngc import HebbianChanges, settle_coupled
 from sb3_actpc.utils.arguments import (
     MAX_SEED,
     Between,
-    Count,
+    DemonstrationLimit,
     Share,
     Size,
     Weight,
@@ -42,6 +42,7 @@ from sb3_actpc.utils.checks import Settings, check_finite
 # the mean absolute action-value that divides the critic term is at least this: before any reward was seen, the critic's
 # noise must not be scaled up to full strength
 SMALLEST_VALUE_SCALE = 1.0
+TD3_BC_WEIGHT = 2.5  # α of TD3+BC
 TARGET_NOISE_CLIP = 2.5  # standard deviations, as TD3's 0.5 for 0.2
 
 
@@ -75,40 +76,35 @@ class ActPC(ActPCBase):
     :param gamma: discount
     :param train_freq: environment steps (or episodes) between updates
     :param gradient_steps: updates each time; -1 for as many as steps were collected
-    :param action_noise: SB3's exploration noise; replaces ``exploration_noise``
+    :param action_noise: exploration noise on actions in [-1, 1]: the standard deviation of Gaussian noise, or one of SB3's
     :param replay_buffer_class: None, or one of SB3's classes or its name (its ActPC counterpart is used)
     :param replay_buffer_kwargs: keywords of :class:`~sb3_actpc.actpc.buffers.SignalReplay` and of SB3's class
-    :param optimize_memory_usage: as in SB3; not with ``alpha_ep``, as the generator learns where every step led
+    :param optimize_memory_usage: as in SB3; not with an epistemic weight, as the generator learns where every step led
     :param n_steps: length of n-step returns; 1 by default with hindsight, ``optimize_memory_usage`` or
-        ``bootstrap="literal"``
+        ``target_policy_noise=None``
     :param settling: "scheduled" (one ordered sweep of the errors, Z-IL) or "iterative" (settle, then change; with
         ``circuit_kwargs=dict(dynamics="state")`` the paper's K steps of eq. 1)
     :param demonstrations: a path, a Minari id, or a :class:`~sb3_actpc.demonstrations.dataset.Demonstrations`; others can be
         set later (``agent.demonstrations = ...``)
-    :param n_demonstrations: use only the first so many episodes of them
-    :param n_demonstration_transitions: use only the first so many transitions (the paper's "300 samples")
-    :param prior_updates: updates of the prior before learning starts, with ``alpha_in``; then it is frozen
+    :param n_demonstrations: use only the first so many episodes of them, or, as ``(300, "transitions")``, so many transitions
+        (the paper's "300 samples")
     :param refresh_weight: λ, weight of the actor's refresh from the demonstrations and its own good episodes
     :param demonstration_fraction: share of every batch that comes from the demonstrations
-    :param exploration_noise: standard deviation of the Gaussian noise on actions in [-1, 1]
-    :param alpha_ep: weight of the epistemic signal
-    :param alpha_in: weight of the instrumental signal
-    :param alpha_ext: weight of the task's reward (the paper's is 0 with demonstrations)
+    :param reward_weights: weights of the ``epistemic`` and the ``instrumental`` signal (the paper's α_ep and α_in; here 0) and
+        of the ``task``'s reward (α_ext, the paper's is 0 with demonstrations; here 1)
     :param signal_kwargs: keywords of :class:`~sb3_actpc.actpc.reward_signals.InternalSignals`
-    :param critic_weight: weight of the critic term in the actor's update; the default is TD3+BC's (arXiv 2106.06860); 0 leaves
-        imitation alone
-    :param normalize_critic_term: divide that term by the batch's mean absolute action-value (at least 1)
+    :param critic_weight: weight of the critic term in the actor's update. None is TD3+BC's rule (arXiv 2106.06860), 2.5
+        divided by the batch's mean absolute action-value (at least 1); 0 leaves imitation alone
     :param policy_delay: updates of the critic for each of the actor; the paper's is 1
-    :param bootstrap: "joint" (at the target actor's next action, the appendix) or "literal" (at the action taken, the main
-        text's equation)
-    :param target_policy_noise: standard deviation of the noise on the target actor's action
+    :param target_policy_noise: standard deviation of the noise on the target actor's next action, which bootstraps (the
+        paper's appendix); None for the action taken in its place (the main text's equation)
     :param target_update_interval: the targets move after every update (1), or every so many environment steps
     :param observation_normalization: "none" (the paper), "demonstrations" (their mean and standard deviation) or "bounds"
         (those of the observation space become -1 and 1)
     :param guidance: "none" (the paper's agent), "default" or an :class:`~sb3_actpc.guidance.base.ActorGuidance`
     :param guidance_kwargs: keywords of :class:`~sb3_actpc.guidance.guidance.GuidanceConfig`
     :param policy_kwargs: keywords of :class:`~sb3_actpc.actpc.policies.ActPCPolicy`
-    :param stats_window_size: as in SB3, and so are ``tensorboard_log``, ``verbose``, ``device`` and ``seed``
+    :param tensorboard_log: as in SB3, and so are ``verbose``, ``device`` and ``seed``
     :raises ValueError: for values, spaces or demonstrations that do not fit
     :raises FileNotFoundError: where no demonstrations file is
     :raises ImportError: for a Minari id without the extra ``minari``
@@ -130,7 +126,7 @@ class ActPC(ActPCBase):
         gamma: Share = 0.99,
         train_freq: Annotated[int | tuple[int, str], check_train_freq] = 1,
         gradient_steps: Annotated[int, Between(-1)] = 4,
-        action_noise: Annotated[ActionNoise | None, check_noise] = None,
+        action_noise: Annotated[ActionNoise | float | None, check_noise] = 0.1,
         replay_buffer_class: type[ReplayBuffer] | str | None = None,
         replay_buffer_kwargs: Settings | None = None,
         optimize_memory_usage: bool = False,
@@ -138,27 +134,19 @@ class ActPC(ActPCBase):
         *,
         settling: Literal["iterative", "scheduled"] = "scheduled",
         demonstrations: Demonstrations | str | Path | None = None,
-        n_demonstrations: Annotated[int | None, Between(1)] = None,
-        n_demonstration_transitions: Annotated[int | None, Between(1)] = None,
-        prior_updates: Count = 2000,
+        n_demonstrations: DemonstrationLimit = None,
         refresh_weight: Weight = 1.0,
         demonstration_fraction: Annotated[float | None, Between(0, 1)] = None,
-        exploration_noise: Weight = 0.1,
-        alpha_ep: Weight = 0.0,
-        alpha_in: Weight = 0.0,
-        alpha_ext: float = 1.0,
+        reward_weights: Annotated[Settings | None, check_reward_weights] = None,
         signal_kwargs: Settings | None = None,
-        critic_weight: Weight = 2.5,
-        normalize_critic_term: bool = True,
+        critic_weight: Annotated[float | None, Between(0)] = None,
         policy_delay: Size = 4,
-        bootstrap: Literal["joint", "literal"] = "joint",
-        target_policy_noise: Weight = 0.2,
+        target_policy_noise: Annotated[float | None, Between(0)] = 0.2,
         target_update_interval: Annotated[int, Between(1)] = 1,
         observation_normalization: Literal["none", "demonstrations", "bounds"] | None = None,
         guidance: ActorGuidance | str | None = None,
         guidance_kwargs: Settings | None = None,
         policy_kwargs: Settings | None = None,
-        stats_window_size: Size = 100,
         tensorboard_log: str | None = None,
         verbose: int = 0,
         device: Annotated[th.device | str, check_computes] = "auto",
@@ -167,7 +155,7 @@ class ActPC(ActPCBase):
     ) -> None:
         # Keywords left at None have one value with demonstrations and one without
         has_demonstrations = demonstrations is not None
-        is_one_step = relabels(replay_buffer_class) or optimize_memory_usage or bootstrap == "literal"
+        is_one_step = relabels(replay_buffer_class) or optimize_memory_usage or target_policy_noise is None
         if learning_starts is None:
             learning_starts = 0 if has_demonstrations else 100
         if n_steps is None:
@@ -195,7 +183,6 @@ class ActPC(ActPCBase):
             optimize_memory_usage=optimize_memory_usage,
             n_steps=n_steps,
             policy_kwargs=dict(policy_kwargs or {}),
-            stats_window_size=stats_window_size,
             tensorboard_log=tensorboard_log,
             verbose=verbose,
             device=device,
@@ -205,34 +192,25 @@ class ActPC(ActPCBase):
             support_multi_env=True,
             demonstrations=demonstrations,
             n_demonstrations=n_demonstrations,
-            n_demonstration_transitions=n_demonstration_transitions,
         )
         self.settling = settling
-        self.prior_updates = prior_updates
         self.refresh_weight = refresh_weight
         self.demonstration_fraction = demonstration_fraction
-        self.exploration_noise = exploration_noise
-        self.alpha_ep = alpha_ep
-        self.alpha_in = alpha_in
-        self.alpha_ext = alpha_ext
+        self.reward_weights = dict(reward_weights or {})
         self.signal_kwargs = signal_kwargs
         self.critic_weight = critic_weight
-        self.normalize_critic_term = normalize_critic_term
         self.policy_delay = policy_delay
-        self.bootstrap = bootstrap
         self.target_policy_noise = target_policy_noise
         self.target_update_interval = target_update_interval
         self.observation_normalization = observation_normalization
         self.guidance = guidance
         self.guidance_kwargs = guidance_kwargs
         self.signals = InternalSignals()
+        self.was_made_without_demonstrations = not has_demonstrations
         if _init_setup_model:
             self._setup_model()
-            check_own_learning_rates(self.policy, self.lr_schedule(1.0))
-            needing = [name for name in NEED_DEMONSTRATIONS if getattr(self, name)]
-            if not has_demonstrations and (needing or observation_normalization == "demonstrations"):
-                needing = needing or ["observation_normalization"]
-                raise ValueError(f"{' and '.join(needing)}: give demonstrations=, or leave it out")
+            self._check_settings()
+            self._check_needs_met()
             self._setup_demonstrations()
 
     # ------------------------------------------------------------------ collecting (Algorithm 1, lines 8 to 16)
@@ -243,26 +221,23 @@ class ActPC(ActPCBase):
         """As in SB3: actions for the environments, and the same in [-1, 1]."""
         self._restart_if_disturbed()
         is_random = self.num_timesteps < learning_starts
-        context = self._context()
         # a_t = f_proj(o_t): the actor, or a circuit that guidance evaluates. The working memory follows random actions too
         if self.policy.memory_history or not is_random:
             assert self._last_obs is not None
-            observations, circuits = self.actor.obs_to_tensor(self._last_obs)[0], self.actor_guidance.acting_circuits(context)
-            state, starts = self._rollout_state, self._rollout_starts
-            actions, self._rollout_state = self.actor.roll_out(observations, state, starts, circuits)
+            actions, self._rollout_state = self.actor.roll_out(
+                self.actor.obs_to_tensor(self._last_obs)[0],
+                self._rollout_state,
+                self._rollout_starts,
+                self.actor_guidance.acting_circuits(self._context()),
+            )
         if is_random:
             actions = self.policy.scale_action(np.array([self.action_space.sample() for _ in range(n_envs)]))
         check_finite("actor", "actions", actions, self.num_timesteps)
         # Exploration noise, where guidance lets the episode have some
-        noise = None
         if action_noise is not None:
-            noise = action_noise()
-        elif self.exploration_noise:
-            noise = np.random.normal(size=actions.shape).astype(np.float32) * np.float32(self.exploration_noise)
-        if noise is not None:
             explores = np.array([self.actor_guidance.explores(env) for env in range(n_envs)])
             explores = explores.reshape(-1, *[1] * (actions.ndim - 1))
-            actions = np.clip(actions + explores * noise, -1.0, 1.0).astype(np.float32)
+            actions = np.clip(actions + explores * action_noise(), -1.0, 1.0).astype(np.float32)
         return self.policy.unscale_action(actions), actions
 
     def _store_transition(
@@ -274,24 +249,18 @@ class ActPC(ActPCBase):
         dones: np.ndarray,
         infos: list[dict[str, Any]],
     ) -> None:
+        """As in SB3: store (o_t, a_t, r_t, o_t+1), then its signals; and tell guidance of the step."""
         assert isinstance(replay_buffer, SignalReplay)
         check_step(new_obs, reward, infos, self.num_timesteps)
-        # Observations and rewards as the environment gave them, before VecNormalize and before its reset
-        normalize = self._vec_normalize_env
-        observations, next_observations, rewards = self._last_original_obs, new_obs, reward
-        if normalize is None:
-            observations = self._last_obs
-        else:
-            next_observations, rewards = normalize.get_original_obs(), normalize.get_original_reward()
-        last = last_observations(next_observations, dones, infos, normalize)
-        # Store (o_t, a_t, r_t, o_t+1), then its signals
-        replay_buffer.add(observations, last, buffer_action, rewards, dones, infos)
-        if any(self.reward_weights[1:]):
+        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+        if self.used_weights.has_signals:
             replay_buffer.store_signals(*self.score_newest())
-        self._last_obs, self._last_original_obs = new_obs, next_observations
-        starts, self._rollout_starts = self._rollout_starts, np.array(dones, dtype=bool)
+        starts = self._rollout_starts
+        self._rollout_starts = np.array(dones, dtype=bool)
         # Guidance counts steps of policies, not random ones
         if self.num_timesteps >= self.learning_starts + self.n_envs:
+            normalize = self._vec_normalize_env
+            rewards = reward if normalize is None else normalize.get_original_reward()
             self.actor_guidance.on_step(self._context(starts), rewards, dones, self._n_updates)
         if self.expert is not None and np.any(dones):
             self.expert.check_scale(replay_buffer.rewards[: replay_buffer.size()])
@@ -346,7 +315,7 @@ class ActPC(ActPCBase):
             features, actions, memory = self.sample_imitated(len(batch.features))
             chain = self.actor.circuit.chain(features, memory)
             filtered_weight = self.actor_guidance.filtered_weight(self._n_updates)
-            if self.critic_weight and filtered_weight < 1.0:
+            if self.has_critic_term and filtered_weight < 1.0:
                 actions = self.q_filter(features, actions, chain.output, filtered_weight)
             state = self.actor.circuit.settle_chain(chain, actions)
             imitation = self.actor.circuit.hebbian_update(state).scale_(imitation_weight)
@@ -354,15 +323,12 @@ class ActPC(ActPCBase):
             self.diagnostics.change_norms("imitation", imitation)
             changes.append(imitation)
         # Critic term: actor and critic settle as one under the critic's output error +1/A, ΔΘ_a = e φ(z)ᵀ
-        critic_weight = self.critic_weight * self.actor_guidance.critic_weight(self._n_updates)
-        if critic_weight:
+        share = self.actor_guidance.critic_weight(self._n_updates)
+        if self.has_critic_term and share:
             coupled = settle_coupled(self.actor.circuit, self.critic, batch.features, batch.memory, self.policy.nudge)
             improvement = self.actor.circuit.hebbian_update(coupled.actor)
             self.diagnostics.coupled(coupled, improvement, batch.features, batch.memory)
-            if self.normalize_critic_term:
-                improvement.scale_(critic_weight / coupled.action_values.abs().mean().clamp_min(SMALLEST_VALUE_SCALE))
-            else:
-                improvement.scale_(critic_weight)
+            improvement.scale_(share * self.critic_term_weight(coupled.action_values))
             self.diagnostics.change_norms("critic_term", improvement)
             if not changes:
                 self.diagnostics.settled("actor", coupled.actor)
@@ -374,6 +340,12 @@ class ActPC(ActPCBase):
                 total.add_(other)
             self.actor.circuit.apply_changes(total)
             self.actor_guidance.after_update(self._context())
+
+    def critic_term_weight(self, action_values: th.Tensor) -> float | th.Tensor:
+        """``critic_weight``, or by TD3+BC's rule what makes the term independent of the scale of ``action_values``, (B, A)."""
+        if self.critic_weight is not None:
+            return self.critic_weight
+        return TD3_BC_WEIGHT / action_values.abs().mean().clamp_min(SMALLEST_VALUE_SCALE)
 
     def q_filter(self, features: th.Tensor, actions: th.Tensor, own: th.Tensor, weight: float = 0.0) -> th.Tensor:
         """Imitated actions, (B, A). Where all critics value the actor's ``own`` more, these, which have no error (without a
@@ -389,7 +361,7 @@ class ActPC(ActPCBase):
 
     def update_critic(self, batch: Batch) -> None:
         """All critics settle on the same targets, ΔΘ_c = e φ(z)ᵀ (lines 21 and 22). Without a weight they have no role."""
-        if not self.critic_weight:
+        if not self.has_critic_term:
             return
         targets = self.critic_targets(batch)
         state = self.critic.settle(th.cat([batch.features, batch.actions], dim=1), targets)
@@ -398,16 +370,16 @@ class ActPC(ActPCBase):
 
     def update_generator(self, batch: Batch) -> None:
         """The epistemic signal learns the next observation (line 24). Without weight in the reward it has no role."""
-        if self.alpha_ep:
-            self.epistemic.update(batch.features, batch.actions, batch.next_features, batch.memory)
+        if self.used_weights.epistemic:
+            self.epistemic.update(batch)
 
     def critic_targets(self, batch: Batch) -> th.Tensor:
         """t = r + γ c, or r alone when terminal; one and the same reward for every action output, (B, A)."""
         # The action taken (main text), or the target actor's next one with clipped noise as in TD3 (appendix)
         next_actions = batch.actions
-        if self.bootstrap == "joint":
+        if self.target_policy_noise is not None:
             next_actions = self.actor_target.project(batch.bootstrap_features, batch.next_memory)
-        if self.bootstrap == "joint" and self.target_policy_noise:
+        if self.target_policy_noise:
             noise = th.randn_like(next_actions) * self.target_policy_noise
             bound = TARGET_NOISE_CLIP * self.target_policy_noise
             next_actions = (next_actions + noise.clamp(-bound, bound)).clamp(-1.0, 1.0)
@@ -426,6 +398,7 @@ class ActPC(ActPCBase):
 
     def _on_step(self) -> None:
         """Moves the targets where that goes by environment steps."""
-        interval, now = self.target_update_interval, self.num_timesteps
+        interval = self.target_update_interval
+        now = self.num_timesteps
         if interval > 1 and now // interval > (now - self.n_envs) // interval:
             self.update_targets()

@@ -3,7 +3,6 @@
 import time
 import warnings
 from collections.abc import Iterable, Iterator
-from dataclasses import fields
 from os import PathLike
 from pathlib import Path
 from typing import Any, TypeVar
@@ -21,26 +20,22 @@ from sb3_actpc.actpc.buffers import SignalReplay, combined_buffer_class
 from sb3_actpc.actpc.demonstration_replay import DemonstrationReplay
 from sb3_actpc.actpc.diagnostics import Diagnostics
 from sb3_actpc.actpc.policies import ActPCActor, ActPCPolicy
-from sb3_actpc.actpc.reward_signals import InternalSignals
+from sb3_actpc.actpc.reward_signals import InternalSignals, RewardWeights, check_reward_weights
 from sb3_actpc.actpc.self_imitation import Episodes, sample_union
-from sb3_actpc.actpc.validation import (
-    check_keywords_agree,
-    check_loaded_buffer,
-    check_observations,
-    check_own_learning_rates,
-    finite_bounds,
-)
+from sb3_actpc.actpc.validation import check_loaded_buffer, check_observations, finite_bounds
 from sb3_actpc.checkpoints import Restored, load_checkpoint
 from sb3_actpc.demonstrations.mixin import LearnsFromDemonstrations
-from sb3_actpc.guidance import ActorGuidance, BehaviorGuidance, GuidanceConfig, GuidanceContext
+from sb3_actpc.guidance import ActorGuidance, GuidanceContext
 from sb3_actpc.guidance.base import ImitationBatch
+from sb3_actpc.guidance.guidance import make_guidance
 from sb3_actpc.utils.checks import Settings, check_finite, named_in_errors
+from sb3_actpc.utils.noise import as_action_noise
 from sb3_actpc.utils.rollouts import StoresLastTransition
 from sb3_actpc.utils.weights import load_weights, save_weights
 
 SelfBase = TypeVar("SelfBase", bound="ActPCBase")
 RESCORING_INTERVAL = 1000  # updates between two evaluations of the demonstrations' signals
-NEED_DEMONSTRATIONS = ("demonstration_fraction", "n_demonstrations", "n_demonstration_transitions")
+NEED_DEMONSTRATIONS = ("demonstration_fraction", "n_demonstrations")
 _OF_POLICY = ("actor", "critic", "generator", "prior", "actor_target", "critic_target")
 _DERIVED = ("expert", "diagnostics", "epistemic", "instrumental", "actor_guidance", "_used_demonstrations", "_described")
 
@@ -61,18 +56,16 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
     guidance: ActorGuidance | str
     guidance_kwargs: Settings | None
     signal_kwargs: Settings | None
-    alpha_ext: float
-    alpha_ep: float
-    alpha_in: float
-    bootstrap: str
-    critic_weight: float
+    reward_weights: Settings
+    target_policy_noise: float | None
+    critic_weight: float | None
     refresh_weight: float
     policy_delay: int
     demonstration_fraction: float
     observation_normalization: str
-    prior_updates: int
     only_acts = False  # a bundled agent, whose critic is not trained
     expert: DemonstrationReplay | None = None  # the demonstrations, fitted to the environment
+    was_made_without_demonstrations: bool
     _used_demonstrations: tuple[Any, ...] = ()
     _described = ""  # what ``learn`` has said
     _rollout_state: tuple[np.ndarray, ...] | None = None  # the working memory of the running episodes
@@ -95,9 +88,15 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
         return self.actor.with_circuit(self.actor_guidance.candidate(self._context()))
 
     @property
-    def reward_weights(self) -> tuple[float, float, float]:
-        """(α_ext, α_ep, α_in) as used: without demonstrations there is no prior."""
-        return self.alpha_ext, self.alpha_ep, 0.0 if self.demonstrations is None else self.alpha_in
+    def used_weights(self) -> RewardWeights:
+        """The weights of the reward's parts; without demonstrations there is no prior."""
+        weights = RewardWeights(**(self.reward_weights or {}))
+        return weights if self.demonstrations is not None else weights._replace(instrumental=0.0)
+
+    @property
+    def has_critic_term(self) -> bool:
+        """Whether the critic has a part in the actor's update; its own updates have no use without."""
+        return self.critic_weight != 0
 
     # ------------------------------------------------------------------ parts
 
@@ -105,31 +104,59 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
         if self.action_space is None:
             raise ValueError("env=None: an environment or the id of one is needed, such as 'Pendulum-v1'")
         self._check_actions()
-        check_keywords_agree(self.alpha_ep, self.optimize_memory_usage, self.bootstrap, self.n_steps)
         self.actor_guidance = make_guidance(self.guidance, self.guidance_kwargs)
         self._setup_lr_schedule()
         self.set_random_seed(self.seed)
         self.policy = self._make_policy().to(self.device)
-        self.actor, self.actor_target = self.policy.actor, self.policy.actor_target
-        self.critic, self.critic_target = self.policy.critic, self.policy.critic_target
-        self.generator, self.prior = self.policy.generator, self.policy.prior
+        self.actor = self.policy.actor
+        self.actor_target = self.policy.actor_target
+        self.critic = self.policy.critic
+        self.critic_target = self.policy.critic_target
+        self.generator = self.policy.generator
+        self.prior = self.policy.prior
         self.diagnostics = Diagnostics(self.policy)
         # A loaded agent may be given other signals; of the same ones it keeps what their normalizers have seen
         with named_in_errors(f"signal_kwargs={self.signal_kwargs!r}"):
             signals = InternalSignals(**(self.signal_kwargs or {}))
         if signals.settings != self.signals.settings:
             self.signals = signals
+        self.signals.prior_updates = signals.prior_updates
         self.epistemic = signals.epistemic_class(self.policy.generator, self.diagnostics, signals.errors)
         self.instrumental = signals.instrumental_class(self.policy.prior, self.diagnostics, signals.errors)
         if self.replay_buffer is None:
             self.replay_buffer = self._make_replay_buffer()
         self._convert_train_freq()
 
-    def _make_policy(self) -> ActPCPolicy:
-        if "activation_fn" in self.policy_kwargs:
+    def _check_settings(self) -> None:
+        """:raises ValueError: for settings, which can change after the agent was made, that do not go together"""
+        check_reward_weights("reward_weights", self.reward_weights)
+        self.action_noise = as_action_noise(self.action_noise, self.action_space.shape)
+        epistemic = self.used_weights.epistemic
+        if epistemic and self.optimize_memory_usage:
             raise ValueError(
-                "policy_kwargs has activation_fn: name one, policy_kwargs=dict(circuit_kwargs=dict(activation=...))"
+                f"reward_weights['epistemic']={epistemic:g} does not work with optimize_memory_usage=True, which overwrites "
+                "the last observations of episodes: use optimize_memory_usage=False or a weight of 0"
             )
+        if self.target_policy_noise is None and self.n_steps > 1:
+            raise ValueError(
+                f"n_steps={self.n_steps} does not work with target_policy_noise=None, which values the action taken: use 1"
+            )
+        for name in self.policy.circuits():
+            own = self.policy.settings_of(name).get("learning_rate")
+            if own and not self.lr_schedule(1.0):
+                raise ValueError(
+                    f"{name}_kwargs has learning_rate={own}, a multiple of the agent's, which begins at 0: begin above"
+                )
+
+    def _check_needs_met(self) -> None:
+        """:raises ValueError: for keywords that say nothing without demonstrations"""
+        needing = [name for name in NEED_DEMONSTRATIONS if getattr(self, name)]
+        if self.observation_normalization == "demonstrations":
+            needing.append("observation_normalization")
+        if needing and self.demonstrations is None:
+            raise ValueError(f"{' and '.join(needing)}: give demonstrations=, or leave it out")
+
+    def _make_policy(self) -> ActPCPolicy:
         if "is_gated" in self.policy_kwargs:
             raise ValueError("policy_kwargs has is_gated, which guidance sets: use guidance_kwargs=dict(gate=...)")
         with named_in_errors(f"policy_kwargs={self.policy_kwargs!r}", ValueError, AssertionError):
@@ -137,8 +164,8 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
             if circuit_kwargs["settling"] != self.settling:
                 raise ValueError(f"circuit_kwargs has settling={circuit_kwargs['settling']!r}: give settling= to the agent")
             own = {"circuit_kwargs": circuit_kwargs, "is_gated": self.actor_guidance.has_gate}
-            observed, acted = self.observation_space, self.action_space
-            policy = self.policy_class(observed, acted, self.lr_schedule, **{**self.policy_kwargs, **own})
+            keywords = {**self.policy_kwargs, **own}
+            policy = self.policy_class(self.observation_space, self.action_space, self.lr_schedule, **keywords)
         assert isinstance(policy, ActPCPolicy)
         return policy
 
@@ -182,13 +209,12 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
 
         :raises ValueError: for demonstrations that do not fit
         """
-        self._used_demonstrations = self.demonstrations, self.n_demonstrations, self.n_demonstration_transitions
+        self._used_demonstrations = self.demonstrations, self.n_demonstrations
         self.expert = None
         if self.demonstrations is not None:
-            observed, acted = self.observation_space, self.action_space
-            self.expert = DemonstrationReplay(self._fitted_demonstrations(), observed, acted, self.policy.memory_history)
+            spaces_ = self.observation_space, self.action_space
+            self.expert = DemonstrationReplay(self._fitted_demonstrations(), *spaces_, self.policy.memory_history)
         # An actor that has imitated keeps the statistics of its demonstrations
-        normalizer, extractor = self.actor.normalizer, self.actor.features_extractor
         is_normalised = self._vec_normalize_env is not None and bool(self._vec_normalize_env.norm_obs)
         parts: Iterable[Any]
         if self.observation_normalization == "bounds":
@@ -197,65 +223,66 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
             parts = [] if is_normalised else self.expert.parts()
         else:
             return
+        extractor = self.actor.features_extractor
         seen = [self.actor.extract_features(to_device(part, self.device), extractor) for part in parts]
-        normalizer.fit(th.cat(seen) if seen else None)
+        self.actor.normalizer.fit(th.cat(seen) if seen else None)
 
     def _update_demonstrations(self) -> None:
         """Use demonstrations that were set since. A prior and a normalizer that have learned stay as they are."""
-        now = self.demonstrations, self.n_demonstrations, self.n_demonstration_transitions
-        used = self._used_demonstrations
-        if self.demonstrations is not None and self.guidance == "none" and used and used[0] is None:
+        if self.demonstrations is not None and self.guidance == "none" and self.was_made_without_demonstrations:
+            self.was_made_without_demonstrations = False  # said once
             warnings.warn(
                 "demonstrations were set after the agent was made without: guidance='none' "
                 f"(no BC pre-training), n_steps={self.n_steps} and demonstration_fraction={self.demonstration_fraction:g} "
                 "stay. For the defaults with demonstrations, pass demonstrations= to the constructor",
                 stacklevel=5,
             )
-        if self.expert is None or any(mine is not one for mine, one in zip(now, used, strict=True)):
+        now = self.demonstrations, self.n_demonstrations
+        if self.expert is None or any(mine is not one for mine, one in zip(now, self._used_demonstrations, strict=True)):
             self._setup_demonstrations()
         # one discount and one length of returns for what is replayed and what is demonstrated, of a loaded buffer too
         self.replay_buffer.set_returns(self.n_steps, self.gamma)
         memory = self.replay_buffer.self_imitation
         if memory is not None:
             memory.takes_all = self.actor_guidance.stores == "positive" and self.expert is not None
-        if self.demonstrations is None:
-            self.demonstration_fraction, self.n_demonstrations, self.n_demonstration_transitions = 0.0, None, None
-        if self.demonstrations is None and self.is_pretrained and self.refresh_weight:
+        if self.demonstrations is not None:
+            return
+        self.demonstration_fraction = 0.0
+        self.n_demonstrations = None
+        if self.is_pretrained and self.refresh_weight:
             warnings.warn(
                 "the agent was taught by demonstrations and goes on without them: pass demonstrations=", stacklevel=5
             )
-        if self.demonstrations is None and self.alpha_in:
-            warnings.warn(f"alpha_in={self.alpha_in:g} has no effect without demonstrations=", stacklevel=5)
+        unused = (self.reward_weights or {}).get("instrumental")
+        if unused:
+            warnings.warn(f"reward_weights['instrumental']={unused:g} has no effect without demonstrations=", stacklevel=5)
 
     def pretrain(self) -> None:
         """Train the prior on the demonstrations and let guidance start, once; ``learn`` calls this."""
         if self.expert is None and self.demonstrations is not None:  # of a loaded agent
             self._setup_demonstrations()
-        expert, env = self.expert, self._vec_normalize_env
+        expert = self.expert
+        env = self._vec_normalize_env
         if expert is not None:
             if not self.is_pretrained and env is not None and env.norm_obs:
                 warnings.warn("VecNormalize's statistics drift while the circuits learn: use norm_obs=False", stacklevel=3)
-                self._show_to_vec_normalize(expert)
+                if env.training:  # it has seen one observation else
+                    expert.show_to(env)
+                    if self._last_original_obs is not None:
+                        self._last_obs = env.normalize_obs(self._last_original_obs)
             # without a weight the prior has no role
-            n_updates = self.prior_updates - int(self.policy.n_prior_updates) if self.alpha_in else 0
+            n_updates = 0
+            if self.used_weights.instrumental:
+                n_updates = self.signals.prior_updates - int(self.policy.n_prior_updates)
             batch_size = self.policy.batch_sizes(self.batch_size)["prior"]
             self.policy.set_learning_rate(self.lr_schedule(1.0))
             for _ in range(n_updates):
-                batch = expert.sample(batch_size, self.actor, env, self.reward_weights, self.gamma)
-                self.instrumental.update(batch.features, batch.actions, batch.next_features, batch.memory)
+                self.instrumental.update(expert.batch(expert.draw(batch_size), self.actor, env, self.used_weights, self.gamma))
                 self.policy.n_prior_updates.add_(1)
         # BC is of demonstrations: an agent without does not imitate its own episodes first
         self.actor_guidance.on_training_start(self._context(), self.is_pretrained or expert is None)
         if expert is not None:
             self.policy.has_imitated.fill_(1.0)
-
-    def _show_to_vec_normalize(self, expert: DemonstrationReplay) -> None:
-        """VecNormalize's statistics take in the demonstrations: they have seen one observation else."""
-        normalize = self._vec_normalize_env
-        if normalize is not None and normalize.training:
-            expert.show_to(normalize)
-            if self._last_original_obs is not None:
-                self._last_obs = normalize.normalize_obs(self._last_original_obs)
 
     # ------------------------------------------------------------------ learn
 
@@ -286,8 +313,7 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
         tb_log_name: str = "run",
         progress_bar: bool = False,
     ) -> tuple[int, BaseCallback]:
-        check_keywords_agree(self.alpha_ep, self.optimize_memory_usage, self.bootstrap, self.n_steps)
-        check_own_learning_rates(self.policy, self.lr_schedule(1.0))
+        self._check_settings()
         # Running episodes are cut where SB3 resets the environments, or someone else has stepped in them since
         if self.is_disturbed:
             self._last_obs = None
@@ -325,9 +351,8 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
 
     def imitated_episodes(self) -> list[Episodes]:
         """What refresh draws from: the demonstrations and the self-imitation memory M^actor."""
-        memory, parts = self.replay_buffer.self_imitation, []
-        if self.expert is not None:
-            parts.append(self.expert.episodes)
+        parts = [] if self.expert is None else [self.expert.episodes]
+        memory = self.replay_buffer.self_imitation
         if memory is not None and memory.episodes is not None:
             parts.append(memory.episodes)
         return parts
@@ -347,7 +372,7 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
         (n_envs,) each."""
         newest = self.replay_buffer.sample(self.n_envs, self._vec_normalize_env, None, n_newest=self.n_envs)
         raw = self.raw_signals(Batch.of(newest, newest.rewards, self.actor))
-        epistemic, instrumental = self.signals.score(*raw, *self.reward_weights[1:])
+        epistemic, instrumental = self.signals.score(*raw, self.used_weights)
         check_finite("generator", "signals", epistemic, self.num_timesteps)
         check_finite("prior", "signals", instrumental, self.num_timesteps)
         self.diagnostics.follow(epistemic_signal=epistemic.mean(), instrumental_signal=instrumental.mean())
@@ -355,22 +380,23 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
 
     def raw_signals(self, batch: Batch) -> tuple[np.ndarray, np.ndarray]:
         """r̂^ep and r̂^in of transitions, (B,) each; zeros where the signal has no weight."""
-        _, alpha_ep, alpha_in = self.reward_weights
-        scored = batch.features, batch.actions, batch.next_features, batch.memory
+        weights = self.used_weights
         epistemic, instrumental = np.zeros((2, len(batch.features)), dtype=np.float32)
-        if alpha_ep:
-            epistemic = self.epistemic.score(*scored).cpu().numpy()
-        if alpha_in:
-            instrumental = self.instrumental.score(*scored).cpu().numpy()
+        if weights.epistemic:
+            epistemic = self.epistemic.score(batch).cpu().numpy()
+        if weights.instrumental:
+            instrumental = self.instrumental.score(batch).cpu().numpy()
         return epistemic, instrumental
 
     def sample_batches(self, n_batches: int, batch_size: int) -> Iterator[Batch]:
         """Minibatches of replayed transitions, the newest in each, then the share that comes from the demonstrations."""
         if n_batches < 1:
             return iter(())
-        expert, actor, env = self.expert, self.actor, self._vec_normalize_env
-        weights = self.reward_weights
-        normalizers = self.signals.replayed if any(weights[1:]) else None
+        expert = self.expert
+        actor = self.actor
+        env = self._vec_normalize_env
+        weights = self.used_weights
+        normalizers = self.signals.replayed if weights.has_signals else None
         # Now and then the signals of demonstrated transitions are computed anew, by the present generator
         if expert is not None and self.demonstration_fraction and normalizers is not None:
             if self._n_updates % RESCORING_INTERVAL == 1 or not expert.has_signals:
@@ -383,16 +409,17 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
         n_newest = self.replay_buffer.n_newest(largest - n_demonstrated)
         n_drawn = n_newest + n_batches * (largest - n_demonstrated - n_newest)
         samples = self.replay_buffer.sample(n_drawn, env, normalizers, n_newest)
-        if not weights[1]:  # nobody predicts one step
+        if not weights.epistemic:  # nobody predicts one step
             samples = samples._replace(following_observations=None)
-        signals = weights[1] * samples.epistemic + weights[2] * samples.instrumental
-        replayed = Batch.of(samples, weights[0] * samples.rewards + signals, actor)
-        self.diagnostics.rewards(self._n_updates, n_batches, self.policy_delay, replayed.rewards, samples.rewards, weights[0])
+        signals = weights.epistemic * samples.epistemic + weights.instrumental * samples.instrumental
+        replayed = Batch.of(samples, weights.task * samples.rewards + signals, actor)
+        internal = replayed.rewards - weights.task * samples.rewards
+        self.diagnostics.rewards(self._n_updates, n_batches, self.policy_delay, internal, samples.rewards)
         # Demonstrated transitions likewise
         demonstrated = None
         if expert is not None and n_demonstrated:
-            how = actor, env, weights, self.gamma, self.n_steps, normalizers
-            demonstrated = expert.sample(n_demonstrated * n_batches, *how)
+            rows = expert.draw(n_demonstrated * n_batches)
+            demonstrated = expert.batch(rows, actor, env, weights, self.gamma, self.n_steps, normalizers)
         # circuits with a smaller batch take its first rows: the newest, then a fair mixture of the rest
         is_shuffled = min(sizes.values()) < largest
         return minibatches(replayed, demonstrated, n_batches, n_newest, is_shuffled)
@@ -400,7 +427,7 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
     # ------------------------------------------------------------------ what is said and logged
 
     def _log_training(self) -> None:
-        values = {**self.diagnostics.summary(), **self.actor_guidance.logs()}
+        values = {**self.diagnostics.values, **self.actor_guidance.logs()}
         memory = self.replay_buffer.self_imitation
         if memory is not None:
             values |= {"self_imitation_size": len(memory), "self_imitation_best_return": memory.best_return}
@@ -409,24 +436,14 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
             self.logger.record(f"train/{key}", value)
 
     def describe(self) -> str:
-        """What the reward is made of, from which demonstrations, and what is off; ``learn`` prints it with ``verbose=1``, and
-        again when it has changed."""
-        ext, ep, inst = self.reward_weights
-        parts = {
-            "the task's reward": ext,
-            "generator": ep,
-            "prior": inst,
-            "critic term": self.critic_weight,
-            "refresh": self.refresh_weight,
-            "self-imitation": self.replay_buffer.self_imitation is not None,
-            "demonstrations in the critic's batch": self.demonstration_fraction,
-            "working memory": self.policy.memory_history,
-        }
-        off = ", ".join(name for name, value in parts.items() if not value) or "nothing"
+        """What the reward is made of, and from which demonstrations; ``learn`` prints it with ``verbose=1``, and again when it
+        has changed."""
+        weights = self.used_weights
         demonstrations = "none" if self.expert is None else repr(self.expert.demonstrations)
         return (
-            f"reward: {ext:g} x task (alpha_ext) + {ep:g} x epistemic (alpha_ep) + {inst:g} x instrumental signal (alpha_in)\n"
-            f"demonstrations: {demonstrations}\n{self.actor_guidance.describe()}\noff: {off}"
+            f"reward: {weights.task:g} x task + {weights.epistemic:g} x epistemic + {weights.instrumental:g} x instrumental "
+            "signal (reward_weights)\n"
+            f"demonstrations: {demonstrations}\n{self.actor_guidance.describe()}"
         )
 
     # ------------------------------------------------------------------ files
@@ -471,7 +488,8 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
             )
         if self.expert is not None:
             self.expert.epistemic, self.expert.instrumental, self.expert.has_signals = stored
-        self._rollout_state, self._rollout_starts = state["rollout_state"], state["rollout_starts"]
+        self._rollout_state = state["rollout_state"]
+        self._rollout_starts = state["rollout_starts"]
         self.signals.restore_checkpoint_state(state["signals"])
         self.diagnostics.values = dict(state["diagnostics"])
         self.actor_guidance.load_state_dict(state["guidance"])
@@ -509,7 +527,8 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
         """
         given = self.replay_buffer
         super().load_replay_buffer(path, truncate_last_traj)
-        loaded, self.replay_buffer = self.replay_buffer, given
+        loaded = self.replay_buffer
+        self.replay_buffer = given
         check_loaded_buffer(path, loaded, isinstance(loaded, SignalReplay), self)
         loaded.history = self.policy.memory_history
         self.replay_buffer = loaded
@@ -543,19 +562,3 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
         names = [name if name != "actor" else "actor.circuit" for name in self.policy.circuits()]
         learned = [name for name in ("epistemic", "instrumental") if isinstance(getattr(self, name), th.nn.Module)]
         return ["policy", *(f"policy.{name}.optimizer" for name in names), *learned], []
-
-
-def make_guidance(given: ActorGuidance | str, settings: Settings | None) -> ActorGuidance:
-    """:raises ValueError: for another name, or keywords that the guidance has not"""
-    if given not in ("default", "none") and not isinstance(given, ActorGuidance):
-        raise ValueError(f"guidance={given!r} must be None, 'default', 'none' or an ActorGuidance")
-    known = [one.name for one in fields(GuidanceConfig)]
-    unknown = sorted({*(settings or {})} - {*known})
-    if unknown:
-        raise ValueError(f"guidance_kwargs={settings!r} has unknown keys {unknown}: choose from {known}")
-    config = GuidanceConfig(**(settings or {}))
-    if settings and given != "default":
-        warnings.warn(f"guidance_kwargs={settings!r} have no effect without guidance='default'", stacklevel=4)
-    if isinstance(given, ActorGuidance):
-        return given
-    return BehaviorGuidance(config) if given == "default" else ActorGuidance()

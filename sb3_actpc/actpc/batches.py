@@ -6,10 +6,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch as th
 from stable_baselines3.common.vec_env import VecNormalize
-from torch.utils._pytree import tree_flatten, tree_unflatten
+from torch.utils._pytree import tree_map
 
 from sb3_actpc.actpc.policies import ActPCActor
-from sb3_actpc.utils.nested import map_observations
 
 Observations = np.ndarray | dict[str, np.ndarray]
 TensorObservations = th.Tensor | dict[str, th.Tensor]
@@ -93,7 +92,8 @@ class Batch(NamedTuple):
             next_past = actor.past_features(samples.next_history, samples.next_history_mask)
             if next_past is None:  # one step on, the present observation is the newest of the past
                 next_past = th.cat([past[:, 1:], features[:, None]], dim=1)
-            memory, next_memory = actor.memory(past), actor.memory(next_past)
+            memory = actor.memory(past)
+            next_memory = actor.memory(next_past)
         observed = features, samples.actions, next_features, bootstrap_features
         return cls(*observed, memory, next_memory, rewards, samples.dones, samples.discounts)
 
@@ -118,15 +118,15 @@ def minibatches(
     :param n_newest: rows that all minibatches share
     :param is_shuffled: whether all but the newest rows come in random order
     """
-    n_replayed, n_demonstrated = len(replayed.features) - n_newest, 0
     everything = replayed
+    n_demonstrated = 0
     if demonstrated is not None:
         n_demonstrated = len(demonstrated.features)
         pairs: Any = zip(replayed, demonstrated, strict=True)
         columns: Any = [None if mine is None else th.cat([mine, theirs]) for mine, theirs in pairs]
         everything = Batch(*columns)
-    rows = th.arange(n_newest + n_replayed + n_demonstrated, device=replayed.features.device)
-    newest, own, shown = rows.split([n_newest, n_replayed, n_demonstrated])
+    rows = th.arange(len(everything.features), device=replayed.features.device)
+    newest, own, shown = rows.split([n_newest, len(replayed.features) - n_newest, n_demonstrated])
     for index in range(n_batches):
         parts = (part[index * len(part) // n_batches : (index + 1) * len(part) // n_batches] for part in (own, shown))
         order = th.cat([newest, *parts])
@@ -136,23 +136,6 @@ def minibatches(
         yield everything.rows(order)
 
 
-def last_observations(
-    observations: Observations, dones: np.ndarray, infos: list[dict[str, Any]], env: VecNormalize | None
-) -> Observations:
-    """What each step led to: ``observations``, where an episode ended its last one instead of the next episode's first."""
-    last: Any = map_observations(np.array, observations)
-    for index in np.flatnonzero(dones):
-        terminal = infos[index].get("terminal_observation")
-        if terminal is not None and env is not None:
-            terminal = env.unnormalize_obs(terminal)
-        if isinstance(terminal, dict):
-            for key in last:
-                last[key][index] = terminal[key]
-        elif terminal is not None:
-            last[index] = terminal
-    return last
-
-
 def normalized(observations: Observations | None, env: VecNormalize | None) -> Any:
     """Observations, (..., *obs_shape) or a dict of such, as VecNormalize normalises them, if there is one; None stays None."""
     return observations if observations is None or env is None else env.normalize_obs(observations)
@@ -160,22 +143,10 @@ def normalized(observations: Observations | None, env: VecNormalize | None) -> A
 
 def to_device(arrays: Any, device: th.device) -> Any:
     """
-    Arrays as tensors; to a GPU in one copy for each kind of number, as a small copy takes as long as a large one.
+    Arrays as tensors.
 
     :param arrays: arrays and Nones in (named) tuples and dicts
     :param device: where the tensors are; on the CPU they share the arrays' memory
     :return: the same, of tensors
     """
-    leaves, structure = tree_flatten(arrays)
-    places = [place for place, leaf in enumerate(leaves) if leaf is not None]
-    if device.type == "cpu":
-        for place in places:
-            leaves[place] = th.as_tensor(leaves[place])
-        return tree_unflatten(leaves, structure)
-    for kind in {leaves[place].dtype for place in places}:
-        alike = [place for place in places if leaves[place].dtype == kind]
-        together = th.as_tensor(np.concatenate([leaves[place].ravel() for place in alike]), device=device)
-        pieces = together.split([leaves[place].size for place in alike])
-        for place, piece in zip(alike, pieces, strict=True):
-            leaves[place] = piece.view(leaves[place].shape)
-    return tree_unflatten(leaves, structure)
+    return tree_map(lambda array: None if array is None else th.as_tensor(array, device=device), arrays)

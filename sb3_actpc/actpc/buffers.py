@@ -51,7 +51,8 @@ class SignalReplay(ReplayBuffer):
         **kwargs: Any,
     ) -> None:
         super().__init__(*args, **kwargs)
-        self.combined, self.history = combined, history
+        self.combined = combined
+        self.history = history
         self.set_returns(n_steps, gamma)
         self.epistemic = np.zeros((self.buffer_size, self.n_envs), dtype=np.float32)
         self.instrumental = np.zeros((self.buffer_size, self.n_envs), dtype=np.float32)
@@ -117,7 +118,8 @@ class SignalReplay(ReplayBuffer):
             raise ValueError(
                 f"n_steps={n_steps} does not work with hindsight relabelling or optimize_memory_usage=True: use 1"
             )
-        self.n_steps, self.gamma = n_steps, gamma
+        self.n_steps = n_steps
+        self.gamma = gamma
 
     def forget_own_episodes(self) -> None:
         """Those of the self-imitation memory: in another environment their returns would differ."""
@@ -160,10 +162,12 @@ class SignalReplay(ReplayBuffer):
         newest = np.arange(self.n_newest(batch_size) if n_newest is None else n_newest)
         if 0 < len(newest) < self.n_envs:
             newest = np.random.permutation(self.n_envs)[: len(newest)]
-        rows, envs = np.full(len(newest), self.newest), newest
+        rows = np.full(len(newest), self.newest)
+        envs = newest
         if len(newest) < batch_size:
-            drawn = self._draw(batch_size - len(newest))
-            rows, envs = np.concatenate([rows, drawn[0]]), np.concatenate([envs, drawn[1]])
+            drawn_rows, drawn_envs = self._draw(batch_size - len(newest))
+            rows = np.concatenate([rows, drawn_rows])
+            envs = np.concatenate([envs, drawn_envs])
         return self._relabel(self.gather(rows, envs, env, rewards_of), rows, envs, len(newest), env)
 
     def _relabel(

@@ -10,7 +10,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_actpc.actpc.batches import Batch, Observations, SignalReplaySamples, normalized, to_device
 from sb3_actpc.actpc.policies import ActPCActor
-from sb3_actpc.actpc.reward_signals import STORED, Normalize
+from sb3_actpc.actpc.reward_signals import STORED, Normalize, RewardWeights
 from sb3_actpc.actpc.self_imitation import Episodes
 from sb3_actpc.demonstrations import Demonstrations, scaled_actions
 from sb3_actpc.demonstrations.rows import split_observations
@@ -31,7 +31,8 @@ class DemonstrationReplay:
     def __init__(
         self, demonstrations: Demonstrations, observation_space: spaces.Space, action_space: spaces.Box, history: int
     ) -> None:
-        self.demonstrations, self.history = demonstrations, history
+        self.demonstrations = demonstrations
+        self.history = history
         bounds = demonstrations.episode_bounds
         lengths = bounds[:, 1] - bounds[:, 0]
         self.ends = np.repeat(bounds[:, 1], lengths)
@@ -42,23 +43,24 @@ class DemonstrationReplay:
             returns=np.repeat(demonstrations.episode_returns, lengths),
         )
         self.next_observations = split_observations(observation_space, demonstrations.next_observations)
-        self.epistemic, self.instrumental = np.zeros((2, len(demonstrations)), dtype=np.float32)
+        self.epistemic = np.zeros(len(demonstrations), dtype=np.float32)
+        self.instrumental = np.zeros(len(demonstrations), dtype=np.float32)
         self.has_signals = False
         self.has_scale = False  # whether rewards have been compared
 
     def __len__(self) -> int:
         return len(self.demonstrations)
 
-    def sample(self, n: int, *how: Any) -> Batch:
-        """``n`` transitions drawn uniformly; see :meth:`batch`."""
-        return self.batch(np.random.randint(0, len(self), size=n), *how)
+    def draw(self, n: int) -> np.ndarray:
+        """``n`` rows, uniformly."""
+        return np.random.randint(0, len(self), size=n)
 
     def batch(
         self,
         rows: np.ndarray,
         actor: ActPCActor,
         env: VecNormalize | None,
-        weights: tuple[float, float, float],
+        weights: RewardWeights,
         gamma: float,
         n_steps: int = 1,
         signals: tuple[Normalize, Normalize] | None = None,
@@ -66,7 +68,7 @@ class DemonstrationReplay:
         """:param rows: (B,) which transitions
         :param actor: turns observations into features
         :param env: VecNormalize whose statistics normalise observations and the task's rewards
-        :param weights: (α_ext, α_ep, α_in)
+        :param weights: of the parts of the reward
         :param gamma: discount
         :param n_steps: length of the returns, which end with the episode
         :param signals: what the stored signals pay, epistemic and instrumental; None for themselves
@@ -82,8 +84,8 @@ class DemonstrationReplay:
         if env is not None:
             task = env.normalize_reward(task)
         epistemic, instrumental = signals or STORED
-        rewards = weights[0] * task + weights[1] * epistemic(self.epistemic[window])
-        rewards = rewards + weights[2] * instrumental(self.instrumental[window])
+        rewards = weights.task * task + weights.epistemic * epistemic(self.epistemic[window])
+        rewards = rewards + weights.instrumental * instrumental(self.instrumental[window])
         rewards = (rewards * counts * gamma ** np.arange(n_steps)).sum(1)
 
         def column(values: np.ndarray) -> np.ndarray:
@@ -101,7 +103,7 @@ class DemonstrationReplay:
             instrumental=None,
             history=normalized(samples.history, env),
             history_mask=samples.history_mask,
-            following_observations=normalized(self._next(rows), env) if n_steps > 1 and weights[1] else None,
+            following_observations=normalized(self._next(rows), env) if n_steps > 1 and weights.epistemic else None,
             next_history=normalized(next_history, env),
             next_history_mask=next_mask,
         )
@@ -166,6 +168,6 @@ class DemonstrationReplay:
         """
         for start in range(0, len(self), PART):
             rows = np.arange(start, min(start + PART, len(self)))
-            epistemic, instrumental = score(self.batch(rows, actor, env, (0.0, 0.0, 0.0), 0.0))
+            epistemic, instrumental = score(self.batch(rows, actor, env, RewardWeights(0.0, 0.0, 0.0), 0.0))
             self.epistemic[rows], self.instrumental[rows] = store[0](epistemic), store[1](instrumental)
         self.has_signals = True

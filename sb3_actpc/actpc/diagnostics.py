@@ -19,7 +19,7 @@ class Diagnostics:
     def __init__(self, policy: ActPCPolicy) -> None:
         self.circuits = policy.circuits()
         self.active = False
-        self.values: dict[str, float] = {}
+        self.values: dict[str, float] = {}  # everything measured last
 
     def is_due(self, n_updates: int, delay: int = 1) -> bool:
         """Whether the update with this number, from 1 on, is measured."""
@@ -51,22 +51,19 @@ class Diagnostics:
             elif self.active:
                 self.values[key] = float(value())
 
-    def rewards(
-        self, n_updates: int, n_batches: int, delay: int, combined: th.Tensor, task: th.Tensor, alpha_ext: float
-    ) -> None:
+    def rewards(self, n_updates: int, n_batches: int, delay: int, internal: th.Tensor, task: th.Tensor) -> None:
         """
         Means of the internal and of the task's reward, where one of the next ``n_batches`` updates is measured.
 
         :param n_updates: updates so far
         :param n_batches: updates that the rewards are for
         :param delay: updates for each of the actor
-        :param combined: (B, 1), the rewards that the critic learns from
-        :param task: (B, 1), the task's
-        :param alpha_ext: weight of the task's
+        :param internal: (B, 1), what the critic learns from beside the task's reward
+        :param task: (B, 1), the task's reward
         """
         numbers = range(n_updates + 1, n_updates + 1 + n_batches)
         if len(task) and any(self.is_due(number, delay) for number in numbers):
-            self.follow(internal_reward=float((combined - alpha_ext * task).mean()), task_reward=float(task.mean()))
+            self.follow(internal_reward=float(internal.mean()), task_reward=float(task.mean()))
 
     def settled(self, name: str, state: SettledState) -> None:
         """Energy (batch mean) and settling residual of a circuit."""
@@ -95,7 +92,3 @@ class Diagnostics:
         if self.active:
             for layer, change in enumerate(changes.weights):
                 self.values[f"actor_{name}_norm_{layer}"] = float(change.norm())
-
-    def summary(self) -> dict[str, float]:
-        """Everything measured last."""
-        return self.values

@@ -18,8 +18,8 @@ from sb3_actpc.utils.arguments import (
     CIRCUITS,
     MAX_CRITICS,
     Between,
+    SubclassOf,
     check_circuit,
-    check_extractor,
     check_net_arch,
     check_nudge,
     check_optimizer,
@@ -36,17 +36,16 @@ OBSERVATION_CLIP = 10.0
 # standard deviations at least, of a feature that has changed: of its largest size, and at all; a smaller one may be rounding
 SMALLEST_CHANGE, SMALLEST_DEVIATION = 1e-4, 1e-7
 PRIOR_NET_ARCH = (512, 256)  # paper: prior of all MuJoCo tasks
-NOT_OF_CIRCUITS = ("net_arch", "learning_rate", "batch_size")  # of a circuit's own settings
+NOT_OF_CIRCUITS = ("learning_rate", "batch_size")  # of a circuit's own settings
 
 
 def check_circuit_class(name: str, given: Any) -> None:
     """:raises ValueError: for anything but a subclass of NGCCircuit, or such for circuits by their names"""
-    parts = given if isinstance(given, dict) else dict.fromkeys(CIRCUITS, given)
-    for circuit, kind in parts.items():
-        if circuit not in CIRCUITS or not isinstance(kind, type) or not issubclass(kind, NGCCircuit):
-            raise ValueError(
-                f"{name}={given!r} must be a subclass of {NGCCircuit.__name__}, or a dict of such for some of {list(CIRCUITS)}"
-            )
+    parts = given if isinstance(given, dict) else {"actor": given}
+    if not {*parts} <= {*CIRCUITS}:
+        raise ValueError(f"{name}={given!r} must be a class, or a dict of classes for some of {list(CIRCUITS)}")
+    for kind in parts.values():
+        SubclassOf(NGCCircuit)(name, kind)
 
 
 class ObservationNormalizer(nn.Module):
@@ -182,7 +181,8 @@ class ActPCActor(BasePolicy):
         :raises ValueError: for a state of another number of environments
         """
         with th.no_grad():
-            features, memory = self.features(observations), None
+            features = self.features(observations)
+            memory = None
             if self.memory is not None:
                 shape = len(features), self.memory.history, features.shape[1]
                 history = np.zeros(shape, dtype=np.float32) if state is None else state[0].copy()
@@ -237,7 +237,7 @@ class ActPCPolicy(BasePolicy):
     :param circuit_class: a subclass of :class:`~sb3_actpc.ngc.NGCCircuit` for all circuits, or a dict with classes for some
         of ``actor``, ``critic``, ``generator`` and ``prior``
     :param circuit_kwargs: keywords of every circuit
-    :param actor_kwargs: the same for the actor alone, and ``net_arch``, ``learning_rate``, ``batch_size``
+    :param actor_kwargs: the same for the actor alone, and ``learning_rate``, ``batch_size``
     :param critic_kwargs: the same for the critic
     :param generator_kwargs: the same for the generator
     :param prior_kwargs: the same for the prior
@@ -276,7 +276,7 @@ class ActPCPolicy(BasePolicy):
         memory_history: Annotated[int, Between(0, LARGEST_SIZE)] = 0,
         is_gated: bool = False,
         nudge: Annotated[float | None, check_nudge] = None,
-        features_extractor_class: Annotated[type[BaseFeaturesExtractor], check_extractor] = FlattenExtractor,
+        features_extractor_class: Annotated[type[BaseFeaturesExtractor], SubclassOf(BaseFeaturesExtractor)] = FlattenExtractor,
         features_extractor_kwargs: Settings | None = None,
         normalize_images: bool = True,
         optimizer_class: Annotated[type[th.optim.Optimizer], check_optimizer] = th.optim.Adam,
@@ -298,18 +298,26 @@ class ActPCPolicy(BasePolicy):
             normalize_images=normalize_images,
             squash_output=True,
         )
-        self.net_arch, self.n_critics, self.memory_history, self.nudge = net_arch, n_critics, memory_history, nudge
-        self.circuit_class, self.circuit_kwargs = circuit_class, dict(circuit_kwargs or {})
-        self.actor_kwargs, self.critic_kwargs = actor_kwargs, critic_kwargs
-        self.generator_kwargs, self.prior_kwargs = generator_kwargs, prior_kwargs
-        self.is_gated, self.lr_schedule = is_gated, lr_schedule
+        self.net_arch = net_arch
+        self.n_critics = n_critics
+        self.memory_history = memory_history
+        self.nudge = nudge
+        self.circuit_class = circuit_class
+        self.circuit_kwargs = dict(circuit_kwargs or {})
+        self.actor_kwargs = actor_kwargs
+        self.critic_kwargs = critic_kwargs
+        self.generator_kwargs = generator_kwargs
+        self.prior_kwargs = prior_kwargs
+        self.is_gated = is_gated
+        self.lr_schedule = lr_schedule
         self._build()
 
     def _build(self) -> None:
         with named_in_errors(f"features_extractor_kwargs={self.features_extractor_kwargs!r}", AssertionError):
             extractor = self.make_features_extractor()
         extractor.requires_grad_(False)
-        n_features, n_actions = extractor.features_dim, int(np.prod(self.action_space.shape))
+        n_features = extractor.features_dim
+        n_actions = int(np.prod(self.action_space.shape))
         memory = WorkingMemory(n_features, self.memory_history) if self.memory_history else None
         n_memory = memory.size if memory else 0
         circuit = self._make_circuit("actor", n_features, n_actions, output_activation="tanh", n_memory=n_memory)
@@ -349,14 +357,12 @@ class ActPCPolicy(BasePolicy):
     def _make_circuit(self, name: str, n_inputs: int, n_outputs: int, **extra: Any) -> NGCCircuit:
         own = self.settings_of(name)
         kind = self.circuit_class.get(name, NGCCircuit) if isinstance(self.circuit_class, dict) else self.circuit_class
-        # Hidden sizes: the circuit's own, those of its key, or those of all
-        arch: Any = self.net_arch
-        if isinstance(arch, dict):
-            arch = arch.get({"actor": "pi", "critic": "qf"}.get(name, name))
-        if own.get("net_arch") is not None:
-            arch = own["net_arch"]
-        if arch is None:
-            arch = PRIOR_NET_ARCH if name == "prior" else [256, 256]
+        # Hidden sizes: those of all circuits, or of the circuit's key
+        hidden: Any = self.net_arch
+        if isinstance(hidden, dict):
+            hidden = hidden.get({"actor": "pi", "critic": "qf"}.get(name, name))
+        if hidden is None:
+            hidden = PRIOR_NET_ARCH if name == "prior" else (256, 256)
         # Keywords: ActPC's defaults, those of every circuit, the circuit's own
         default: dict[str, Any] = {"feedback": "learned", "feedback_start": "mirrored", "weight_decay": 0.1}
         is_normalized = name == "critic" and self.circuit_kwargs.get("settling") == "scheduled"
@@ -368,10 +374,11 @@ class ActPCPolicy(BasePolicy):
         known = sorted({*CIRCUIT_KEYWORDS, *constructor_keywords(kind)} - _SIZES)
         if unknown := sorted(set(kwargs) - set(known)):
             raise ValueError(f"circuit_kwargs, {name}_kwargs: a circuit has no keywords {unknown}; choose from {known}")
-        return kind(n_inputs, n_outputs, list(arch), **kwargs, **extra)
+        return kind(n_inputs, n_outputs, list(hidden), **kwargs, **extra)
 
     def _make_optimizer(self, name: str, circuit: NGCCircuit) -> th.optim.Optimizer:
-        start, own = self.lr_schedule(1.0), self.settings_of(name).get("learning_rate")
+        start = self.lr_schedule(1.0)
+        own = self.settings_of(name).get("learning_rate")
         scale = 1.0
         if own is not None:
             scale = own / start if start else 0.0  # a loaded policy has no schedule, and does not learn
@@ -451,6 +458,7 @@ POLICIES: dict[str, type[BasePolicy]] = {
 
 def check_policy(name: str, policy: Any) -> None:
     """:raises ValueError: when it is neither the name of a policy nor a subclass of :class:`ActPCPolicy`"""
-    is_name = isinstance(policy, str) and policy in POLICIES
-    if not is_name and not (isinstance(policy, type) and issubclass(policy, ActPCPolicy)):
+    if isinstance(policy, str) and policy not in POLICIES:
         raise ValueError(f"{name}={policy!r} must be one of {list(POLICIES)}, or a subclass of {ActPCPolicy.__name__}")
+    if not isinstance(policy, str):
+        SubclassOf(ActPCPolicy)(name, policy)

@@ -1,18 +1,43 @@
 """The internal reward: epistemic and instrumental signals from the errors of settled circuits, and their normalisers."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
-from typing import Annotated, Any, Literal
+from collections.abc import Callable, Mapping
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 import torch as th
 
+from sb3_actpc.actpc.batches import Batch
 from sb3_actpc.actpc.diagnostics import Diagnostics
 from sb3_actpc.ngc import NGCCircuit, SettledState
-from sb3_actpc.utils.arguments import checked
+from sb3_actpc.utils.arguments import Between, Count, SubclassOf, checked
+from sb3_actpc.utils.checks import check_kind
 
 Normalize = Callable[[np.ndarray], np.ndarray]  # element by element, in any shape
 STORED: tuple[Normalize, Normalize] = (np.asarray, np.asarray)  # both signals pay what was stored
+
+
+class RewardWeights(NamedTuple):
+    """Weights of the parts of the reward: α_ep and α_in of the signals (paper, Algorithm 1, line 14), α_ext of the task's."""
+
+    task: float = 1.0
+    epistemic: float = 0.0
+    instrumental: float = 0.0
+
+    @property
+    def has_signals(self) -> bool:
+        """Whether a signal has a part in the reward."""
+        return bool(self.epistemic or self.instrumental)
+
+
+def check_reward_weights(name: str, weights: Mapping[str, Any] | None) -> None:
+    """:raises ValueError: for another key than those of :class:`RewardWeights`, no number, or a negative weight of a signal"""
+    for key, value in (weights or {}).items():
+        if key not in RewardWeights._fields:
+            raise ValueError(f"{name} has an unknown key {key!r}: choose from {list(RewardWeights._fields)}")
+        check_kind(f"{name}[{key!r}]", value, float)
+        if key != "task":
+            Between(0)(f"{name}[{key!r}]", value)
 
 
 def summed_squared_errors(state: SettledState, which: str = "all") -> th.Tensor:
@@ -39,20 +64,17 @@ class RewardSignal(ABC):
         self.errors = errors
 
     @abstractmethod
-    def score(self, features: th.Tensor, actions: th.Tensor, next_features: th.Tensor, memory: th.Tensor | None) -> th.Tensor:
+    def score(self, batch: Batch) -> th.Tensor:
         """
         r̂ of transitions, before it is normalized.
 
-        :param features: (B, n_features)
-        :param actions: (B, A), in [-1, 1]
-        :param next_features: (B, n_features)
-        :param memory: m_t, (B, n_memory), or None
+        :param batch: B transitions
         :return: (B,), not negative
         """
 
     @abstractmethod
-    def update(self, features: th.Tensor, actions: th.Tensor, next_features: th.Tensor, memory: th.Tensor | None) -> None:
-        """One update on a batch of transitions; shapes as for :meth:`score`."""
+    def update(self, batch: Batch) -> None:
+        """One update on a batch of transitions."""
 
 
 class CircuitSignal(RewardSignal):
@@ -66,31 +88,33 @@ class CircuitSignal(RewardSignal):
 class GeneratorSurprise(CircuitSignal):
     """The epistemic signal: how badly the generator predicts the next observation (Algorithm 1, lines 10, 12 and 24)."""
 
-    def score(self, features: th.Tensor, actions: th.Tensor, next_features: th.Tensor, memory: th.Tensor | None) -> th.Tensor:
+    def score(self, batch: Batch) -> th.Tensor:
         """The summed squared errors of the settled generator."""
-        inputs = th.cat([features, actions], dim=1)
-        return summed_squared_errors(self.circuit.settle(inputs, next_features, memory), self.errors)
+        return summed_squared_errors(self._settle(batch), self.errors)
 
-    def update(self, features: th.Tensor, actions: th.Tensor, next_features: th.Tensor, memory: th.Tensor | None) -> None:
+    def update(self, batch: Batch) -> None:
         """The generator settles on the next observation and changes: ΔW = e φ(z)ᵀ."""
-        inputs = th.cat([features, actions], dim=1)
-        state = self.circuit.settle(inputs, next_features, memory)
+        state = self._settle(batch)
         self.diagnostics.settled("generator", state)
         self.circuit.apply_changes(self.circuit.hebbian_update(state))
+
+    def _settle(self, batch: Batch) -> SettledState:
+        inputs = th.cat([batch.features, batch.actions], dim=1)
+        return self.circuit.settle(inputs, batch.next_features, batch.memory)
 
 
 class PriorError(CircuitSignal):
     """The instrumental signal: how far a step is from the demonstrated ones (Algorithm 1, lines 10 and 13)."""
 
-    def score(self, features: th.Tensor, actions: th.Tensor, next_features: th.Tensor, memory: th.Tensor | None) -> th.Tensor:
+    def score(self, batch: Batch) -> th.Tensor:
         """The summed squared errors of the settled prior."""
-        state = self.circuit.settle(features, next_features, memory)
+        state = self.circuit.settle(batch.features, batch.next_features, batch.memory)
         self.diagnostics.settled("prior", state)
         return summed_squared_errors(state, self.errors)
 
-    def update(self, features: th.Tensor, actions: th.Tensor, next_features: th.Tensor, memory: th.Tensor | None) -> None:
+    def update(self, batch: Batch) -> None:
         """The prior settles on the demonstrated next observation and changes; only before learning, then it is frozen."""
-        state = self.circuit.settle(features, next_features, memory)
+        state = self.circuit.settle(batch.features, batch.next_features, batch.memory)
         self.circuit.apply_changes(self.circuit.hebbian_update(state))
 
 
@@ -121,16 +145,6 @@ class RunningMaximum:
         return np.minimum(raw / self.maximum, 1.0)
 
 
-class Saturating:
-    """r = r̂ / (r̂ + 1): no state, so the same transition keeps the same signal."""
-
-    def __call__(self, raw: np.ndarray) -> np.ndarray:
-        """In [0, 1), of values r̂ >= 0 of any shape."""
-        return raw / (raw + 1.0)
-
-    rescale = __call__
-
-
 class RunningQuantile:
     """r = min(1, r̂ / q), where q follows the 0.9 quantile of r̂ by stochastic approximation on the log scale.
 
@@ -138,7 +152,9 @@ class RunningQuantile:
     """
 
     def __init__(self, quantile: float = 0.9, step: float = 0.02) -> None:
-        self.quantile, self.step, self.estimate = quantile, step, 0.0
+        self.quantile = quantile
+        self.step = step
+        self.estimate = 0.0
 
     def __call__(self, raw: np.ndarray) -> np.ndarray:
         """(n_envs,) in [0, 1], of (n_envs,) new values r̂ >= 0, which the quantile follows."""
@@ -154,53 +170,50 @@ class RunningQuantile:
         return np.minimum(raw / max(self.estimate, 1e-12), 1.0)
 
 
-Normalizer = RunningMaximum | Saturating | RunningQuantile
-
-
-def check_signal(name: str, kind: Any) -> None:
-    """:raises ValueError: for anything but a subclass of :class:`RewardSignal`"""
-    if not isinstance(kind, type) or not issubclass(kind, RewardSignal):
-        raise ValueError(f"{name}={kind!r} must be a subclass of {RewardSignal.__name__}, which has score and update")
-
-
 class InternalSignals:
     """What both signals are made of, and what their normalisers have seen.
 
-    :param normalizer: "quantile" (:class:`RunningQuantile`), "saturating" (r / (r + 1)) or "max" (running maximum, the paper:
-        the first transitions set it, and signals soon are near zero)
+    :param normalizer: "quantile" (:class:`RunningQuantile`) or "max" (running maximum, the paper: the first transitions set
+        it, and signals soon are near zero)
     :param normalization: "sampled" (whenever a transition is replayed, by what the normalisers have seen until then) or
         "stored" (once, when it is seen, the paper)
     :param instrumental_form: see :func:`instrumental_reward`
     :param errors: the squared errors of "all" layers are summed (the paper) or of the "output" alone
     :param epistemic_class: what scores how new a transition is
     :param instrumental_class: what scores how far a transition is from the demonstrations
+    :param prior_updates: updates of the prior before learning starts, where the instrumental signal has a weight; then it is
+        frozen
     :raises ValueError: for another value
     """
 
     @checked
     def __init__(
         self,
-        normalizer: Literal["quantile", "saturating", "max"] = "quantile",
+        normalizer: Literal["quantile", "max"] = "quantile",
         normalization: Literal["sampled", "stored"] = "sampled",
         instrumental_form: Literal["penalty", "unit"] = "penalty",
         errors: Literal["all", "output"] = "all",
-        epistemic_class: Annotated[type[RewardSignal], check_signal] = GeneratorSurprise,
-        instrumental_class: Annotated[type[RewardSignal], check_signal] = PriorError,
+        epistemic_class: Annotated[type[RewardSignal], SubclassOf(RewardSignal)] = GeneratorSurprise,
+        instrumental_class: Annotated[type[RewardSignal], SubclassOf(RewardSignal)] = PriorError,
+        prior_updates: Count = 2000,
     ) -> None:
         self.settings = normalizer, normalization, instrumental_form, errors, epistemic_class, instrumental_class
-        kinds: dict[str, type[Normalizer]] = {"max": RunningMaximum, "saturating": Saturating, "quantile": RunningQuantile}
-        self.epistemic, self.instrumental = kinds[normalizer](), kinds[normalizer]()
-        self.normalization, self.instrumental_form, self.errors = normalization, instrumental_form, errors
-        self.epistemic_class, self.instrumental_class = epistemic_class, instrumental_class
+        kind: type[RunningMaximum | RunningQuantile] = RunningMaximum if normalizer == "max" else RunningQuantile
+        self.epistemic = kind()
+        self.instrumental = kind()
+        self.normalization = normalization
+        self.instrumental_form = instrumental_form
+        self.errors = errors
+        self.epistemic_class = epistemic_class
+        self.instrumental_class = instrumental_class
+        self.prior_updates = prior_updates
 
-    def score(
-        self, epistemic: np.ndarray, instrumental: np.ndarray, alpha_ep: float, alpha_in: float
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def score(self, epistemic: np.ndarray, instrumental: np.ndarray, weights: RewardWeights) -> tuple[np.ndarray, np.ndarray]:
         """What the summed squared errors r̂ of generator and prior pay, (n_envs,) each; the normalisers follow them, and a
         signal without weight stays as it is."""
-        if alpha_ep:
+        if weights.epistemic:
             epistemic = self.epistemic(epistemic)
-        if alpha_in:
+        if weights.instrumental:
             instrumental = instrumental_reward(self.instrumental(instrumental), self.instrumental_form)
         return epistemic, instrumental
 

@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass, fields
 from functools import cached_property
 from typing import Any, Literal, NamedTuple
 
@@ -111,7 +111,8 @@ class SelfImitationMemory:
 
     def takes(self, length: int, episode_return: float) -> bool:
         """Whether an episode of so many transitions, which has ended with this sparse return, is good and short enough."""
-        self._n_ended, self._best_ended = self._n_ended + 1, max(self._best_ended, episode_return)
+        self._n_ended += 1
+        self._best_ended = max(self._best_ended, episode_return)
         if self._n_ended == PATIENCE and self._best_ended < 0.0:
             warnings.warn(
                 f"all of the first {PATIENCE} episodes had a negative return, self-imitation takes positive ones: shift the "
@@ -134,10 +135,7 @@ class SelfImitationMemory:
 
     def checkpoint_state(self) -> dict[str, Any]:
         """The stored episodes and their returns, for a checkpoint."""
-        episodes = (
-            None if self.episodes is None else {field.name: getattr(self.episodes, field.name) for field in fields(Episodes)}
-        )
-        return {**vars(self), "episodes": episodes}
+        return {**vars(self), "episodes": None if self.episodes is None else asdict(self.episodes)}
 
     def restore_checkpoint_state(self, state: dict[str, Any]) -> None:
         """:param state: what :meth:`checkpoint_state` returned"""
@@ -165,7 +163,8 @@ def sample_union(parts: list[Episodes], n: int, history: int = 0, weighting: Wei
     else:
         ends = np.cumsum([len(part) for part in parts])
         drawn = np.sort(np.random.randint(0, ends[-1], size=n))
-    taken, start = [], 0.0
+    taken = []
+    start = 0.0
     for index, (part, end) in enumerate(zip(parts, ends, strict=True)):
         rows = drawn[(drawn >= start) & (drawn < end)] - start
         if by_return:

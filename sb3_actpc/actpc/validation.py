@@ -1,4 +1,4 @@
-"""Checks of settings that must agree, and of what environments, buffers and optimizers bring."""
+"""Checks of what environments and buffers bring."""
 
 from typing import Any
 
@@ -6,34 +6,10 @@ import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.preprocessing import get_action_dim, get_obs_shape
 
-from sb3_actpc.actpc.policies import ActPCPolicy
 from sb3_actpc.utils.checks import check_finite
 from sb3_actpc.utils.nested import map_observations
 
 LARGEST_BOUND = 1e6  # of an observation; larger ones stand for none
-
-
-def check_keywords_agree(alpha_ep: float, optimize_memory_usage: bool, bootstrap: str, n_steps: int) -> None:
-    """:raises ValueError: for keywords of the agent that do not go together"""
-    if alpha_ep and optimize_memory_usage:
-        raise ValueError(
-            f"alpha_ep={alpha_ep:g} does not work with optimize_memory_usage=True, which overwrites the last observations of "
-            "episodes: use optimize_memory_usage=False or alpha_ep=0"
-        )
-    if bootstrap == "literal" and n_steps > 1:
-        raise ValueError(
-            f"n_steps={n_steps} does not work with bootstrap='literal', which values the action taken: use n_steps=1"
-        )
-
-
-def check_own_learning_rates(policy: ActPCPolicy, start: float) -> None:
-    """:raises ValueError: where a circuit's own rate would be a multiple of the agent's, which starts at 0"""
-    for name in policy.circuits():
-        own = policy.settings_of(name).get("learning_rate")
-        if own and not start:
-            raise ValueError(
-                f"{name}_kwargs has learning_rate={own}, a multiple of the agent's, which begins at 0: begin above"
-            )
 
 
 def check_loaded_buffer(path: Any, loaded: Any, is_own: bool, agent: Any) -> None:

@@ -101,7 +101,7 @@ class IBRL(TD3Demo):
 
     def _clone_actor(self) -> None:
         """Train the BC policy, not the actor."""
-        shown = "demonstrations", "n_demonstrations", "n_demonstration_transitions", "seed", "device"
+        shown = "demonstrations", "n_demonstrations", "seed", "device"
         same = {name: getattr(self, name) for name in shown}
         model = BC("MlpPolicy", self.env, learning_rate=lambda left: 1e-3 * left, batch_size=64, **same)
         model.learn(self.bc_steps, log_interval=None)

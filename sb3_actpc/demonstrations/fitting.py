@@ -52,8 +52,7 @@ def fit_demonstrations(
     env: "VecEnv | None",
     observation_space: spaces.Space[Any],
     action_space: spaces.Space[Any],
-    n_episodes: int | None = None,
-    n_transitions: int | None = None,
+    limit: int | tuple[int, str] | None = None,
 ) -> Demonstrations:
     """The demonstrations as an environment would have recorded them: of its task, in its spaces, with its rewards.
 
@@ -63,8 +62,7 @@ def fit_demonstrations(
     :param env: None where there is none yet
     :param observation_space: of the agent
     :param action_space: of the agent
-    :param n_episodes: use only this many episodes, the first ones
-    :param n_transitions: use only this many transitions, the first ones
+    :param limit: use only this many episodes, the first ones, or so many transitions: ``(number, "transitions")``
     :raises FileNotFoundError: when there is no such file
     :raises ValueError: for demonstrations that are damaged, too few, of another task, or recorded behind other wrappers of
         observations or actions
@@ -74,9 +72,10 @@ def fit_demonstrations(
     has_goals = env is not None and env.has_attr("goal_demonstrations")
     demonstrations = resolve(source, None if has_goals else observation_space)  # they may be of the task without goals
     try:
-        demonstrations = demonstrations.select(n_episodes, n_transitions)
+        number, unit = limit if isinstance(limit, (tuple, list)) else (limit, "episodes")
+        demonstrations = demonstrations.select(**{f"n_{unit}": number})
     except ValueError as error:
-        raise ValueError(f"n_demonstrations={n_episodes}, n_demonstration_transitions={n_transitions}: {error}") from error
+        raise ValueError(f"n_demonstrations={limit}: {error}") from error
     env_id = None
     if env is not None:
         from sb3_actpc.utils.tasks import task_id  # heavy: demonstrations do without

@@ -10,7 +10,7 @@ from stable_baselines3.common.type_aliases import GymEnv
 
 from sb3_actpc.demonstrations.dataset import Demonstrations
 from sb3_actpc.demonstrations.fitting import fit_demonstrations
-from sb3_actpc.utils.arguments import check_actions
+from sb3_actpc.utils.arguments import DemonstrationLimit, check_actions, checked
 
 
 class LearnsFromDemonstrations(BaseAlgorithm):
@@ -19,25 +19,23 @@ class LearnsFromDemonstrations(BaseAlgorithm):
     :param policy: as SB3's
     :param env: as SB3's
     :param demonstrations: a path, or a :class:`~sb3_actpc.demonstrations.dataset.Demonstrations`; None learns without
-    :param n_demonstrations: use only this many episodes, the first ones
-    :param n_demonstration_transitions: use only this many transitions, the first ones
+    :param n_demonstrations: use only this many episodes, the first ones; ``(300, "transitions")`` for so many transitions
     :param options: keywords of the algorithm; dictionaries among them are copied, since SB3 adds keys to some
     """
 
+    @checked
     def __init__(
         self,
         policy: Any,
         env: GymEnv | str | None,
         *,
         demonstrations: Demonstrations | str | Path | None = None,
-        n_demonstrations: int | None = None,
-        n_demonstration_transitions: int | None = None,
+        n_demonstrations: DemonstrationLimit = None,
         **options: Any,
     ) -> None:
         # a saved agent holds the path as text, which every system can read
         self.demonstrations = os.fspath(demonstrations) if isinstance(demonstrations, Path) else demonstrations
         self.n_demonstrations = n_demonstrations
-        self.n_demonstration_transitions = n_demonstration_transitions
         super().__init__(policy, env, **_copied(options))
 
     def _check_actions(self) -> None:
@@ -52,9 +50,9 @@ class LearnsFromDemonstrations(BaseAlgorithm):
         :raises FileNotFoundError: when the file is missing
         """
         assert self.demonstrations is not None
-        limits = self.n_demonstrations, self.n_demonstration_transitions
+        observed, acted = self.observation_space, self.action_space
         try:
-            return fit_demonstrations(self.demonstrations, self.env, self.observation_space, self.action_space, *limits)
+            return fit_demonstrations(self.demonstrations, self.env, observed, acted, self.n_demonstrations)
         except FileNotFoundError as error:
             raise FileNotFoundError(f"{error}; or pass demonstrations=, which load(path, env=env, ...) takes too") from error
 

@@ -21,8 +21,8 @@ N_WARM_UP = 3  # rounds that do not count
 BASE = "SB3 TD3"
 # preset -> what shortens the training before the first step
 QUICK: dict[str, dict[str, Any]] = {
-    "actpc": {"prior_updates": 1, "guidance_kwargs.bc_updates": 1, "guidance_kwargs.critic_warmup": 1},
-    "actpc_paper": {"prior_updates": 1},
+    "actpc": {"signal_kwargs.prior_updates": 1, "guidance_kwargs.bc_updates": 1, "guidance_kwargs.critic_warmup": 1},
+    "actpc_paper": {"signal_kwargs.prior_updates": 1},
 }
 
 Entries = dict[str, Callable[[], object]]

@@ -1,7 +1,7 @@
 """The default guidance: BC pre-training, critic warm-up, return-weighted imitation and the deployment gate, as hooks."""
 
-from dataclasses import asdict, dataclass
-from numbers import Integral, Real
+import warnings
+from dataclasses import asdict, dataclass, fields
 from typing import Any, Literal
 
 import numpy as np
@@ -10,6 +10,8 @@ from sb3_actpc.guidance.base import ActorGuidance, GuidanceContext
 from sb3_actpc.guidance.behavior_cloning import clone_behavior
 from sb3_actpc.guidance.policy_selection import PolicySelection
 from sb3_actpc.ngc import NGCCircuit
+from sb3_actpc.utils.arguments import Count, Share, check_value
+from sb3_actpc.utils.checks import Settings
 
 
 @dataclass(frozen=True)
@@ -34,30 +36,19 @@ class GuidanceConfig:
     :raises ValueError: for a value out of range
     """
 
-    bc_updates: int = 3000
-    critic_warmup: int = 6000
+    bc_updates: Count = 3000
+    critic_warmup: Count = 6000
     q_filter: bool = True
-    filter_residual: float = 0.01
+    filter_residual: Share = 0.01
     weighting: Literal["returns", "uniform"] = "returns"
     gate: bool = True
-    evaluation_share: float = 0.25
-    averaging_rate: float = 0.002
-    challenger_interval: int = 4000
+    evaluation_share: Share = 0.25
+    averaging_rate: Share = 0.002
+    challenger_interval: Count = 4000
 
     def __post_init__(self) -> None:
-        for name in ("bc_updates", "critic_warmup", "challenger_interval"):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, Integral) or value < 0:
-                raise ValueError(f"guidance_kwargs[{name!r}]={value!r} must be a whole number of at least 0")
-        for name in ("evaluation_share", "averaging_rate", "filter_residual"):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, Real) or not 0.0 <= float(value) <= 1.0:
-                raise ValueError(f"guidance_kwargs[{name!r}]={value!r} must be a number from 0 to 1")
-        if self.weighting not in ("returns", "uniform"):
-            raise ValueError(f"guidance_kwargs['weighting']={self.weighting!r} must be 'returns' or 'uniform'")
-        for name in ("q_filter", "gate"):
-            if not isinstance(getattr(self, name), bool):
-                raise ValueError(f"guidance_kwargs[{name!r}]={getattr(self, name)!r} must be True or False")
+        for field in fields(self):
+            check_value(f"guidance_kwargs[{field.name!r}]", getattr(self, field.name), field.type)
 
 
 class BehaviorGuidance(ActorGuidance):
@@ -106,7 +97,8 @@ class BehaviorGuidance(ActorGuidance):
 
     def on_step(self, context: GuidanceContext, rewards: np.ndarray, dones: np.ndarray, n_updates: int) -> None:
         """Evaluation episodes end, policies are promoted, rejected or rolled back, the next episodes begin."""
-        selection, circuits = self.selection, context.selection_circuits
+        selection = self.selection
+        circuits = context.selection_circuits
         if selection is None or circuits is None:
             return
         for env in range(context.n_envs):
@@ -184,4 +176,26 @@ class BehaviorGuidance(ActorGuidance):
         """As stored."""
         stored = state["selection"]
         self.selection = None if stored is None else PolicySelection(**{**stored, "share": self.config.evaluation_share})
-        self.copied_at, self.bc_residual = state["copied_at"], state["bc_residual"]
+        self.copied_at = state["copied_at"]
+        self.bc_residual = state["bc_residual"]
+
+
+def make_guidance(given: ActorGuidance | str, settings: Settings | None) -> ActorGuidance:
+    """
+    :param given: "default", "none" or the guidance itself
+    :param settings: keywords of :class:`GuidanceConfig`, for "default"
+    :raises ValueError: for another name, or keywords that the guidance has not
+    """
+    if given not in ("default", "none") and not isinstance(given, ActorGuidance):
+        raise ValueError(f"guidance={given!r} must be None, 'default', 'none' or an ActorGuidance")
+    settings = settings or {}
+    known = [field.name for field in fields(GuidanceConfig)]
+    unknown = sorted({*settings} - {*known})
+    if unknown:
+        raise ValueError(f"guidance_kwargs={settings!r} has unknown keys {unknown}: choose from {known}")
+    config = GuidanceConfig(**settings)
+    if settings and given != "default":
+        warnings.warn(f"guidance_kwargs={settings!r} have no effect without guidance='default'", stacklevel=4)
+    if isinstance(given, ActorGuidance):
+        return given
+    return BehaviorGuidance(config) if given == "default" else ActorGuidance()

@@ -71,8 +71,10 @@ class PolicySelection:
 
     def end_episode(self, env: int, actor_differs: bool) -> Decision | None:
         """The episode of ``env`` has ended: what its return decides, if anything. See :meth:`begin_episode`."""
-        role, episode_return = self.roles[env], self.running[env]
-        self.roles[env], self.running[env] = "average", 0.0
+        role = self.roles[env]
+        episode_return = self.running[env]
+        self.roles[env] = "average"
+        self.running[env] = 0.0
         if math.isnan(episode_return):
             return None
         self.worst = min(self.worst, episode_return)
@@ -101,7 +103,9 @@ class PolicySelection:
         is_due = n_incumbent >= self.n_needed or bool(self.support)
         begins = actor_differs and not self.has_challenger and is_due
         if begins:
-            self.has_challenger, self.challenger_returns, self.exploration_returns = True, [], []
+            self.has_challenger = True
+            self.challenger_returns = []
+            self.exploration_returns = []
             self._cut("challenger")
         # steps that the incumbent does not need are saved for the challenger
         n_needed = self.budget if self.has_challenger else self.n_needed
@@ -115,7 +119,12 @@ class PolicySelection:
         """Running episodes of policies that are replaced count for nobody."""
         for env, role in enumerate(self.roles):
             if role in roles:
-                self.roles[env], self.running[env] = "average", math.nan
+                self.roles[env] = "average"
+                self.running[env] = math.nan
+
+    def _drop_challenger(self) -> None:
+        self.has_challenger = False
+        self.support = []
 
     def _exceed(self, ours: list[float]) -> bool:
         """Both get a pseudo-episode of the worst return: a policy with few episodes may not have failed yet."""
@@ -131,21 +140,25 @@ class PolicySelection:
             if loss < 0 and len(ours) >= self.min_episodes and self._exceed(ours):
                 self._cut("incumbent", "challenger")
                 self.n_needed = min(max(2 * n, self.min_episodes), self.budget)
-                self.previous_returns, self.incumbent_returns = self.incumbent_returns, self.challenger_returns
-                self.has_challenger, self.challenger_returns, self.exploration_returns, self.support = False, [], [], []
+                self.previous_returns = self.incumbent_returns
+                self.incumbent_returns = self.challenger_returns
+                self.challenger_returns = []
+                self.exploration_returns = []
+                self._drop_challenger()
                 self.n_promoted += 1
                 return "promoted"
             is_enough = n >= self.min_episodes or bool(self.support)
             if (is_enough and loss > self.reject * error) or n >= self.budget:
                 self.n_needed = min(len(self.incumbent_returns) + 1, self.budget)
-                self.has_challenger, self.support = False, []
+                self._drop_challenger()
                 self.n_rejected += 1
                 return "rejected"
         if self.previous_returns and len(self.incumbent_returns) >= self.min_episodes:
             loss, error = compare(self.previous_returns, self.incumbent_returns)
             if loss > self.reject * error:
-                self.incumbent_returns, self.previous_returns = self.previous_returns, []
-                self.has_challenger, self.support = False, []
+                self.incumbent_returns = self.previous_returns
+                self.previous_returns = []
+                self._drop_challenger()
                 self._cut("incumbent", "challenger")
                 self.n_rolled_back += 1
                 return "rolled back"

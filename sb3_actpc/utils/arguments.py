@@ -6,14 +6,13 @@ import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import wraps
-from numbers import Integral
+from numbers import Integral, Real
 from typing import Annotated, Any, Literal, ParamSpec, get_args, get_origin
 
 import gymnasium as gym
 import numpy as np
 import torch as th
 from stable_baselines3.common.noise import ActionNoise
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import TrainFreq
 from stable_baselines3.common.vec_env import VecEnv
 
@@ -36,9 +35,23 @@ class Between:
 
     def __call__(self, name: str, value: Any) -> None:
         """:raises ValueError: naming the keyword, its value and the bounds"""
+        if isinstance(value, bool):
+            raise ValueError(f"{name}={value!r} must be a number")
         if value is not None and not self.low <= value <= self.high:
             bounds = f"at least {self.low}" if np.isinf(self.high) else f"between {self.low} and {self.high}"
             raise ValueError(f"{name}={value!r} must be {bounds}")
+
+
+@dataclass(frozen=True)
+class SubclassOf:
+    """A class that extends another."""
+
+    base: type
+
+    def __call__(self, name: str, kind: Any) -> None:
+        """:raises ValueError: naming the keyword, its value and the class to extend"""
+        if not isinstance(kind, type) or not issubclass(kind, self.base):
+            raise ValueError(f"{name}={kind!r} must be a subclass of {self.base.__name__}")
 
 
 Share = Annotated[float, Between(0, 1)]
@@ -68,7 +81,7 @@ def checked(init: Callable[Parameters, None]) -> Callable[Parameters, None]:
         given.apply_defaults()
         for name, value in given.arguments.items():
             given.arguments[name] = _plain(value)
-            _check(name, given.arguments[name], signature.parameters[name].annotation)
+            check_value(name, given.arguments[name], signature.parameters[name].annotation)
         init(*given.args, **given.kwargs)
 
     return checking
@@ -91,10 +104,10 @@ def check_settings(kind: type, settings: Mapping[str, Any]) -> None:
             annotations = {**{one.name: one.annotation for one in own}, **annotations}
     annotations = {**OF_SB3, **annotations}
     for name in filter(annotations.__contains__, settings):
-        _check(name, settings[name], annotations[name])
+        check_value(name, settings[name], annotations[name])
 
 
-def _check(name: str, value: Any, annotation: Any) -> None:
+def check_value(name: str, value: Any, annotation: Any) -> None:
     """:raises ValueError: naming the keyword, its value, what is allowed, and how to mend it"""
     kind, *checks = get_args(annotation) if get_origin(annotation) is Annotated else (annotation,)
     if get_origin(kind) is Literal:
@@ -107,6 +120,26 @@ def _check(name: str, value: Any, annotation: Any) -> None:
 
 
 # ---------------------------------------------------------------------- of the agent
+
+
+def refuse_noise(name: str, noise: Any) -> None:
+    """In a preset, of an algorithm of SB3: its noises are no plain values."""
+    raise ValueError(f"{name!r} is not set here: use --set noise_type=normal --set noise_std=0.1")
+
+
+def check_limit(name: str, limit: Any) -> None:
+    """None, a number of episodes, or a number with its unit."""
+    if limit is None:
+        return
+    number, unit = limit if isinstance(limit, (tuple, list)) and len(limit) == 2 else (limit, "episodes")
+    is_number = isinstance(number, Integral) and not isinstance(number, bool) and int(number) >= 1
+    if not is_number or unit not in ("episodes", "transitions"):
+        raise ValueError(
+            f"{name}={limit!r} must be a whole number of at least 1, of episodes, or (number, 'episodes' or 'transitions')"
+        )
+
+
+DemonstrationLimit = Annotated[int | tuple[int, str] | None, check_limit]
 
 
 def check_env(name: str, env: Any) -> None:
@@ -123,7 +156,7 @@ def check_learning_rate(name: str, learning_rate: Any) -> None:
         raise ValueError(
             f"{name}={learning_rate!r} must be a number, or a function of the remaining progress (1 to 0): {error}"
         ) from error
-    _check(name, start, Weight)
+    check_value(name, start, Weight)
 
 
 def check_train_freq(name: str, train_freq: Any) -> None:
@@ -136,9 +169,13 @@ def check_train_freq(name: str, train_freq: Any) -> None:
 
 
 def check_noise(name: str, noise: Any) -> None:
-    """One of SB3's."""
-    if noise is not None and not isinstance(noise, ActionNoise):
-        raise ValueError(f"{name}={noise!r} must be None or one of SB3's, such as NormalActionNoise(mean, sigma)")
+    """None, a standard deviation, or one of SB3's."""
+    if isinstance(noise, Real):
+        check_value(name, noise, Weight)
+    elif noise is not None and not isinstance(noise, ActionNoise):
+        raise ValueError(
+            f"{name}={noise!r} must be None, a standard deviation, or one of SB3's, such as NormalActionNoise(mean, sigma)"
+        )
 
 
 def check_nudge(name: str, nudge: Any) -> None:
@@ -181,6 +218,7 @@ OF_SB3: dict[str, Any] = {
     "train_freq": Annotated[Any, check_train_freq],
     "gradient_steps": Annotated[int, Between(-1)],
     "target_kl": Annotated[float | None, Between(0)],
+    "action_noise": Annotated[Any, refuse_noise],
     "use_sde": bool,
     "tensorboard_log": str | None,
 }
@@ -215,25 +253,15 @@ def check_circuit(name: str, settings: Any) -> None:
     """What a circuit can have of its own beside the keywords of every circuit."""
     for key, value in (settings or {}).items():
         where = f"{name}[{key!r}]"
-        if key == "net_arch":
-            check_hidden(where, value)
-        elif key in ("learning_rate", "batch_size"):
-            _check(where, value, Size if key == "batch_size" else Annotated[float, Between(0, LARGEST_SIZE)])
-
-
-def check_extractor(name: str, kind: Any) -> None:
-    """A class of features extractors."""
-    _check_subclass(name, kind, BaseFeaturesExtractor)
+        if key == "batch_size":
+            check_value(where, value, Size)
+        elif key == "learning_rate":
+            check_value(where, value, Annotated[float, Between(0, LARGEST_SIZE)])
 
 
 def check_optimizer(name: str, kind: Any) -> None:
     """A class of ``torch.optim`` that steps by the changes alone."""
-    _check_subclass(name, kind, th.optim.Optimizer)
+    SubclassOf(th.optim.Optimizer)(name, kind)
     closure = inspect.signature(kind.step).parameters.get("closure")
     if closure is not None and closure.default is closure.empty:
         raise ValueError(f"{name}={kind!r} asks for a loss again and again; circuits have none: use one such as Adam or SGD")
-
-
-def _check_subclass(name: str, kind: Any, base: type) -> None:
-    if not isinstance(kind, type) or not issubclass(kind, base):
-        raise ValueError(f"{name}={kind!r} must be a subclass of {base.__name__}")

@@ -15,6 +15,7 @@ from stable_baselines3.common.type_aliases import TrainFreq
 from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
 
 from sb3_actpc.utils.constructors import constructor_keywords
+from sb3_actpc.utils.noise import GaussianNoise
 
 # a class can be named when it is of one of these packages and of one of these kinds
 _PACKAGES = ("torch", "stable_baselines3", "sb3_contrib", "sb3_actpc")
@@ -62,6 +63,10 @@ def read_settings(record: Mapping[str, Any], overrides: Mapping[str, Any]) -> di
 
 def _name_value(value: Any) -> Any:
     """JSON of one setting; every JSON object has one key, the kind of the value."""
+    if isinstance(value, VectorizedActionNoise):
+        value = value.base_noise
+    if isinstance(value, GaussianNoise):
+        return value.std
     if isinstance(value, Enum):
         return value.name.lower()
     if value is None or isinstance(value, (bool, int, float, str)):
@@ -87,8 +92,6 @@ def _name_object(value: Any) -> dict[str, Any]:
             return {"class": name}
     if isinstance(value, FloatSchedule):
         return _name_object(value.value_schedule)
-    if isinstance(value, VectorizedActionNoise):
-        return _name_object(value.base_noise)
     for name, (kind, attributes) in _OBJECTS.items():
         if type(value) is kind:
             return {"object": [name, {key: np.asarray(vars(value)[part]).tolist() for key, part in attributes.items()}]}

@@ -28,18 +28,15 @@ PLAIN: dict[str, Any] = {
     "policy_kwargs": PLAIN_POLICY,
     "tau": 0.005,
     "n_steps": 1,
-    "prior_updates": 5,
     "guidance": "none",
     "policy_delay": 1,
     "gradient_steps": 1,
     "demonstration_fraction": 0.0,
     "observation_normalization": "none",
-    "exploration_noise": 0.0,
+    "action_noise": 0.0,
     "target_policy_noise": 0.0,
-    "normalize_critic_term": False,
-    "alpha_ep": 1.0,
-    "alpha_in": 1.0,
-    "alpha_ext": 1.0,
+    "critic_weight": 2.5,
+    "reward_weights": {"epistemic": 1.0, "instrumental": 1.0},
     "signal_kwargs": {"normalizer": "max", "normalization": "stored"},
 }
 # the constructor's defaults, but for sizes: BC and a critic warm-up of no time
@@ -47,10 +44,12 @@ QUICK: dict[str, Any] = {**SMALL, "learning_starts": None, "guidance_kwargs": {"
 
 
 def plain(**keywords: Any) -> dict[str, Any]:
-    """``PLAIN`` with other values; those of ``policy_kwargs`` and of its ``circuit_kwargs`` one by one."""
+    """``PLAIN`` with other values; of dictionaries (but ``signal_kwargs``) one by one."""
     policy = {**PLAIN_POLICY, **keywords.pop("policy_kwargs", {})}
     policy["circuit_kwargs"] = {**PLAIN_POLICY["circuit_kwargs"], **policy["circuit_kwargs"]}  # type: ignore[dict-item]
-    return {**PLAIN, **keywords, "policy_kwargs": policy}
+    weights = {**PLAIN["reward_weights"], **keywords.pop("reward_weights", {})}
+    signals = {"prior_updates": 5, **keywords.pop("signal_kwargs", PLAIN["signal_kwargs"])}
+    return {**PLAIN, **keywords, "reward_weights": weights, "signal_kwargs": signals, "policy_kwargs": policy}
 
 
 def imitating(env=CountingEnv, policy_kwargs=None, **keywords):

@@ -16,6 +16,7 @@ from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 from sb3_actpc import ActPC, Demonstrations, MlpPolicy
 from sb3_actpc.actpc import actpc as actpc_module
 from sb3_actpc.actpc.batches import Batch
+from sb3_actpc.actpc.reward_signals import RewardWeights
 from sb3_actpc.ngc import settle_coupled
 from tests.actpc.agents import QUICK, differ, imitating, make, plain, weights_of
 from tests.actpc.envs import CountingEnv, demonstrations
@@ -30,9 +31,8 @@ def remembering(history):
 
 
 def test_the_critic_target_is_the_weighted_sum_of_the_three_parts_plus_the_bootstrap():
-    model = make(
-        demonstrations=demonstrations(), alpha_ext=0.7, alpha_ep=0.5, alpha_in=0.25, replay_buffer_kwargs={"combined": False}
-    )
+    weights = {"task": 0.7, "epistemic": 0.5, "instrumental": 0.25}
+    model = make(demonstrations=demonstrations(), reward_weights=weights, replay_buffer_kwargs={"combined": False})
     model.learn(60)
     np.random.seed(1)
     replayed = model.replay_buffer.sample(32)
@@ -47,13 +47,14 @@ def test_the_critic_target_is_the_weighted_sum_of_the_three_parts_plus_the_boots
     assert batch.dones.max() == 1.0  # terminal transitions were in the batch: their targets are the reward alone
 
 
-@pytest.mark.parametrize("name", ["alpha_ep", "alpha_in", "alpha_ext"])
+@pytest.mark.parametrize("name", ["epistemic", "instrumental", "task"])
 def test_each_part_of_the_reward_reaches_the_critic_and_the_actor(name):
     """An earlier agent of this family computed the epistemic term and never used it."""
     learned = []
     for weight in (0.0, 2.0):
-        weights = {"alpha_ep": 0.0, "alpha_in": 0.0, "alpha_ext": 0.0, name: weight}
-        model = make(demonstrations=demonstrations(), prior_updates=0, **weights)  # both runs draw the same numbers
+        weights = {"epistemic": 0.0, "instrumental": 0.0, "task": 0.0, name: weight}
+        signals = {"normalizer": "max", "normalization": "stored", "prior_updates": 0}  # both runs draw the same numbers
+        model = make(demonstrations=demonstrations(), signal_kwargs=signals, reward_weights=weights)
         model.learn(80)
         learned.append((weights_of(model.critic), weights_of(model.actor.circuit)))
     assert differ(learned[0][0], learned[1][0]) and differ(learned[0][1], learned[1][1])
@@ -73,18 +74,12 @@ def test_signals_are_the_summed_squared_errors_over_a_maximum_that_starts_at_one
     assert np.allclose(buffer.instrumental[:30, 0], -expected[:, 1], rtol=1e-4)
 
 
-@pytest.mark.parametrize("normalizer", ["max", "saturating", "quantile"])
-def test_every_normalizer_keeps_signals_in_their_range(normalizer):
-    model = make(demonstrations=demonstrations(), signal_kwargs={"normalizer": normalizer, "normalization": "stored"})
-    model.learn(60)
-    assert 0 < model.replay_buffer.epistemic[:60].max() <= 1 and -1 <= model.replay_buffer.instrumental[:60].min() < 0
-
-
 def test_the_unit_form_pays_one_more_than_the_penalty_for_every_transition():
     """1 - r = 1 + (-r): the same settled errors and the same normaliser, so the two differ by 1 everywhere."""
     paid = []
     for form in ("penalty", "unit"):
-        keywords = {"alpha_ep": 0.0, "alpha_ext": 0.0, "learning_starts": 1000, "signal_kwargs": {"instrumental_form": form}}
+        weights = {"epistemic": 0.0, "task": 0.0}
+        keywords = {"reward_weights": weights, "learning_starts": 1000, "signal_kwargs": {"instrumental_form": form}}
         model = make(demonstrations=demonstrations(), **keywords).learn(40)
         np.random.seed(1)
         paid.append(next(model.sample_batches(1, 32)).rewards)
@@ -99,8 +94,7 @@ def test_signals_normalised_when_sampled_follow_the_maximum_that_was_seen_last()
             demonstrations=demonstrations(),
             signal_kwargs={"normalizer": "max", "normalization": normalization},
             learning_starts=1000,
-            alpha_in=0.0,
-            alpha_ext=0.0,
+            reward_weights={"instrumental": 0.0, "task": 0.0},
         )
         models[normalization].learn(30)
     raw = models["sampled"].replay_buffer.epistemic[:30, 0]
@@ -118,7 +112,7 @@ def test_signals_normalised_when_sampled_follow_the_maximum_that_was_seen_last()
 
 def test_demonstrated_transitions_are_normalised_when_they_are_sampled_as_replayed_ones_are():
     """One batch, one normaliser: the maximum doubles, and both halves are paid half."""
-    keywords = {"demonstration_fraction": 0.5, "alpha_in": 0.0, "alpha_ext": 0.0}
+    keywords = {"demonstration_fraction": 0.5, "reward_weights": {"instrumental": 0.0, "task": 0.0}}
     model = make(demonstrations=demonstrations(), signal_kwargs={"normalizer": "max"}, **keywords)
     model.learn(30)
     paid = []
@@ -170,19 +164,6 @@ def test_the_actor_update_changes_the_actor_and_leaves_the_critic_bit_identical(
     assert not differ(critic, list(model.critic.state_dict().values())) and differ(actor, weights_of(model.actor.circuit))
 
 
-def test_refresh_pulls_the_actor_towards_the_demonstrations():
-    data = demonstrations()
-    distance = {}
-    for weight in (0.0, 1.0):
-        model = make(demonstrations=data, refresh_weight=weight, critic_weight=0.0, replay_buffer_kwargs=NO_MEMORY)
-        before = weights_of(model.actor.circuit)
-        model.learn(400)
-        actions = model.actor.circuit.project(th.as_tensor(data.observations))
-        distance[weight] = float((actions - th.as_tensor(data.actions / 2)).square().mean())
-        assert differ(before, weights_of(model.actor.circuit)) == (weight > 0)
-    assert distance[1.0] < 0.8 * distance[0.0]
-
-
 def step_of_actor(before_update=lambda model: None, **keywords):
     """What one update adds to the actor's synapses: by SGD with a rate of 1, the change itself; nothing was learned before.
     The agent and its batch, too."""
@@ -211,8 +192,8 @@ def test_scaled_pressure_is_divided_by_the_mean_absolute_action_value_or_by_one_
         model.critic.synapses.biases[-1].add_(shift)
 
     steps = []
-    for scale in (False, True):
-        step, model, batch = step_of_actor(shift_values, normalize_critic_term=scale, replay_buffer_kwargs=NO_MEMORY)
+    for weight in (2.5, None):
+        step, model, batch = step_of_actor(shift_values, critic_weight=weight, replay_buffer_kwargs=NO_MEMORY)
         steps.append(step)
     # the actor has moved since by some 1e-2
     inputs = th.cat([batch.features, model.actor_target.project(batch.features)], dim=1)
@@ -274,7 +255,7 @@ def test_the_smaller_value_of_two_critics_drawn_at_random_bootstraps():
 
 
 def test_the_literal_bootstrap_values_the_action_taken():
-    model = make(bootstrap="literal")
+    model = make(target_policy_noise=None)
     model.learn(40)
     batch = next(model.sample_batches(1, 16))
     values = model.critic_target.project(th.cat([batch.next_features, batch.actions], dim=1))
@@ -303,7 +284,7 @@ def test_generator_and_prior_learn_the_next_observation():
     """Here the next observation is minus this one."""
     data = demonstrations()
     data = dataclasses.replace(data, next_observations=-data.observations)
-    model = make(demonstrations=data, prior_updates=300, demonstration_fraction=0.9, learning_rate=2e-3)
+    model = make(demonstrations=data, signal_kwargs={"prior_updates": 300}, demonstration_fraction=0.9, learning_rate=2e-3)
     model.learn(300)
     o, actions = th.as_tensor(data.observations), th.as_tensor(model.expert.episodes.actions)
     for predicted in (model.prior.project(o), model.generator.project(th.cat([o, actions], dim=1))):
@@ -325,7 +306,7 @@ def test_refresh_imitates_the_agents_own_best_episodes_beside_the_demonstrations
 
 def test_demonstrations_fill_their_share_of_the_critic_batch():
     data = demonstrations()
-    model = make(demonstrations=data, demonstration_fraction=0.5, alpha_ext=1.0)
+    model = make(demonstrations=data, demonstration_fraction=0.5)
     model.learn(40)
     batch = next(model.sample_batches(1, 16))
     rows = {tuple(row) for row in data.observations.tolist()}
@@ -337,8 +318,10 @@ def test_demonstrations_fill_their_share_of_the_critic_batch():
 def test_demonstrated_returns_reach_n_steps_ahead_and_end_with_the_episode():
     data = demonstrations(n_episodes=2, length=5)
     data = dataclasses.replace(data, rewards=np.arange(10.0), terminations=np.arange(10) == 9)
-    model = make(demonstrations=data, n_steps=3, alpha_ext=1.0)
-    batch = model.expert.batch(np.array([0, 3, 9]), model.actor, None, (1.0, 1.0, 0.0), 0.5, n_steps=3)  # no signals yet
+    model = make(demonstrations=data, n_steps=3)
+    batch = model.expert.batch(
+        np.array([0, 3, 9]), model.actor, None, RewardWeights(1.0, 1.0), 0.5, n_steps=3
+    )  # no signals yet
     assert batch.rewards.ravel().tolist() == [0 + 0.5 * 1 + 0.25 * 2, 3 + 0.5 * 4, 9]
     assert batch.discounts.ravel().tolist() == [0.125, 0.25, 0.5]
     assert batch.dones.ravel().tolist() == [0, 0, 1]
@@ -348,7 +331,7 @@ def test_demonstrated_returns_reach_n_steps_ahead_and_end_with_the_episode():
 
 def test_with_n_step_returns_generator_and_prior_still_predict_one_step():
     """Their surprise is measured one step on; trained n steps on, they would be surprised by everything."""
-    model = make(demonstrations=demonstrations(), n_steps=3, alpha_ext=1.0, alpha_ep=1.0, demonstration_fraction=0.5)
+    model = make(demonstrations=demonstrations(), n_steps=3, demonstration_fraction=0.5)
     model.learn(40)
     buffer, size = model.replay_buffer, model.replay_buffer.pos
     pairs = zip(
@@ -361,7 +344,7 @@ def test_with_n_step_returns_generator_and_prior_still_predict_one_step():
     one_step_on = [following[tuple(row)] for row in batch.features.tolist()]
     assert [tuple(row) for row in batch.next_features.tolist()] == one_step_on
     assert differ([batch.next_features], [batch.bootstrap_features])
-    model.alpha_ep = 0.0  # nobody predicts: the gathering is left out
+    model.reward_weights["epistemic"] = 0.0  # nobody predicts: the gathering is left out
     batch = next(model.sample_batches(1, 64))
     assert not differ([batch.next_features], [batch.bootstrap_features])
 
@@ -369,7 +352,7 @@ def test_with_n_step_returns_generator_and_prior_still_predict_one_step():
 def test_a_circuit_with_a_smaller_batch_takes_the_newest_and_a_fair_mixture_of_the_rest():
     data = demonstrations()
     sizes = {"critic_kwargs": {"batch_size": 64}, "generator_kwargs": {"batch_size": 32}}
-    model = make(demonstrations=data, demonstration_fraction=0.5, alpha_ext=1.0, policy_kwargs={"net_arch": [16, 16], **sizes})
+    model = make(demonstrations=data, demonstration_fraction=0.5, policy_kwargs={"net_arch": [16, 16], **sizes})
     model.learn(40)
     rows = {tuple(row) for row in data.observations.tolist()}
     newest = tuple(model.replay_buffer.observations[model.replay_buffer.newest, 0].tolist())
@@ -501,7 +484,8 @@ def test_learning_never_backpropagates(settling, monkeypatch):
 
     for owner, name in ((th.Tensor, "backward"), (th.autograd, "backward"), (th.autograd, "grad")):
         monkeypatch.setattr(owner, name, refuse)
-    model = imitating(settling=settling, alpha_ep=0.1, alpha_in=0.1, prior_updates=5, policy_kwargs={"memory_history": 7})
+    signals = {"reward_weights": {"epistemic": 0.1, "instrumental": 0.1}, "signal_kwargs": {"prior_updates": 5}}
+    model = imitating(settling=settling, policy_kwargs={"memory_history": 7}, **signals)
     before = weights_of(model.policy)
     model.learn(60)
     assert differ(before, weights_of(model.policy))
@@ -553,7 +537,7 @@ def test_a_loaded_agents_signals_are_those_asked_for(tmp_path):
     model = make(demonstrations=demonstrations(), signal_kwargs={"normalizer": "max"}, learning_starts=1)
     model.learn(30)
     model.save(tmp_path / "agent")
-    same, other = ActPC.load(tmp_path / "agent"), ActPC.load(tmp_path / "agent", signal_kwargs={"normalizer": "saturating"})
+    same, other = ActPC.load(tmp_path / "agent"), ActPC.load(tmp_path / "agent", signal_kwargs={"normalizer": "quantile"})
     assert same.signals.checkpoint_state() == model.signals.checkpoint_state()
     assert type(other.signals.epistemic) is not type(model.signals.epistemic)
 
@@ -647,7 +631,7 @@ def test_demonstrations_that_are_set_later_are_checked_and_used(tmp_path):
 
 @pytest.mark.parametrize("settling", ["iterative", "scheduled"])
 def test_two_seeded_runs_are_bit_identical(settling):
-    runs = [make(settling=settling, demonstrations=demonstrations(), alpha_ext=1.0).learn(80) for _ in range(2)]
+    runs = [make(settling=settling, demonstrations=demonstrations()).learn(80) for _ in range(2)]
     assert not differ(weights_of(runs[0].policy), weights_of(runs[1].policy))
 
 
@@ -717,7 +701,7 @@ def test_the_memory_of_the_bootstrapped_step_is_the_one_that_the_same_step_has_a
     assert goes_on.any() and batch.memory.abs().sum() > 0
     assert th.allclose(batch.next_memory[:-n_steps][goes_on], batch.memory[n_steps:][goes_on], atol=1e-6)
     rows = np.arange(len(model.expert))
-    shown = model.expert.batch(rows, model.actor, None, model.reward_weights, model.gamma, n_steps)
+    shown = model.expert.batch(rows, model.actor, None, model.used_weights, model.gamma, n_steps)
     goes_on = rows + n_steps < model.expert.ends
     assert goes_on.any()
     assert th.allclose(shown.next_memory[goes_on], shown.memory[rows[goes_on] + n_steps], atol=1e-6)
@@ -735,9 +719,7 @@ def test_a_second_learn_cuts_the_episode_it_interrupts():
 
 def test_vec_normalize_relabels_the_task_reward_alone():
     env = VecNormalize(DummyVecEnv([CountingEnv]))
-    model = make(
-        env, demonstrations=demonstrations(), demonstration_fraction=0.25, alpha_ext=1.0, policy_kwargs=remembering(7)
-    )
+    model = make(env, demonstrations=demonstrations(), demonstration_fraction=0.25, policy_kwargs=remembering(7))
     with pytest.warns(UserWarning, match="statistics drift"):
         model.learn(60)
     np.random.seed(0)
@@ -754,15 +736,18 @@ def test_vec_normalize_relabels_the_task_reward_alone():
 @pytest.mark.parametrize(
     ("keywords", "named"),
     [
-        ({"bootstrap": "both"}, "bootstrap='both'"),
-        ({"signal_kwargs": {"normalizer": "mean"}}, "signal_kwargs={'normalizer': 'mean'}: normalizer='mean'"),
+        ({"signal_kwargs": {"normalizer": "mean"}}, "signal_kwargs=.*: normalizer='mean'"),
         ({"signal_kwargs": {"normaliser": "max"}}, "signal_kwargs.*has no keyword 'normaliser'"),
         ({"target_update_interval": 0}, "target_update_interval=0"),
         ({"demonstration_fraction": 1.5}, "demonstration_fraction=1.5"),
         ({"refresh_weight": -1.0}, "refresh_weight=-1.0"),
-        ({"alpha_ep": -1.0}, "alpha_ep=-1.0 must be at least 0"),
-        ({"alpha_in": -0.1}, "alpha_in=-0.1 must be at least 0"),
-        ({"policy_kwargs": {"activation_fn": th.nn.ReLU}}, "activation_fn: name one"),
+        ({"reward_weights": {"epistemic": -1.0}}, r"reward_weights\['epistemic'\]=-1.0 must be at least 0"),
+        ({"reward_weights": {"task": "1"}}, r"reward_weights\['task'\]='1' must be a finite number"),
+        ({"reward_weights": {"alpha_ep": 1.0}}, "'alpha_ep': choose from .'task', 'epistemic', 'instrumental'"),
+        ({"action_noise": -0.1}, "action_noise=-0.1 must be at least 0"),
+        ({"action_noise": "0.1"}, "action_noise='0.1' must be None, a standard deviation, or one of SB3's"),
+        ({"n_demonstrations": (3, "steps")}, "must be a whole number .* or .number, 'episodes' or 'transitions'"),
+        ({"policy_kwargs": {"activation_fn": th.nn.ReLU}}, "has no keyword 'activation_fn'"),
         ({"policy_kwargs": {"sleepiness": 0.5}}, "ActPCPolicy has no keyword 'sleepiness'"),
         ({"policy_kwargs": {"n_critics": 0}}, "n_critics=0"),
         ({"policy_kwargs": {"nudge": 0.0}}, "nudge=0.0"),
@@ -786,10 +771,10 @@ def test_vec_normalize_relabels_the_task_reward_alone():
         ({"replay_buffer_kwargs": {"combine": True}}, "replay_buffer_kwargs=.*'combine'"),
         ({"replay_buffer_kwargs": {"n_steps": 2}}, "replay_buffer_kwargs=.*'n_steps'"),
         ({"settling": "fast"}, "settling='fast'"),
-        ({"bootstrap": "literal", "n_steps": 3}, "n_steps=3 does not work with bootstrap='literal'.*use n_steps=1"),
-        ({"alpha_ep": 0.5, "optimize_memory_usage": True, **NO_TIMEOUTS}, "optimize_memory_usage=False or alpha_ep=0"),
+        ({"target_policy_noise": None, "n_steps": 3}, "n_steps=3 does not work with target_policy_noise=None.*use 1"),
+        ({"optimize_memory_usage": True, **NO_TIMEOUTS}, "optimize_memory_usage=False or a weight of 0"),
         (
-            {"alpha_ep": 0.0, "optimize_memory_usage": True, "n_steps": 3, **NO_TIMEOUTS},
+            {"reward_weights": {"epistemic": 0.0}, "optimize_memory_usage": True, "n_steps": 3, **NO_TIMEOUTS},
             "n_steps=3 does not work",
         ),
         ({"observation_normalization": "bounds"}, "needs a flat Box whose bounds are below"),
@@ -867,11 +852,11 @@ def test_demonstrations_of_another_task_are_refused():
 
 def test_the_prior_learns_from_the_demonstrations_and_then_stands_still():
     """Where it has no role, it does not learn, and it learns once."""
-    model = make(demonstrations=demonstrations(), prior_updates=50, alpha_in=0.0)
+    model = make(demonstrations=demonstrations(), signal_kwargs={"prior_updates": 50}, reward_weights={"instrumental": 0.0})
     untrained = weights_of(model.prior)
     model.learn(20)
     assert not differ(untrained, weights_of(model.prior))
-    model.alpha_in = 1.0
+    model.reward_weights = {"instrumental": 1.0}
     model.learn(20)
     trained = weights_of(model.prior)
     model.learn(20)
@@ -883,11 +868,11 @@ def test_a_batch_may_be_of_demonstrations_alone():
     with warnings.catch_warnings():
         warnings.simplefilter("error", RuntimeWarning)  # no means of nothing
         model.learn(60)
-    assert np.isfinite(list(model.diagnostics.summary().values())).all()
+    assert np.isfinite(list(model.diagnostics.values.values())).all()
 
 
 def test_what_has_no_effect_without_demonstrations_is_named():
-    with pytest.warns(UserWarning, match="alpha_in=1 has no effect without demonstrations="):
-        make(alpha_in=1.0).learn(5)
+    with pytest.warns(UserWarning, match="'instrumental'.=1 has no effect without demonstrations="):
+        make().learn(5)
     with pytest.warns(UserWarning, match=r"guidance_kwargs=.*have no effect without guidance"):
         make(guidance_kwargs={"gate": False})

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch as th
 
-from sb3_actpc.actpc.reward_signals import InternalSignals, RunningQuantile
+from sb3_actpc.actpc.reward_signals import InternalSignals, RewardWeights, RunningQuantile
 from tests.actpc.agents import make
 from tests.actpc.envs import demonstrations
 
@@ -42,7 +42,7 @@ def test_signals_outlive_the_surprises_of_the_first_steps_by_default():
     for settings, expected in (({}, 1.0), ({"normalizer": "max", "normalization": "stored"}, 0.001)):
         signals = InternalSignals(**settings)
         for raw in (first, *[later] * 4000):
-            signals.score(raw, np.zeros(1), alpha_ep=1.0, alpha_in=0.0)
+            signals.score(raw, np.zeros(1), RewardWeights(epistemic=1.0))
         assert signals.rewards_of_errors[0](later) == pytest.approx(expected, rel=0.02)
 
 

@@ -1,20 +1,40 @@
-"""Keywords: numbers of NumPy, buffers that fit, misspelt names."""
+"""Keywords: numbers of NumPy, noise, buffers that fit, and what ``learn`` says of them."""
 
 import numpy as np
 import pytest
 from stable_baselines3.common.buffers import ReplayBuffer
 
 from sb3_actpc import ActPC
+from sb3_actpc.utils.settings import constructor_settings
 from tests.actpc.agents import SMALL, make
 from tests.actpc.envs import CountingEnv
 
 
 def test_numpys_numbers_are_numbers():
     settings = {"seed": np.int64(3), "learning_rate": np.float32(1e-3), "gamma": np.float64(0.9)}
-    model = make(train_freq=np.int64(2), stats_window_size=np.int64(5), **settings).learn(15)
+    model = make(train_freq=np.int64(2), **settings).learn(15)
     assert model.num_timesteps == 16 and model._n_updates > 0
     assert [type(getattr(model, name)) for name in settings] == [int, float, float]
     assert make(train_freq=(np.int64(2), "episode")).learn(15).train_freq.frequency == 2
+
+
+def test_a_number_is_the_standard_deviation_of_the_action_noise():
+    model = make(action_noise=0.3)
+    assert np.std([model.action_noise() for _ in range(2000)], axis=0) == pytest.approx([0.3, 0.3], rel=0.1)
+    assert constructor_settings(model)["keywords"]["action_noise"] == 0.3
+    assert make(action_noise=None).action_noise is None and make(action_noise=0).action_noise is None
+
+
+def test_learn_says_once_what_the_reward_is_made_of(capsys):
+    model = make(verbose=1, learning_starts=1000)
+    for _ in range(3):
+        model.learn(5, reset_num_timesteps=False)
+    assert capsys.readouterr().out.count("reward: 1 x task") == 1
+    model.reward_weights = {"task": 0.5}
+    model.learn(5)
+    assert "reward: 0.5 x task" in capsys.readouterr().out
+    make(learning_starts=1000).learn(5)
+    assert capsys.readouterr().out == ""
 
 
 @pytest.mark.parametrize("kind", ["ReplayBuffer", "NStepReplayBuffer", "DictReplayBuffer", "HerReplayBuffer"])

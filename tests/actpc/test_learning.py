@@ -1,10 +1,8 @@
 """The agent learns, with the constructor's defaults: a short case always, Pendulum by ``pytest -m slow``."""
 
-import numpy as np
 import pytest
 from stable_baselines3.common.envs import IdentityEnvBox
 from stable_baselines3.common.evaluation import evaluate_policy
-from stable_baselines3.common.noise import NormalActionNoise
 
 from sb3_actpc import ActPC
 
@@ -19,7 +17,6 @@ def test_a_bandit_is_learned_in_400_steps(settling):
         learning_rate=1e-3,
         gamma=0.95,
         policy_kwargs={"net_arch": [64, 64]},
-        action_noise=NormalActionNoise(np.zeros(1), 0.1 * np.ones(1)),
         seed=0,
     )
     before = evaluate_policy(model, model.get_env(), 20)[0]

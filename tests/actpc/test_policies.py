@@ -35,8 +35,3 @@ def test_adam_takes_the_form_that_it_is_given(given):
     model = make(policy_kwargs={"optimizer_kwargs": given})
     assert bool(model.actor.circuit.optimizer.defaults["fused"]) == (not given)
     model.learn(15)
-
-
-def test_nothing_is_imitated_where_nothing_is_shown_or_kept():
-    assert "self-imitation" in make(replay_buffer_kwargs={"self_imitation_size": 0}).describe().splitlines()[-1]
-    assert "self-imitation" not in make().describe()

@@ -105,7 +105,7 @@ def test_cloning_alone_brings_the_actor_to_the_demonstrations() -> None:
 
 
 def test_the_number_of_demonstrations_can_be_limited() -> None:
-    model = demonstrating(n_demonstration_transitions=7)
+    model = demonstrating(n_demonstrations=(7, "transitions"))
     assert model.replay_buffer.demonstrated.buffer_size == 7
     assert np.array_equal(model.replay_buffer.demonstrated.observations[:, 0], record("Pendulum-v1").observations[:7])
 

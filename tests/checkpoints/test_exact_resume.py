@@ -48,7 +48,7 @@ def check(make: Any, folder: Path, n_steps: int, stop_at: int, **options: Any) -
 @pytest.mark.parametrize(("n_envs", "normalize", "stop_at"), [(1, False, 34), (1, True, 41), (2, True, 34), (2, False, 41)])
 def test_actpc(tmp_path: Path, n_envs: int, normalize: bool, stop_at: int) -> None:
     """The episodes have 5, 9, 3 and 12 steps: 34 is (with one environment) an end, 41 is not."""
-    make = lambda: make_actpc(CountingEnv, n_envs, normalize, demonstrations=demonstrations(), alpha_ext=1.0)  # noqa: E731
+    make = lambda: make_actpc(CountingEnv, n_envs, normalize, demonstrations=demonstrations())  # noqa: E731
     check(make, tmp_path, 90, stop_at)
     assert len(log_rows(tmp_path / "resumed" / "progress.csv")) > 8
 
@@ -59,9 +59,9 @@ def test_actpc(tmp_path: Path, n_envs: int, normalize: bool, stop_at: int) -> No
         {"guidance": "none", "guidance_kwargs": None, "train_freq": (1, "episode"), "gradient_steps": 2},
         {"buffer_size": 20, "action_noise": OrnsteinUhlenbeckActionNoise(np.zeros(2), 0.1 * np.ones(2))},
         {"settling": "iterative", "policy_kwargs": {"net_arch": [16, 16], "circuit_kwargs": {"feedback": "tied"}}},
-        {"n_steps": 3, "signal_kwargs": {"normalizer": "quantile"}, "target_policy_noise": 0.0},
+        {"n_steps": 3, "signal_kwargs": {"normalizer": "quantile", "prior_updates": 5}, "target_policy_noise": 0.0},
         {"n_steps": 4, "policy_kwargs": REMEMBERING},
-        {"optimize_memory_usage": True, "replay_buffer_kwargs": {"handle_timeout_termination": False}, "alpha_ep": 0.0},
+        {"optimize_memory_usage": True, "replay_buffer_kwargs": {"handle_timeout_termination": False}, "reward_weights": {}},
         {"demonstration_fraction": 0.0, "guidance_kwargs": {"gate": False}, "observation_normalization": "none"},
         {"tau": 1.0, "target_update_interval": 7, "train_freq": (3, "step"), "gradient_steps": -1},
     ],

@@ -18,7 +18,6 @@ SMALL: dict[str, Any] = {
     **SHORT_WARM_UP,
     "policy_kwargs": {"net_arch": [16, 16]},
     "batch_size": 16,
-    "prior_updates": 3,
     "learning_starts": 5,
     "gradient_steps": -1,
     "seed": 3,
@@ -32,7 +31,7 @@ def test_a_run_stopped_within_an_episode_is_the_run_never_stopped(env_id: str, t
 
     def make() -> ActPC:
         env = make_vec_env(env_id, seed=5, env_kwargs={"horizon": 20})
-        return ActPC("MlpPolicy", env, demonstrations=made_up(env_id), alpha_ext=1.0, **SMALL)
+        return ActPC("MlpPolicy", env, demonstrations=made_up(env_id), **SMALL)
 
     straight = learn_straight(make, tmp_path / "straight", 65)
     resumed = learn_in_two(make, tmp_path / "resumed", 65, stop_at=33)

@@ -46,7 +46,7 @@ def test_algorithms_with_one_seed_see_the_same_states_rewards_and_ends(tmp_path:
     """While all act at random, by the same seed: 60 steps of two hoppers, several falls."""
     seen = []
     for algo in OFF_POLICY:
-        quick = {"guidance_kwargs": {"bc_updates": 1}, "exploration_noise": 0.0}
+        quick = {"guidance_kwargs": {"bc_updates": 1}, "action_noise": 0.0}
         model, env = prepare(algo, tmp_path, **(quick if algo == "actpc" else {}))
         recorder = Recorder()
         model.learn(120, callback=recorder)

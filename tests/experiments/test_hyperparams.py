@@ -32,7 +32,7 @@ DEFAULT_ENV = {"her": "GoalHopper-v5", **dict.fromkeys(("ppo", "sac", "trpo"), "
 # what would take long, and nothing else
 OFF_POLICY = {"learning_starts": 0, "buffer_size": 1000, "batch_size": 8}
 FEWER: dict[str, dict[str, Any]] = {
-    "actpc": {**OFF_POLICY, "prior_updates": 2},
+    "actpc": {**OFF_POLICY, "signal_kwargs.prior_updates": 2},
     "her": {**OFF_POLICY, "demonstration_fraction": 1.0},
     "bc": {"batch_size": 8},
     "bcq": {"batch_size": 8},

@@ -131,7 +131,7 @@ def test_a_run_folder_of_another_version_is_refused_with_the_reason() -> None:
 def test_a_preset_is_given_to_the_constructor_as_it_is() -> None:
     Path("p.yml").write_text(
         "default: {n_timesteps: 9, noise_type: normal, noise_std: 0.2, learning_rate: lin_4e-4, train_freq: [2, step], "
-        "prior_updates: 1, buffer_size: 100}",
+        "buffer_size: 100}",
         encoding="utf-8",
     )
     keywords = preset("SparseHopper-v5", "p.yml")

@@ -33,7 +33,7 @@ RUNGS = {
     "settling",
     "observation_normalization",
     "policy_kwargs.actor_kwargs.memory_weight",
-    "n_demonstration_transitions",
+    "n_demonstrations",
     "refresh_weight",
     "guidance",
     "guidance_kwargs.bc_updates",
@@ -105,8 +105,8 @@ def test_the_preset_has_the_papers_values(method: str, task: str, env_id: str) -
 
 # of the run, of the computation, or of nothing that the paper's preset turns on
 NOT_OF_THE_AGENT = set(
-    "policy env device seed verbose tensorboard_log stats_window_size optimize_memory_usage replay_buffer_class "
-    "guidance_kwargs demonstrations n_demonstrations action_noise".split()
+    "policy env device seed verbose tensorboard_log optimize_memory_usage replay_buffer_class "
+    "guidance_kwargs demonstrations".split()
 )
 OF_THE_AGENT = {"settling"}  # among the circuits' keywords
 
@@ -132,4 +132,4 @@ def flat(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 def test_the_faithful_preset_is_the_papers_but_for_its_rungs(env_id: str) -> None:
     paper, faithful = flat(load_preset("actpc_paper", env_id)), flat(load_preset("actpc_faithful", env_id))
     differing = {key for key in paper | faithful if paper.get(key, UNSET) != faithful.get(key, UNSET)} - {"n_timesteps"}
-    assert differing == (RUNGS - {"n_demonstration_transitions"} if "-v0" in env_id else RUNGS)
+    assert differing == (RUNGS - {"n_demonstrations"} if "-v0" in env_id else RUNGS)

@@ -108,7 +108,7 @@ def _fill(shared: Run, task: Run, variant: Run) -> Run:
         if own_demonstrations or run.env_kwargs:
             with closing(make_train_env(run.env, run.env_kwargs, 1, run.seed)) as env:
                 if own_demonstrations:
-                    fit_demonstrations(run.demonstrations, env, env.observation_space, env.action_space, None, None)
+                    fit_demonstrations(run.demonstrations, env, env.observation_space, env.action_space)
         return run
     except (ValueError, FileNotFoundError) as error:
         raise type(error)(f"{run.task}, {variant.name}: {error}") from error

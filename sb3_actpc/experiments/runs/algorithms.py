@@ -29,11 +29,8 @@ ALGORITHMS = {
     "td3": "sb3_actpc.baselines:TD3Demo",
     "trpo": "sb3_contrib:TRPO",
 }
-# constructor keywords that have an option of their own, or another name
-_OPTION_OF = {
-    **{name: f"--{name}" for name in ("env", "seed", "device", "demonstrations")},
-    "action_noise": "--set noise_type=normal --set noise_std=0.1",
-}
+# constructor keywords that have an option of their own
+_OPTION_OF = {name: f"--{name}" for name in ("env", "seed", "device", "demonstrations")}
 
 
 def known_algorithm(name: str) -> str:

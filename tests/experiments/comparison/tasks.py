@@ -75,7 +75,6 @@ def write_preset(path: Path = Path("small.yml"), **more: Any) -> None:
         "batch_size": 8,
         "buffer_size": 200,
         "policy_kwargs": {"net_arch": [8]},
-        "prior_updates": 3,
         "noise_type": "normal",
         "noise_std": 0.3,
         "learning_rate": 0.01,

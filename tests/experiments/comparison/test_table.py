@@ -74,7 +74,7 @@ def test_variants_and_tasks_of_a_file_have_settings_and_names_of_their_own() -> 
         steps=60,
     )
     assert [run.n_timesteps for run in runs] == [60, 20, 40, 20]
-    assert {key: runs[1].settings[key] for key in ("alpha_ep", "gamma")} == {"alpha_ep": 0.0, "gamma": 0.5}
+    assert (runs[1].settings["reward_weights"]["epistemic"], runs[1].settings["gamma"]) == (0.0, 0.5)
     few = {"env": "SparseReacher-v5", "task": "few", "settings": {"n_demonstrations": 2}}
     named = plan(envs=["SparseReacher-v5", few])
     assert [(run.task, run.settings.get("n_demonstrations")) for run in named] == [("SparseReacher-v5", None), ("few", 2)]

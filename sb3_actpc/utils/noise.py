@@ -1,0 +1,31 @@
+"""Exploration noise that is given as a number."""
+
+import numpy as np
+from stable_baselines3.common.noise import ActionNoise
+
+
+class GaussianNoise(ActionNoise):
+    """Independent Gaussian noise on every dimension of an action in [-1, 1].
+
+    :param std: standard deviation
+    :param shape: of an action
+    """
+
+    def __init__(self, std: float, shape: tuple[int, ...]) -> None:
+        super().__init__()
+        self.std = std
+        self.shape = shape
+
+    def __call__(self) -> np.ndarray:
+        """float32 of the action's shape, from NumPy's global generator as SB3's noises."""
+        return np.random.normal(size=self.shape).astype(np.float32) * np.float32(self.std)
+
+    def __repr__(self) -> str:
+        return f"GaussianNoise(std={self.std:g})"
+
+
+def as_action_noise(noise: ActionNoise | float | None, shape: tuple[int, ...]) -> ActionNoise | None:
+    """SB3's noise as it is, Gaussian noise for a standard deviation; None for 0 and None."""
+    if isinstance(noise, ActionNoise):
+        return noise
+    return GaussianNoise(noise, shape) if noise else None
