@@ -84,8 +84,9 @@ def main() -> int:
     size = sum(array.nbytes for array in buffer_arrays(model.replay_buffer).values()) / 2**20
     times: dict[str, list[float]] = {"numpy.save and fsync": [], "checkpoint": []}
     with tempfile.TemporaryDirectory(dir=args.folder) as name:
-        callback = CheckpointCallback(Path(name) / "checkpoints", handle_signals=False)
+        callback = CheckpointCallback(Path(name) / "checkpoints")
         callback.init_callback(model)
+        callback.close()  # Ctrl-C stops at once
         before = peak_megabytes()
         callback.save()
         raised = peak_megabytes() - before

@@ -4,9 +4,9 @@ Nothing here uses pickle: arrays are safetensors and ``.npy``, everything else i
 """
 
 from sb3_actpc.checkpoints.bundle import DamagedCheckpoint, find_bundle, list_bundles
-from sb3_actpc.checkpoints.callback import CheckpointCallback, continue_learning, load_checkpoint, restore, why_no_checkpoints
+from sb3_actpc.checkpoints.callback import CheckpointCallback, continue_learning, load_checkpoint, why_no_checkpoints
 from sb3_actpc.checkpoints.interrupts import EXIT_STOPPED, StopSignals, TrainingStopped
-from sb3_actpc.checkpoints.state import Restored
+from sb3_actpc.checkpoints.state import Restored, restore
 
 __all__ = [
     "EXIT_STOPPED",

@@ -5,12 +5,12 @@ import json
 import os
 import re
 import shutil
-import uuid
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -71,32 +71,29 @@ def write_bundle(folder: Path, num_timesteps: int, keep: int, manifest: Mapping[
     folder.mkdir(parents=True, exist_ok=True)
     for left in folder.glob(f"{_TEMPORARY}*"):  # of a killed process
         shutil.rmtree(left, ignore_errors=True)
-    temporary = folder / f"{_TEMPORARY}{uuid.uuid4().hex[:12]}"
-    temporary.mkdir()
-    try:
+    with TemporaryDirectory(prefix=_TEMPORARY, dir=folder, ignore_cleanup_errors=True) as temporary:
+        bundle = Path(temporary) / "new"
+        bundle.mkdir()
 
         def write(name: str, content: bytes | np.ndarray) -> None:
-            with named_errors(temporary / name):
+            with named_errors(bundle / name):
                 if isinstance(content, bytes):
-                    (temporary / name).write_bytes(content)
+                    (bundle / name).write_bytes(content)
                 else:
-                    np.save(temporary / name, content, allow_pickle=False)
+                    np.save(bundle / name, content, allow_pickle=False)
 
         yield write
-        names = sorted(path.name for path in temporary.iterdir())
+        paths = sorted(bundle.iterdir())
         with ThreadPoolExecutor(max_workers=4) as workers:
-            files = dict(zip(names, workers.map(lambda name: _seal(temporary / name), names), strict=True))
+            digests = list(workers.map(_seal, paths))
+        files = {path.name: digest for path, digest in zip(paths, digests, strict=True)}
         record = {"version": VERSION, "num_timesteps": num_timesteps, **manifest, "files": files}
         write(MANIFEST, json.dumps({**record, "sha256": manifest_hash(record)}).encode())
-        _seal(temporary / MANIFEST)
+        _seal(bundle / MANIFEST)
         number = 1 + max((int(path.name.partition("_")[0]) for path in list_bundles(folder)), default=0)
-        os.replace(temporary, folder / f"{number:06d}_step_{num_timesteps}")
-    except BaseException:
-        shutil.rmtree(temporary, ignore_errors=True)
-        raise
-    for old in list_bundles(folder)[:-keep]:  # renamed first: a bundle never has its name while half of it is gone
-        os.replace(old, temporary)
-        shutil.rmtree(temporary, ignore_errors=True)
+        os.replace(bundle, folder / f"{number:06d}_step_{num_timesteps}")
+        for old in list_bundles(folder)[:-keep]:  # renamed first: a bundle never has its name while half of it is gone
+            os.replace(old, Path(temporary) / old.name)
 
 
 def list_bundles(folder: str | os.PathLike[str]) -> list[Path]:

@@ -15,13 +15,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 
 from sb3_actpc.checkpoints.bundle import Report, find_bundle, list_bundles, write_bundle
 from sb3_actpc.checkpoints.interrupts import StopSignals, TrainingStopped
-from sb3_actpc.checkpoints.state import (
-    Restored,
-    capture_model,
-    describe_model,
-    restore_learning,
-    restore_model,
-)
+from sb3_actpc.checkpoints.state import Restored, capture_model, describe_model, restore
 from sb3_actpc.utils.callbacks import callback_tree
 from sb3_actpc.utils.checks import check_finite
 from sb3_actpc.utils.settings import constructor_settings, read_settings
@@ -38,11 +32,8 @@ class CheckpointCallback(BaseCallback):
     :param folder: of this run's checkpoints; made when it does not exist
     :param save_freq: environment steps between two checkpoints
     :param keep: how many stay
-    :param handle_signals: save and stop on SIGTERM and SIGINT
     :param at_end: also save when ``learn`` ends
     :param report: given a line when something cannot be saved or restored; by default a warning
-    :param restored: what :func:`restore` returned, where this ``learn`` goes on from a checkpoint; :func:`continue_learning`
-        says so itself
     """
 
     def __init__(
@@ -50,17 +41,18 @@ class CheckpointCallback(BaseCallback):
         folder: str | os.PathLike[str],
         save_freq: int = 10_000,
         keep: int = 3,
-        handle_signals: bool = True,
         at_end: bool = True,
         report: Report = warnings.warn,
-        restored: Restored | None = None,
     ) -> None:
         if save_freq < 1 or keep < 1:
             raise ValueError(f"save_freq={save_freq!r} and keep={keep!r} must be at least 1")
         super().__init__()
-        self.folder, self.save_freq, self.keep = Path(folder), save_freq, keep
-        self.handle_signals, self.at_end = handle_signals, at_end
-        self.report, self.restored = report, restored
+        self.folder = Path(folder)
+        self.save_freq = save_freq
+        self.keep = keep
+        self.at_end = at_end
+        self.report = report
+        self.restored: Restored | None = None  # what ``learn`` goes on from; :func:`continue_learning` sets it
         self.signals = StopSignals()
         self._others: list[BaseCallback] = []
         self._last_saved = 0
@@ -80,15 +72,15 @@ class CheckpointCallback(BaseCallback):
         return list_bundles(self.folder)[-1]
 
     def _init_callback(self) -> None:
-        if reason := why_no_checkpoints(type(self.model)):
+        reason = why_no_checkpoints(type(self.model))
+        if reason:
             raise ValueError(f"{type(self.model).__name__} {reason}: leave the callback out")
         self.folder.mkdir(parents=True, exist_ok=True)
         if self.restored is None and not self._last_saved and list_bundles(self.folder):
             self.report(
                 f"{self.folder} holds checkpoints of another run, which this one's replace: give each run its own folder"
             )
-        if self.handle_signals:
-            self.signals.install()
+        self.signals.install()
 
     def _on_training_start(self) -> None:
         self._others = [one for one in callback_tree(self.locals.get("callback")) if one is not self]
@@ -106,9 +98,11 @@ class CheckpointCallback(BaseCallback):
             self._save_or_report()
 
     def _on_step(self) -> bool:
-        step, seen = self.num_timesteps, self.locals["new_obs"]
+        step = self.num_timesteps
         check_finite("agent", "actions", np.asarray(self.locals["actions"]), step)
-        for observations in seen.values() if isinstance(seen, dict) else [seen]:
+        seen = self.locals["new_obs"]
+        parts = seen.values() if isinstance(seen, dict) else [seen]
+        for observations in parts:
             check_finite("environment", "observations", observations, step)
         check_finite("environment", "rewards", self.locals["rewards"], step)
         return True
@@ -120,9 +114,9 @@ class CheckpointCallback(BaseCallback):
             self._save_or_report()
 
     def _resume(self) -> None:
-        restored, self.restored = self.restored, None
-        if restored is not None:
-            restore_learning(restored, self._others)
+        if self.restored is not None:
+            self.restored.put_back(self._others)
+            self.restored = None
 
     def _save_or_report(self) -> None:
         """A full disk does not end the training: the checkpoints written before stay."""
@@ -138,20 +132,6 @@ def why_no_checkpoints(algorithm: type[BaseAlgorithm]) -> str:
     False`` in the class says that SB3's state is not all of its own."""
     learns_by_rollouts = issubclass(algorithm, (OffPolicyAlgorithm, OnPolicyAlgorithm))
     return "" if learns_by_rollouts and getattr(algorithm, "is_resumable", True) else "keeps no checkpoints"
-
-
-def restore(model: BaseAlgorithm, path: str | os.PathLike[str], report: Report = warnings.warn) -> Restored:
-    """
-    Put a checkpoint back into an agent made with the settings of the stopped run; :func:`continue_learning` goes on with it.
-
-    :param model: the agent, with an environment made as the stopped run's
-    :param path: a checkpoint, or the folder of several: the newest whole one is taken
-    :param report: given a line for each damaged checkpoint, and when episodes must start again
-    :return: the agent (``model``), and what is put back when it learns
-    :raises FileNotFoundError: when there is no checkpoint
-    :raises ValueError: when it is damaged, does not fit or was written in another version of the format
-    """
-    return restore_model(model, find_bundle(path, report), report)
 
 
 def load_checkpoint(
@@ -175,7 +155,7 @@ def load_checkpoint(
     if stored != algorithm.__name__:
         raise ValueError(f"{bundle.path} is a checkpoint of {stored}, not {algorithm.__name__}: load it with that class")
     keywords = read_settings(bundle.manifest["settings"], overrides)
-    return restore_model(algorithm(env=env, device=device, **keywords), bundle, report)
+    return restore(algorithm(env=env, device=device, **keywords), bundle, report)
 
 
 def continue_learning(restored: Restored, callback: MaybeCallback = None, **options: Any) -> BaseAlgorithm:

@@ -5,8 +5,8 @@ is written once, and a value may hold itself. What cannot be written becomes a n
 their names, and objects by their attributes: the program that reads must have them.
 """
 
-import copyreg
 import functools
+import inspect
 import logging
 import pathlib
 import random
@@ -14,7 +14,6 @@ import sys
 import types
 from collections import Counter, OrderedDict, deque
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from enum import Enum
 from typing import Any
 
@@ -26,8 +25,6 @@ from gymnasium.envs.registration import EnvSpec
 from stable_baselines3.common.monitor import ResultsWriter
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_actpc.checkpoints.physics import capture_physics, restore_physics
-
 Node = dict[str, Any]
 _DICTS: tuple[type, ...] = (dict, OrderedDict, Counter)
 _CONTAINERS: dict[str, Any] = {kind.__name__: kind for kind in (list, tuple, set, frozenset, deque, *_DICTS)}
@@ -36,7 +33,78 @@ _UNCHANGED: tuple[Any, ...] = (
     *(type, np.dtype, th.device, types.ModuleType, logging.Logger, pathlib.PurePath),
     *(EnvSpec, ResultsWriter, mujoco.MjModel),
 )
+# how a class says that its objects are copied in another way than by their attributes
+_COPIED_BY = ("__reduce__", "__reduce_ex__", "__getnewargs__", "__getnewargs_ex__", "__getstate__", "__setstate__")
 _METHODS = (types.MethodType, types.BuiltinFunctionType)
+# attributes of environments that the constructors make again, or the next step, and the time of the clock
+_SKIPPED = {"metadata", "_metadata", "spec", "_cached_spec", "results_writer", "t_start"}
+_SKIPPED_OF_VEC_ENVS = {"metadata", "class_attributes", "buf_infos", "reset_infos", "results_writer", "t_start"}
+# each step of MuJoCo makes these again, and their memory is not always that of the data
+_IN_ARENA = ("efc_", "contact", "iefc_", "iM", "iLD", "iacc", "ifrc_")
+_INTEGRATION = mujoco.mjtState.mjSTATE_INTEGRATION
+
+
+def _class_name(value: Any) -> str:
+    return type(value.bit_generator if isinstance(value, np.random.Generator) else value).__qualname__
+
+
+def _name_of(thing: Any) -> str:
+    """What a function, a class or a module goes by, and others by their class."""
+    thing = thing.func if isinstance(thing, functools.partial) else thing
+    if isinstance(thing, types.ModuleType):
+        return thing.__name__
+    thing = thing if hasattr(thing, "__qualname__") else type(thing)
+    line = f":{thing.__code__.co_firstlineno}" if isinstance(thing, types.FunctionType) else ""
+    return f"{thing.__module__}.{thing.__qualname__}{line}"
+
+
+def _is_plain(value: Any) -> bool:
+    """Whether an object holds nothing but its attributes, by what Python's ``copy`` would do. Those of Python's own library
+    may stand for processes or files."""
+    kind = type(value)
+    is_of_python = kind.__module__.partition(".")[0] in sys.stdlib_module_names
+    copies_itself = any(getattr(kind, name, None) is not getattr(object, name, None) for name in _COPIED_BY)
+    if is_of_python or copies_itself or not hasattr(value, "__dict__"):
+        return False
+    try:
+        _, arguments, state, *items = value.__reduce_ex__(2)
+    except TypeError:  # object's own: it cannot be copied
+        return False
+    return arguments == (kind,) and isinstance(state, (dict, types.NoneType)) and items == [None, None]
+
+
+def _filled_cells(function: Any) -> list[Any]:
+    """Its closure's cells without those that hold nothing yet."""
+    return [cell for cell in function.__closure__ or () if cell != types.CellType()]
+
+
+def physics_arrays(data: mujoco.MjData) -> dict[str, np.ndarray]:
+    """MuJoCo's real arrays whose sizes the model sets, by name; indices are scratch memory."""
+    named = {name: getattr(data, name) for name in dir(data) if not name.startswith(("_", *_IN_ARENA))}
+    arrays = {name: value for name, value in named.items() if isinstance(value, np.ndarray)}
+    return {name: value for name, value in arrays.items() if value.dtype.kind == "f" and value.size}
+
+
+def capture_physics(data: mujoco.MjData) -> dict[str, np.ndarray]:
+    """The full integration state, (n,) float64 under "", and copies of the other arrays, since some lag behind the state."""
+    state = np.empty(mujoco.mj_stateSize(data.model, _INTEGRATION))
+    mujoco.mj_getState(data.model, data, state, _INTEGRATION)
+    return {"": state, **{name: np.array(value) for name, value in physics_arrays(data).items()}}
+
+
+def restore_physics(data: mujoco.MjData, arrays: dict[str, np.ndarray]) -> None:
+    """Put back what :func:`capture_physics` returned; ValueError when it is of another simulation."""
+    size = len(arrays[""])
+    own = mujoco.mj_stateSize(data.model, _INTEGRATION)
+    if size != own:
+        raise ValueError(f"the simulator had {size} state variables, this one has {own}")
+    mujoco.mj_setState(data.model, data, arrays[""], _INTEGRATION)
+    mujoco.mj_forward(data.model, data)
+    for name, value in physics_arrays(data).items():
+        if name in arrays and arrays[name].shape == value.shape:
+            value[...] = arrays[name]
+
+
 # made from one array
 _FROM_ARRAY: dict[str, Callable[[np.ndarray], Any]] = {
     "array": np.copy,
@@ -61,47 +129,6 @@ _STATES: dict[str, tuple[Any, Callable[[Any], Any], Callable[[Any, Any], None]]]
     "random": (random.Random, random.Random.getstate, random.Random.setstate),
     "physics": (mujoco.MjData, capture_physics, restore_physics),
 }
-# attributes of environments that the constructors make again, or the next step, and the time of the clock
-_SKIPPED = {"metadata", "_metadata", "spec", "_cached_spec", "results_writer", "t_start"}
-_SKIPPED_OF_VEC_ENVS = {"metadata", "class_attributes", "buf_infos", "reset_infos", "results_writer", "t_start"}
-
-
-def _class_name(value: Any) -> str:
-    return type(value.bit_generator if isinstance(value, np.random.Generator) else value).__qualname__
-
-
-def _name_of(thing: Any) -> str:
-    """What a function, a class or a module goes by, and others by their class."""
-    thing = thing.func if isinstance(thing, functools.partial) else thing
-    if isinstance(thing, types.ModuleType):
-        return thing.__name__
-    thing = thing if hasattr(thing, "__qualname__") else type(thing)
-    line = f":{thing.__code__.co_firstlineno}" if isinstance(thing, types.FunctionType) else ""
-    return f"{thing.__module__}.{thing.__qualname__}{line}"
-
-
-def _is_plain(value: Any) -> bool:
-    """Whether an object holds nothing but its attributes, by what Python's ``copy`` would do. Those of Python's own library
-    may stand for processes or files."""
-    is_of_python = type(value).__module__.partition(".")[0] in sys.stdlib_module_names
-    if is_of_python or not hasattr(value, "__dict__") or hasattr(value, "__setstate__"):
-        return False
-    try:
-        make, arguments, state, *items = value.__reduce_ex__(2)
-    except Exception:  # what cannot be copied, and what copies itself in another way
-        return False
-    is_new = make is copyreg.__newobj__ and arguments == (type(value),)  # type: ignore[attr-defined]
-    return is_new and isinstance(state, (dict, types.NoneType)) and items == [None, None]
-
-
-def _filled_cells(function: Any) -> list[Any]:
-    """Its closure's cells without those that hold nothing yet."""
-    cells = []
-    for cell in function.__closure__ or ():
-        with suppress(ValueError):
-            cell.cell_contents  # noqa: B018
-            cells.append(cell)
-    return cells
 
 
 class Encoder:
@@ -188,13 +215,14 @@ class Encoder:
         return {**node, **maxlen, "items": [self.encode(part) for part in value]}
 
     def _object(self, value: Any) -> Node:
-        skipped = {*getattr(value, "checkpoint_skipped", ())}
+        # statically: SB3's wrappers pass on attributes of what they wrap
+        skipped = set(inspect.getattr_static(value, "checkpoint_skipped", ()))
         if isinstance(value, gym.Env):
             skipped |= _SKIPPED
         elif isinstance(value, VecEnv):
             skipped |= _SKIPPED_OF_VEC_ENVS
         kept = {name: one for name, one in vars(value).items() if name not in skipped}
-        own = self.encode(value.checkpoint_state()) if hasattr(value, "checkpoint_state") else None
+        own = self.encode(value.checkpoint_state()) if hasattr(type(value), "checkpoint_state") else None
         return {"kind": "object", "name": _name_of(value), "own": own, "attributes": self.encode_each(kept)}
 
 
@@ -203,7 +231,8 @@ class Decoder:
     and why (``lost``)."""
 
     def __init__(self, nodes: Sequence[Node], arrays: Mapping[str, np.ndarray]) -> None:
-        self.nodes, self.arrays = nodes, arrays
+        self.nodes = nodes
+        self.arrays = arrays
         self.lost: list[str] = []
         self._made: dict[int, Any] = {}
         self._used: set[int] = set()  # ids of what has been given a state
@@ -219,17 +248,8 @@ class Decoder:
             return value
         (number,) = value
         if number not in self._made:
-            node = self.nodes[number]
-            kind = node["kind"]
             try:
-                if kind in _FROM_ARRAY:
-                    self._made[number] = _FROM_ARRAY[kind](self.arrays[node["array"]])
-                elif kind in _CONTAINERS:
-                    self._made[number] = self._container(node, existing, number)
-                elif kind in _STATES:
-                    self._put_state(node, existing, number)
-                else:
-                    self._made[number] = getattr(self, f"_{kind}")(node, existing, number)
+                self._made[number] = self._make(number, existing)
             except ValueError:
                 self._made.pop(number, None)  # lost for those who refer to it later, too
                 raise
@@ -243,26 +263,53 @@ class Decoder:
             except ValueError as error:
                 self.lost.append(f"{type(owner).__qualname__}.{name}: {error}")
 
-    def _container(self, node: Node, existing: Any, number: int) -> Any:
-        kind, items = _CONTAINERS[node["kind"]], node["items"]
-        if kind in _DICTS:
-            self._made[number] = made = kind()
-            old = existing if isinstance(existing, dict) else {}
-            for key_node, part in items:
-                key = self.decode(key_node)
-                made[key] = self.decode(part, old.get(key))
-            return made
-        if kind in (list, deque):
-            self._made[number] = made = deque(maxlen=node["maxlen"]) if kind is deque else []
+    def _make(self, number: int, existing: Any) -> Any:
+        node = self.nodes[number]
+        kind = node["kind"]
+        if kind == "lost":
+            raise ValueError(node["reason"])
+        if kind in _FROM_ARRAY:
+            return _FROM_ARRAY[kind](self.arrays[node["array"]])
+        if kind in _CONTAINERS:
+            return self._container(number, existing)
+        if kind in _STATES:
+            return self._with_state(number, existing)
+        if kind == "method":
+            return self._method(node, existing)
+        if _name_of(existing) != node["name"]:
+            raise ValueError(f"it was {node['name']}, and is {_name_of(existing)} when made again")
+        if kind == "enum":
+            return type(existing)(self.decode(node["value"]))
+        self._made[number] = existing  # what it holds may refer to it
+        if kind == "function":
+            self._fill_cells(node, existing)
+        if kind == "object":
+            self._fill(node, existing)
+        return existing
+
+    def _container(self, number: int, existing: Any) -> Any:
+        node = self.nodes[number]
+        kind = _CONTAINERS[node["kind"]]
+        items = node["items"]
+        if kind not in (list, deque, *_DICTS):  # it cannot hold itself
+            return kind(self._parts(items, existing))
+        made = deque(maxlen=node["maxlen"]) if kind is deque else kind()
+        self._made[number] = made
+        if kind not in _DICTS:
             made.extend(self._parts(items, existing))
             return made
-        return kind(self._parts(items, existing))
+        old = existing if isinstance(existing, dict) else {}
+        for key_node, part in items:
+            key = self.decode(key_node)
+            made[key] = self.decode(part, old.get(key))
+        return made
 
     def _parts(self, items: list[Any], existing: Any) -> list[Any]:
         old = list(existing) if isinstance(existing, (list, tuple, deque)) else []
         return [self.decode(part, old[index] if index < len(old) else None) for index, part in enumerate(items)]
 
-    def _put_state(self, node: Node, existing: Any, number: int) -> None:
+    def _with_state(self, number: int, existing: Any) -> Any:
+        node = self.nodes[number]
         name = node["name"]
         if _class_name(existing) != name or (name in _NEW and id(existing) in self._used):
             if name not in _NEW:
@@ -270,40 +317,26 @@ class Decoder:
             existing = _NEW[name]()
         self._used.add(id(existing))
         self._made[number] = existing
-        _STATES[node["kind"]][2](existing, self.decode(node["state"]))
-
-    def _object(self, node: Node, existing: Any, number: int) -> Any:
-        self._unchanged(node, existing, number)
-        if id(existing) in self._used:
-            raise ValueError(f"it was a second {node['name']}, and is the same one when made again")
-        self._used.add(id(existing))
-        self._made[number] = existing
-        if node["own"] is not None:
-            existing.restore_checkpoint_state(self.decode(node["own"]))
-        self.decode_into(existing, node["attributes"])
+        put_back = _STATES[node["kind"]][2]
+        put_back(existing, self.decode(node["state"]))
         return existing
 
-    def _lost(self, node: Node, existing: Any, number: int) -> Any:
-        raise ValueError(node["reason"])
-
-    def _unchanged(self, node: Node, existing: Any, number: int) -> Any:
-        if _name_of(existing) != node["name"]:
-            raise ValueError(f"it was {node['name']}, and is {_name_of(existing)} when made again")
-        return existing
-
-    def _enum(self, node: Node, existing: Any, number: int) -> Any:
-        return type(self._unchanged(node, existing, number))(self.decode(node["value"]))
-
-    def _function(self, node: Node, existing: Any, number: int) -> Any:
-        self._made[number] = self._unchanged(node, existing, number)
-        cells = _filled_cells(existing)
-        contents = self.decode(node["cells"], [cell.cell_contents for cell in cells])
-        for cell, content in zip(cells, contents, strict=True):
-            cell.cell_contents = content
-        return existing
-
-    def _method(self, node: Node, existing: Any, number: int) -> Any:
+    def _method(self, node: Node, existing: Any) -> Any:
         method = getattr(self.decode(node["of"], getattr(existing, "__self__", None)), node["name"], None)
         if method is None:
             raise ValueError(f"it was the method {node['name']}, which is not there now")
         return method
+
+    def _fill_cells(self, node: Node, function: Any) -> None:
+        cells = _filled_cells(function)
+        contents = self.decode(node["cells"], [cell.cell_contents for cell in cells])
+        for cell, content in zip(cells, contents, strict=True):
+            cell.cell_contents = content
+
+    def _fill(self, node: Node, existing: Any) -> None:
+        if id(existing) in self._used:
+            raise ValueError(f"it was a second {node['name']}, and is the same one when made again")
+        self._used.add(id(existing))
+        if node["own"] is not None:
+            existing.restore_checkpoint_state(self.decode(node["own"]))
+        self.decode_into(existing, node["attributes"])

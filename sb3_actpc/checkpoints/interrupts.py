@@ -6,7 +6,6 @@ from types import FrameType
 from typing import Any
 
 EXIT_STOPPED = 75  # EX_TEMPFAIL of sysexits.h: not finished, try again
-STOP_SIGNALS = (signal.SIGTERM, signal.SIGINT)
 
 
 class TrainingStopped(SystemExit):
@@ -15,7 +14,9 @@ class TrainingStopped(SystemExit):
 
     def __init__(self, signal_name: str, num_timesteps: int, checkpoint: str) -> None:
         super().__init__(EXIT_STOPPED)
-        self.signal_name, self.num_timesteps, self.checkpoint = signal_name, num_timesteps, checkpoint
+        self.signal_name = signal_name
+        self.num_timesteps = num_timesteps
+        self.checkpoint = checkpoint
 
     def __str__(self) -> str:
         return f"stopped by {self.signal_name} at step {self.num_timesteps}, saved in {self.checkpoint}"
@@ -36,7 +37,7 @@ class StopSignals:
         if self._old or threading.current_thread() is not threading.main_thread():
             return
         self.received = None
-        for number in STOP_SIGNALS:
+        for number in (signal.SIGTERM, signal.SIGINT):
             self._old[number] = signal.signal(number, self._handle)
 
     def restore(self) -> None:

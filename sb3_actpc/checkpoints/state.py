@@ -2,7 +2,9 @@
 
 import inspect
 import json
+import os
 import random
+import warnings
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,13 +23,14 @@ from stable_baselines3.common.save_util import recursive_getattr
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
-from sb3_actpc.checkpoints.bundle import Bundle, Report, Write
+from sb3_actpc.checkpoints.bundle import Bundle, Report, Write, find_bundle
 from sb3_actpc.checkpoints.encoding import Decoder, Encoder
 from sb3_actpc.utils.extras import installed_version
 from sb3_actpc.utils.tasks import task_id
 from sb3_actpc.utils.weights import check_weights
 
-STATE, ARRAYS = "state.json", "arrays.safetensors"
+STATE = "state.json"
+ARRAYS = "arrays.safetensors"
 _COUNTERS = (
     *("num_timesteps", "_total_timesteps", "_num_timesteps_at_start", "_n_updates", "_n_calls", "_episode_num"),
     *("_current_progress_remaining", "exploration_rate", "_last_obs", "_last_original_obs", "_last_episode_starts"),
@@ -51,6 +54,34 @@ class Restored:
     decoder: Decoder
     starts_again: bool = False
 
+    def put_back(self, callbacks: Sequence[BaseCallback]) -> None:
+        """Put back what the beginning of ``learn`` has changed or made: callbacks, logger, action noise, generators. Callbacks
+        with ``cut_running_episodes`` are told where episodes start again."""
+        model = self.model
+        decoder = self.decoder
+        for name, callback in _named(callbacks).items():
+            kept = self.state["callbacks"].get(name)
+            if kept is None:
+                continue
+            if hasattr(callback, "restore_checkpoint_state"):
+                callback.restore_checkpoint_state({key: decoder.decode(node) for key, node in kept.items()})
+            else:
+                decoder.decode_into(callback, kept)
+            if self.starts_again and hasattr(callback, "cut_running_episodes"):
+                callback.cut_running_episodes()
+        _restore_logger(model, decoder.decode(self.state["logger"]))
+        decoder.decode(self.state["noise"], getattr(model, "action_noise", None))
+        for name, value in decoder.decode(self.state["matrices"]).items():
+            if value is not None:
+                setattr(_action_dist(model), name, value.to(model.device))
+        decoder.decode(self.state["spaces"], [model.action_space, model.observation_space])
+        generators = decoder.decode(self.state["generators"])
+        random.setstate(generators["python"])
+        np.random.set_state(generators["numpy"])
+        th.set_rng_state(generators["torch"])
+        if generators["cuda"] is not None and model.device.type == "cuda":
+            th.cuda.set_rng_state(generators["cuda"], model.device)
+
 
 def capture_model(model: BaseAlgorithm, callbacks: Sequence[BaseCallback], write: Write) -> None:
     """Write everything that the rest of the training depends on, between two rollouts; ValueError when a weight is not finite,
@@ -72,7 +103,7 @@ def capture_model(model: BaseAlgorithm, callbacks: Sequence[BaseCallback], write
         },
         "spaces": [model.action_space, model.observation_space],
         "noise": getattr(model, "action_noise", None),
-        "own": _own_state(model),
+        "own": model.checkpoint_state() if hasattr(model, "checkpoint_state") else None,
         "buffer": None if buffer is None else _buffer_state(buffer, write),
     }
     state = encoder.encode_each(values)
@@ -106,19 +137,29 @@ def describe_model(model: BaseAlgorithm) -> dict[str, Any]:
     }
 
 
-def restore_model(model: BaseAlgorithm, bundle: Bundle, report: Report) -> Restored:
-    """Put everything back into an agent that was made with the same settings, but for what :func:`restore_learning` puts back
-    once ``learn(..., reset_num_timesteps=False)`` has begun. ValueError, and nothing is changed, when the checkpoint is of
-    another algorithm, task, network or buffer."""
-    assert model.env is not None
-    mine, stored = describe_model(model)["agent"], bundle.manifest["agent"]
+def restore(model: BaseAlgorithm, path: str | os.PathLike[str] | Bundle, report: Report = warnings.warn) -> Restored:
+    """
+    Put a checkpoint back into an agent made with the settings of the stopped run; ``continue_learning`` goes on with it.
+
+    :param model: the agent, with an environment made as the stopped run's
+    :param path: a checkpoint, or the folder of several: the newest whole one is taken
+    :param report: given a line for each damaged checkpoint, and when episodes must start again
+    :return: the agent (``model``), and what :meth:`Restored.put_back` puts back when it learns
+    :raises FileNotFoundError: when there is no checkpoint
+    :raises ValueError: when it is damaged, was written in another version of the format, or is of another algorithm, task,
+        network or buffer; nothing is changed then
+    """
+    bundle = path if isinstance(path, Bundle) else find_bundle(path, report)
+    mine = describe_model(model)["agent"]
+    stored = bundle.manifest["agent"]
     for name in {**mine, **stored}:
         if stored.get(name) != mine.get(name):
             raise ValueError(
                 f"{bundle.path} is a checkpoint with {name}={stored.get(name)!r}, the agent has {name}={mine.get(name)!r}: "
                 "resume with the settings and the task of the stopped run"
             )
-    state, arrays = json.loads((bundle.path / STATE).read_bytes()), safetensors.numpy.load_file(bundle.path / ARRAYS)
+    state = json.loads((bundle.path / STATE).read_bytes())
+    arrays = safetensors.numpy.load_file(bundle.path / ARRAYS)
     decoder = Decoder(state["nodes"], arrays)
     decoder.decode(state["env"], model.env)
     lost = list(decoder.lost)
@@ -126,45 +167,17 @@ def restore_model(model: BaseAlgorithm, bundle: Bundle, report: Report) -> Resto
         recursive_getattr(model, name).load_state_dict(values)
     for name, value in decoder.decode(state["variables"]).items():
         recursive_getattr(model, name).data = value.to(model.device)
-    if (buffer := decoder.decode(state["buffer"])) is not None:
+    buffer = decoder.decode(state["buffer"])
+    if buffer is not None:
         _restore_buffer(getattr(model, "replay_buffer", None), buffer, bundle)
     vars(model).update(decoder.decode(state["counters"]))
-    _restore_own_state(model, decoder.decode(state["own"]))
+    own = decoder.decode(state["own"])
+    if own is not None:
+        model.restore_checkpoint_state(own)  # type: ignore[attr-defined]
     if lost:
         report(f"environments cannot be restored within their episodes, all episodes start again: {'; '.join(lost)}")
         _start_episodes_again(model)
     return Restored(model, state, Decoder(state["nodes"], arrays), bool(lost))
-
-
-def restore_learning(restored: Restored, callbacks: Sequence[BaseCallback]) -> None:
-    """Put back what the beginning of ``learn`` has changed or made: callbacks, logger, action noise, generators. Callbacks
-    with ``cut_running_episodes`` are told where episodes start again."""
-    model, state, decoder = restored.model, restored.state, restored.decoder
-    for name, callback in _named(callbacks).items():
-        if name in state["callbacks"]:
-            kept = state["callbacks"][name]
-            if hasattr(callback, "restore_checkpoint_state"):
-                callback.restore_checkpoint_state({key: decoder.decode(node) for key, node in kept.items()})
-            else:
-                decoder.decode_into(callback, kept)
-            if restored.starts_again and hasattr(callback, "cut_running_episodes"):
-                callback.cut_running_episodes()
-    if (logger := decoder.decode(state["logger"])) is not None:
-        _restore_logger(model, logger)
-    decoder.decode(state["noise"], getattr(model, "action_noise", None))
-    for name, value in decoder.decode(state["matrices"]).items():
-        if value is not None:
-            setattr(_action_dist(model), name, value.to(model.device))
-    decoder.decode(state["spaces"], [model.action_space, model.observation_space])
-    states = decoder.decode(state["generators"])
-    random.setstate(states["python"])
-    np.random.set_state(states["numpy"])
-    th.set_rng_state(states["torch"])
-    if states["cuda"] is not None and model.device.type == "cuda":
-        th.cuda.set_rng_state(states["cuda"], model.device)
-
-
-# ------------------------------------------------------------------ the agent
 
 
 def _named(callbacks: Sequence[BaseCallback]) -> dict[str, BaseCallback]:
@@ -173,22 +186,9 @@ def _named(callbacks: Sequence[BaseCallback]) -> dict[str, BaseCallback]:
     return {f"{kind}{1 + kinds[:index].count(kind)}": callbacks[index] for index, kind in enumerate(kinds)}
 
 
-def _own_state(thing: Any) -> Any:
-    """What an agent, a buffer or a callback keeps beside SB3's; None where it keeps nothing."""
-    return thing.checkpoint_state() if hasattr(thing, "checkpoint_state") else None
-
-
-def _restore_own_state(thing: Any, state: Any) -> None:
-    if state is not None:
-        thing.restore_checkpoint_state(state)
-
-
 def _action_dist(model: BaseAlgorithm) -> Any:
     """What draws state-dependent exploration; None without it."""
     return getattr(getattr(model, "actor", model.policy), "action_dist", None) if model.use_sde else None
-
-
-# ------------------------------------------------------------------ the buffer
 
 
 def buffer_arrays(buffer: ReplayBuffer) -> dict[str, np.ndarray]:
@@ -207,14 +207,16 @@ def _buffer_state(buffer: ReplayBuffer, write: Write) -> dict[str, Any]:
         write(f"buffer_{index:02d}.npy", array[:rows])
     infos = buffer.infos[:rows].tolist() if isinstance(buffer, HerReplayBuffer) and buffer.copy_info_dict else []
     cursors = {name: vars(buffer)[name] for name in _BUFFER_CURSORS if name in vars(buffer)}
-    return {"rows": rows, "cursors": cursors, "own": _own_state(buffer), "infos": infos}
+    own = buffer.checkpoint_state() if hasattr(buffer, "checkpoint_state") else None
+    return {"rows": rows, "cursors": cursors, "own": own, "infos": infos}
 
 
 def _restore_buffer(buffer: Any, state: dict[str, Any], bundle: Bundle) -> None:
     for index, array in enumerate(buffer_arrays(buffer).values()):
         array[: state["rows"]] = np.load(bundle.path / f"buffer_{index:02d}.npy", mmap_mode="r", allow_pickle=False)
     vars(buffer).update(state["cursors"])
-    _restore_own_state(buffer, state["own"])
+    if state["own"] is not None:
+        buffer.restore_checkpoint_state(state["own"])
     for row, entries in enumerate(state["infos"]):
         buffer.infos[row] = entries
 
@@ -224,14 +226,12 @@ def _start_episodes_again(model: BaseAlgorithm) -> None:
     assert model.env is not None
     if model.seed is not None and not isinstance(model.env.unwrapped, DummyVecEnv):
         model.env.seed((model.seed + model.num_timesteps) % 2**31)  # their generators are out of reach
-    for name in ("cut_running_episodes", "truncate_last_trajectory"):  # of this package's buffers, and SB3's for hindsight
-        if cut := getattr(getattr(model, "replay_buffer", None), name, None):
-            cut()
-            break
+    buffer: Any = getattr(model, "replay_buffer", None)
+    if hasattr(buffer, "cut_running_episodes"):
+        buffer.cut_running_episodes()
+    elif isinstance(buffer, HerReplayBuffer):
+        buffer.truncate_last_trajectory()
     model._last_obs = None
-
-
-# ------------------------------------------------------------------ callbacks and logger
 
 
 def _callback_state(callback: Any) -> dict[str, Any]:
@@ -260,7 +260,9 @@ def _logger_state(model: BaseAlgorithm) -> dict[str, Any] | None:
     return {**{name: {k: v for k, v in one.items() if isinstance(v, _KEPT)} for name, one in values.items()}, "csv": texts}
 
 
-def _restore_logger(model: BaseAlgorithm, state: dict[str, Any]) -> None:
+def _restore_logger(model: BaseAlgorithm, state: dict[str, Any] | None) -> None:
+    if state is None:
+        return
     for name in _LOGGER_VALUES:
         target = getattr(model.logger, name)
         target.clear()

@@ -1,11 +1,19 @@
-"""Activation functions φ and the in-place multiplication by their derivatives, as settling needs them."""
+"""
+Activation functions φ and the in-place multiplication by their derivatives, as settling needs them, and layer normalization.
+
+Layer normalization acts on hidden latents: x = (z - mean) / std over the units of one layer, without learned scale or shift.
+Mean, variance and the sums of the backward pass are taken over one layer, so the operation is local to it (divisive
+normalization). With tied feedback the error that passes through it is, numerically, the one of autograd.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch as th
 
+EPSILON = 1e-5  # added to the variance, as in torch.nn.LayerNorm
+NORMALIZATIONS = ("none", "layer")
 aten = th.ops.aten
 Function = Callable[[th.Tensor, th.Tensor], th.Tensor]
 Derivative = Callable[[th.Tensor, th.Tensor, th.Tensor], th.Tensor]
@@ -57,3 +65,36 @@ ACTIVATIONS = {name: Activation(name, apply, damp) for name, (apply, damp) in _F
 def get_activation(name: str) -> Activation:
     """The activation of that name."""
     return ACTIVATIONS[name]
+
+
+class Normalized(NamedTuple):
+    """
+    Normalized latents with the statistics that the backward pass needs.
+
+    :param values: x, (..., B, n)
+    :param mean: of every row, (..., B, 1)
+    :param rstd: 1 / std of every row, (..., B, 1)
+    """
+
+    values: th.Tensor
+    mean: th.Tensor
+    rstd: th.Tensor
+
+
+def normalize(latents: th.Tensor) -> Normalized:
+    """Latents z, (..., B, n), normalized over the last dimension, and their statistics."""
+    return Normalized(*th.native_layer_norm(latents, latents.shape[-1:], None, None, EPSILON))
+
+
+def jacobian_product(signal: th.Tensor, latents: th.Tensor, normalized: Normalized) -> th.Tensor:
+    """
+    J s = (s - mean(s) - x mean(s x)) / std, with J the Jacobian of :func:`normalize`, which is symmetric.
+
+    :param signal: s, (..., B, n)
+    :param latents: z, (..., B, n)
+    :param normalized: of ``latents``
+    :return: (..., B, n)
+    """
+    _, mean, rstd = normalized
+    mask = [True, False, False]
+    return aten.native_layer_norm_backward(signal, latents, latents.shape[-1:], mean, rstd, None, None, mask)[0]

@@ -9,14 +9,11 @@ from typing import Any
 import torch as th
 from torch import nn
 
-from sb3_actpc.ngc.activations import ACTIVATIONS
-from sb3_actpc.ngc.dynamics import DYNAMICS, SettledState, SettlingChain
+from sb3_actpc.ngc.activations import ACTIVATIONS, EPSILON, NORMALIZATIONS, normalize
+from sb3_actpc.ngc.dynamics import DYNAMICS, SettledState, SettlingChain, damped, largest_norm_, settling_rates
 from sb3_actpc.ngc.krylov import settle_krylov
-from sb3_actpc.ngc.normalization import EPSILON, NORMALIZATIONS, jacobian_product, normalize
 from sb3_actpc.ngc.plasticity import SYNAPTIC_SCALINGS, HebbianChanges, bound_columns_, hebbian_changes, mirrored, soft_bound_
-from sb3_actpc.ngc.products import affine
-from sb3_actpc.ngc.stability import largest_norm_, settling_rates
-from sb3_actpc.ngc.synapses import Synapses
+from sb3_actpc.ngc.synapses import Synapses, affine
 
 LARGEST_SIZE = 2**20  # of a layer, and of the number of steps
 
@@ -58,7 +55,7 @@ class NGCCircuit(nn.Module):
     :param weight_decay: λ: before every change W, M and E shrink by 1 - ηλ (η the learning rate, as in AdamW); biases do not.
         E and W^T get changes in the same direction, so that what they were born with is what parts them; the decay forgets
         it in some 1/(ηλ) updates (Kolen & Pollack, 1994), and learned error synapses align
-    :param normalization: "layer" normalizes the hidden latents of a layer before φ (:mod:`~sb3_actpc.ngc.normalization`), in
+    :param normalization: "layer" normalizes the hidden latents of a layer before φ (:mod:`~sb3_actpc.ngc.activations`), in
         projection, sweep and settling alike; "none" for the paper's circuits
     :param n_members: M members of an ensemble, each with synapses of its own, which settle and change in the same products;
         0 for one circuit without a leading dimension
@@ -103,19 +100,29 @@ class NGCCircuit(nn.Module):
         _check_settings(dict(locals()))
         super().__init__()
         self.sizes = [n_inputs, *hidden, n_outputs]
-        self.activation, self.output_activation = ACTIVATIONS[activation], ACTIVATIONS[output_activation]
-        self.settling, self.n_settling_steps, self.dynamics = settling, n_settling_steps, dynamics
+        self.activation = ACTIVATIONS[activation]
+        self.output_activation = ACTIVATIONS[output_activation]
+        self.settling = settling
+        self.n_settling_steps = n_settling_steps
         self.settling_tolerance = settling_tolerance
-        self.settling_rate, self.leak, self.derivative_free = settling_rate, leak, derivative_free
-        self.feedback, self.feedback_scale, self.feedback_rate = feedback, feedback_scale, feedback_rate
-        self.synaptic_scaling, self.weight_bound, self.weight_decay = synaptic_scaling, weight_bound, weight_decay
-        self.normalization, self.n_members = normalization, n_members
-        self.n_memory, self.memory_weight = n_memory, memory_weight
+        self.dynamics = dynamics
+        self.leak = leak
+        self.derivative_free = derivative_free
+        self.feedback = feedback
+        self.feedback_scale = feedback_scale
+        self.feedback_rate = feedback_rate
+        self.synaptic_scaling = synaptic_scaling
+        self.weight_bound = weight_bound
+        self.weight_decay = weight_decay
+        self.normalization = normalization
+        self.n_members = n_members
+        self.n_memory = n_memory
+        self.memory_weight = memory_weight
         self.n_feedback_inputs = n_feedback_inputs
         self._create_synapses()
         if feedback_start == "mirrored":
             self.mirror_feedback()
-        self._create_rates()
+        self._create_rates(settling_rate)
 
     # ------------------------------------------------------------------ synapses
 
@@ -143,19 +150,19 @@ class NGCCircuit(nn.Module):
         # the same parameters as plain lists: indexing a ParameterList costs more than a small product
         self.synapses = Synapses(*map(list, (self.weights, self.biases, self.memory_weights, self.feedback_weights)))
 
-    def _create_rates(self) -> None:
+    def _create_rates(self, settling_rate: float | str) -> None:
         moves_by_rates = self.settling == "iterative" and self.dynamics != "krylov"
-        self._keep_rates = moves_by_rates and self.settling_rate == "auto" and self.n_hidden > 0
+        self._keep_rates = moves_by_rates and settling_rate == "auto" and self.n_hidden > 0
         self.register_load_state_dict_post_hook(_follow_loaded)
         # others are the constructor's, and do not travel with the synapses
-        self.register_buffer("rates", th.zeros(max(1, self.n_hidden)), persistent=self._keep_rates)
+        self.register_buffer("rates", th.zeros(max(1, self.n_hidden)), persistent=self._keep_rates)  # β, first layer first
         if self._keep_rates:
             for name, matrix in self._coupling_matrices():
                 start = th.ones(*matrix.shape[:-2], matrix.shape[-1])
                 self.register_buffer(name, th.nn.functional.normalize(start, dim=-1))
             self.update_settling_rates(n_iterations=30)
-        elif self.settling_rate != "auto":
-            self.rates.fill_(float(self.settling_rate))
+        elif settling_rate != "auto":
+            self.rates.fill_(float(settling_rate))
 
     def mirror_feedback(self) -> None:
         """
@@ -202,7 +209,9 @@ class NGCCircuit(nn.Module):
         biases = self.synapses.layer_biases(memory, self.memory_weight)
         layers = self.synapses.weights
         if members is not None:
-            x, biases, layers = x[: len(members)], [b[members] for b in biases], [w[members] for w in layers]
+            x = x[: len(members)]
+            biases = [bias[members] for bias in biases]
+            layers = [weights[members] for weights in layers]
         for weights, bias in zip(layers[:-1], biases[:-1], strict=True):
             latents = affine(bias, x, weights)
             if self.normalization == "layer":
@@ -237,15 +246,11 @@ class NGCCircuit(nn.Module):
         if self.dynamics == "krylov":
             chain.n_steps = settle_krylov(chain, self.n_settling_steps, self.settling_tolerance)
             return chain.state()
-        rates = self.layer_rates()
+        rates = self.rates.tolist()
         for chain.n_steps in range(1, self.n_settling_steps + 1):
             chain.integrate(rates)
             chain.predict()
         return chain.state()
-
-    def layer_rates(self) -> list[float]:
-        """β of every hidden layer, first layer first."""
-        return self.rates[: self.n_hidden].tolist()
 
     def chain(self, x: th.Tensor, memory: th.Tensor | None = None) -> SettlingChain:
         """The projected chain of this circuit's layers, to be clamped and settled; see :meth:`settle` for the shapes."""
@@ -253,7 +258,8 @@ class NGCCircuit(nn.Module):
 
     def _as_input(self, x: th.Tensor) -> th.Tensor:
         """``x``, checked; of an ensemble the same for every member, (M, B, n_inputs)."""
-        n, dtype = self.sizes[0], self.synapses.weights[0].dtype
+        n = self.sizes[0]
+        dtype = self.synapses.weights[0].dtype
         if not isinstance(x, th.Tensor) or x.dim() != 2 or x.shape[1] != n or x.dtype != dtype:
             found = f"a {x.dtype} tensor {tuple(x.shape)}" if isinstance(x, th.Tensor) else f"a {type(x).__name__}"
             raise ValueError(f"this circuit takes inputs of shape (B, {n}), a {dtype} tensor, but was given {found}")
@@ -265,22 +271,19 @@ class NGCCircuit(nn.Module):
 
         1 at the projected start of a circuit with one hidden layer, 0 at a fixed point.
         """
-        moves, drives = [], []
+        moves = []
+        drives = []
         for layer in range(1, self.n_hidden + 1):
+            latents = state.latents[layer]
             signal = state.postsynaptic[layer] @ self.synapses.feedback_matrix(layer, self.feedback_scale)
             if not self.derivative_free:
-                signal = self._damped(signal, state.latents[layer], state.activations[layer])
+                normalized = normalize(latents) if self.normalization == "layer" else None
+                signal = damped(self.activation, signal, latents, state.activations[layer], normalized)
             drives.append(signal.square().sum())
-            moves.append((signal - state.errors[layer - 1] - self.leak * state.latents[layer]).square().sum())
+            moves.append((signal - state.errors[layer - 1] - self.leak * latents).square().sum())
         if not moves:
             return th.zeros(())
         return (th.stack(moves).sum() / th.stack(drives).sum().clamp_min(1e-30)).sqrt()
-
-    def _damped(self, signal: th.Tensor, latents: th.Tensor, activations: th.Tensor) -> th.Tensor:
-        if self.normalization == "none":
-            return self.activation.damp(signal, latents, activations)
-        normalized = normalize(latents)
-        return jacobian_product(self.activation.damp(signal, normalized.values, activations), latents, normalized)
 
     # ------------------------------------------------------------------ learning
 
@@ -357,7 +360,8 @@ class NGCCircuit(nn.Module):
     def projection_copy(self) -> "NGCCircuit":
         """An equal circuit that only projects: a target circuit or a deployed policy. It has no learned error synapses."""
         twin = copy.deepcopy(self)
-        twin.feedback, twin.feedback_weights = "tied", nn.ParameterList()
+        twin.feedback = "tied"
+        twin.feedback_weights = nn.ParameterList()
         twin._list_synapses()
         return twin
 
@@ -382,10 +386,8 @@ class NGCCircuit(nn.Module):
         """The matrices between hidden layers and output, with the names of their power-iteration vectors."""
         named = [(f"singular_vector_{layer}", self.synapses.weights[layer]) for layer in range(1, self.n_hidden + 1)]
         if self.feedback == "learned":
-            named += [
-                (f"feedback_singular_vector_{layer}", self.synapses.feedback_matrix(layer, self.feedback_scale))
-                for layer in range(1, self.n_hidden + 1)
-            ]
+            learned = self.synapses.feedback[-self.n_hidden :]
+            named += [(f"feedback_singular_vector_{layer}", matrix) for layer, matrix in enumerate(learned, start=1)]
         return named
 
     def update_settling_rates(self, n_iterations: int = 1) -> None:
@@ -425,22 +427,9 @@ _CHOICES: dict[str, Collection[str]] = {
     "normalization": NORMALIZATIONS,
 }
 _SMALLEST = {"n_inputs": 1, "n_outputs": 1, "n_settling_steps": 1, "n_memory": 0, "n_feedback_inputs": 0, "n_members": 0}
-_RATES = (
-    "leak",
-    "settling_tolerance",
-    "feedback_rate",
-    "weight_bound",
-    "weight_decay",
-    "feedback_scale",
-    "memory_weight",
-)
-# what scheduled settling implies
-_IMPLIED: dict[str, tuple[Any, ...]] = {
-    "feedback_scale": (1.0,),
-    "leak": (0.0,),
-    "settling_rate": ("auto", 1.0),
-    "derivative_free": (False,),
-}
+_RATES = ("leak", "settling_tolerance", "feedback_rate", "weight_bound", "weight_decay", "feedback_scale", "memory_weight")
+# what scheduled settling implies; krylov dynamics imply the first two
+_IMPLIED = {"leak": 0.0, "settling_rate": "auto", "feedback_scale": 1.0, "derivative_free": False}
 
 
 def _check_settings(given: dict[str, Any]) -> None:
@@ -451,7 +440,8 @@ def _check_settings(given: dict[str, Any]) -> None:
     if not isinstance(given["hidden"], Sequence) or isinstance(given["hidden"], str):
         raise ValueError(f"hidden={given['hidden']!r} must be a list of layer sizes")
     sizes = [(name, given[name], smallest) for name, smallest in _SMALLEST.items()]
-    for name, value, smallest in [*sizes, *((f"hidden[{layer}]", n, 1) for layer, n in enumerate(given["hidden"]))]:
+    sizes += [(f"hidden[{layer}]", size, 1) for layer, size in enumerate(given["hidden"])]
+    for name, value, smallest in sizes:
         if not isinstance(value, Integral) or not smallest <= int(value) <= LARGEST_SIZE:
             raise ValueError(f"{name}={value!r} must be a whole number from {smallest} to {LARGEST_SIZE}")
     for name in _RATES:
@@ -475,10 +465,11 @@ def _check_agreement(given: dict[str, Any]) -> None:
         refuse("n_feedback_inputs", "n_inputs", "it can be at most as large")
     if given["synaptic_scaling"] != "none" and not given["weight_bound"]:
         refuse("weight_bound", "synaptic_scaling", "it must be above 0")
-    for name, implied in _IMPLIED.items() if given["settling"] == "scheduled" else ():
-        if given[name] not in implied:
+    is_scheduled = given["settling"] == "scheduled"
+    for name, implied in _IMPLIED.items():
+        if given[name] == implied:
+            continue
+        if is_scheduled:
             refuse(name, "settling", f"leave {name} out or use settling='iterative'")
-    if given["settling"] == "iterative" and given["dynamics"] == "krylov":
-        for name in ("leak", "settling_rate"):
-            if given[name] not in _IMPLIED[name][:1]:
-                refuse(name, "dynamics", "it needs dynamics='state'")
+        if given["dynamics"] == "krylov" and name in ("leak", "settling_rate"):
+            refuse(name, "dynamics", "it needs dynamics='state'")

@@ -24,8 +24,10 @@ class CoupledState:
 
 def check_agreement(actor: NGCCircuit, critic: NGCCircuit) -> None:
     """:raises ValueError: for two circuits that cannot settle as one, as their schedules differ; a sweep takes no steps"""
-    is_swept = actor.settling == critic.settling == "scheduled"
-    for name in ("settling",) if is_swept else ("settling", "n_settling_steps", "dynamics"):
+    shared = ["settling"]
+    if actor.settling == "iterative":
+        shared += ["n_settling_steps", "dynamics"]
+    for name in shared:
         if getattr(actor, name) != getattr(critic, name):
             raise ValueError(
                 f"actor {name}={getattr(actor, name)!r} and critic {name}={getattr(critic, name)!r} must agree, as they "
@@ -103,7 +105,8 @@ def _settle_both(actor: NGCCircuit, critic: NGCCircuit, motor: SettlingChain, va
     motor.start_settling()
     if actor.dynamics == "krylov":
         return _sweep_repeatedly(actor, critic, motor, value)
-    value_rates, motor_rates = critic.layer_rates(), actor.layer_rates()
+    value_rates = critic.rates.tolist()
+    motor_rates = actor.rates.tolist()
     to_action = critic.input_feedback()
     for step in range(critic.n_settling_steps):
         if step >= value.n_hidden:  # only now has the critic's first layer an error to pass on
@@ -132,7 +135,7 @@ def _sweep_repeatedly(actor: NGCCircuit, critic: NGCCircuit, motor: SettlingChai
 def _mean_value_drive(value: SettlingChain, scale: float = 1.0) -> th.Tensor:
     """The output error ``scale`` / A that raises the mean action-value, of an ensemble the mean over its members."""
     n_members = value.output.shape[0] if value.output.dim() == 3 else 1
-    return _damped(value, th.full_like(value.output, scale / (value.output.shape[-1] * n_members)))
+    return value.drive_of(th.full_like(value.output, scale / (value.output.shape[-1] * n_members)))
 
 
 def _clamp_actor(motor: SettlingChain, value: SettlingChain, to_action: th.Tensor) -> None:
@@ -141,12 +144,4 @@ def _clamp_actor(motor: SettlingChain, value: SettlingChain, to_action: th.Tenso
     if perturbation.dim() == 3:  # every member adds its share of the mean
         perturbation = perturbation.sum(0)
     motor.output_error = perturbation
-    motor.drive = _damped(motor, perturbation)
-
-
-def _damped(chain: SettlingChain, error: th.Tensor) -> th.Tensor:
-    """The output error times g' at the held output; the error itself when g is the identity."""
-    activation = chain.circuit.output_activation
-    if activation.name == "identity":
-        return error
-    return activation.damp(error.clone(), chain.output_prediction, chain.output)
+    motor.drive = motor.drive_of(perturbation)

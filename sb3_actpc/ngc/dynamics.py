@@ -6,13 +6,14 @@ from typing import TYPE_CHECKING
 
 import torch as th
 
-from sb3_actpc.ngc.normalization import Normalized, jacobian_product, normalize
-from sb3_actpc.ngc.products import add_product, affine
+from sb3_actpc.ngc.activations import Activation, Normalized, jacobian_product, normalize
+from sb3_actpc.ngc.synapses import add_product, affine
 
 if TYPE_CHECKING:
     from sb3_actpc.ngc.circuit import NGCCircuit
 
 DYNAMICS = ("krylov", "state")
+MAX_AUTO_RATE = 0.3  # activations with kinks chatter at larger rates (batch-mean energy rises by 0.1 %)
 
 
 @dataclass
@@ -50,7 +51,7 @@ class SettledState:
 
 class SettlingChain:
     """
-    The live latents and errors of one circuit, advanced step by step; ``integrate`` and ``predict`` allocate nothing.
+    The live latents and errors of one circuit, advanced step by step; hidden layers move in place.
 
     ``dynamics="state"`` is eq. 1 of the paper to the letter. A step has two halves: :meth:`integrate` moves the hidden layers,
     all from the same instant; :meth:`predict` brings predictions and errors up to date. "krylov" goes where that rests in a
@@ -65,19 +66,19 @@ class SettlingChain:
 
     def __init__(self, circuit: "NGCCircuit", x: th.Tensor, memory: th.Tensor | None) -> None:
         self.circuit = circuit
-        self.synapses = synapses = circuit.synapses
+        self.synapses = circuit.synapses
         self.memory = memory
-        self.biases = synapses.layer_biases(memory, circuit.memory_weight)
+        self.biases = self.synapses.layer_biases(memory, circuit.memory_weight)
         self.latents: list[th.Tensor] = [x]
         self.activations: list[th.Tensor] = [x]
         self.normalized: list[Normalized | None] = [None]
-        for weights, bias in zip(synapses.weights[:-1], self.biases[:-1], strict=True):
+        for weights, bias in zip(self.synapses.weights[:-1], self.biases[:-1], strict=True):
             latents = affine(bias, self.activations[-1], weights)
             self.latents.append(latents)
             self.normalized.append(None)
             self.activations.append(th.empty_like(latents))
             self._activate(len(self.latents) - 1)
-        self.output_prediction = affine(self.biases[-1], self.activations[-1], synapses.weights[-1])
+        self.output_prediction = affine(self.biases[-1], self.activations[-1], self.synapses.weights[-1])
         self.output = circuit.output_activation.apply(self.output_prediction, th.empty_like(self.output_prediction))
         self.n_hidden = len(self.latents) - 1
         self.lowest_reached = self.n_hidden + 1
@@ -97,21 +98,16 @@ class SettlingChain:
 
     def damp(self, layer: int, signal: th.Tensor) -> th.Tensor:
         """``signal``, (B, n), which is overwritten, times the transposed derivative of a hidden layer's activation."""
-        activation = self.circuit.activation
-        normalized = self.normalized[layer]
-        if normalized is None:
-            return activation.damp(signal, self.latents[layer], self.activations[layer])
-        activation.damp(signal, normalized.values, self.activations[layer])
-        return jacobian_product(signal, self.latents[layer], normalized)
+        held = self.latents[layer], self.activations[layer], self.normalized[layer]
+        return damped(self.circuit.activation, signal, *held)
 
     def slope(self, layer: int, move: th.Tensor) -> th.Tensor:
         """How much a hidden layer's activation changes, to first order, when its latents move by ``move``, (B, n)."""
-        activation = self.circuit.activation
         normalized = self.normalized[layer]
         if normalized is None:
-            return activation.damp(move.clone(), self.latents[layer], self.activations[layer])
+            return self.damp(layer, move.clone())
         change = jacobian_product(move, self.latents[layer], normalized)
-        return activation.damp(change, normalized.values, self.activations[layer])
+        return self.circuit.activation.damp(change, normalized.values, self.activations[layer])
 
     def start_settling(self) -> None:
         """Give every hidden layer its error neurons (at rest: 0) and its buffers."""
@@ -132,8 +128,6 @@ class SettlingChain:
                 "target for each output of each row of the batch"
             )
         self.target = target
-        self.output_error = th.empty_like(self.output)
-        self.drive = th.empty_like(self.output) if self.circuit.output_activation.name != "identity" else self.output_error
         self._refresh_output_error()
 
     def clamp_output_drive(self, drive: th.Tensor) -> None:
@@ -141,12 +135,17 @@ class SettlingChain:
         self.drive = drive
         self.output_error = drive
 
+    def drive_of(self, error: th.Tensor) -> th.Tensor:
+        """An output error, (B, n_outputs), times g' at the output; the error itself when g is the identity."""
+        activation = self.circuit.output_activation
+        if activation.name == "identity":
+            return error
+        return activation.damp(error.clone(), self.output_prediction, self.output)
+
     def _refresh_output_error(self) -> None:
         assert self.target is not None
-        th.sub(self.target, self.output, out=self.output_error)
-        if self.drive is not self.output_error:
-            self.drive.copy_(self.output_error)
-            self.circuit.output_activation.damp(self.drive, self.output_prediction, self.output)
+        self.output_error = self.target - self.output
+        self.drive = self.drive_of(self.output_error)
 
     def feedback(self, layer: int, below: th.Tensor, exact: bool = False, out: th.Tensor | None = None) -> th.Tensor:
         """
@@ -165,7 +164,8 @@ class SettlingChain:
         for layer in range(self.lowest_reached, self.n_hidden + 1):
             below = self.drive if layer == self.n_hidden else self.errors[layer]
             signal = self.feedback(layer, below, out=self.signals[layer - 1])
-            error, rate = self.errors[layer - 1], rates[layer - 1]
+            error = self.errors[layer - 1]
+            rate = rates[layer - 1]
             if circuit.leak:
                 signal.sub_(self.latents[layer], alpha=circuit.leak)
             if layer == 1:  # its prediction is constant: the error moves as the state does
@@ -179,17 +179,18 @@ class SettlingChain:
 
         :param output: also predict the output (needless where its error is clamped)
         """
-        circuit = self.circuit
         for layer in range(self.lowest_reached, self.n_hidden + 1):
-            latents, error = self.latents[layer], self.errors[layer - 1]
+            latents = self.latents[layer]
+            error = self.errors[layer - 1]
+            below = self.activations[layer - 1]
+            weights = self.synapses.weights[layer - 1]
             if layer == 1:
                 th.add(self.first_prediction, error, out=latents)
-            elif circuit.dynamics != "state":
+            elif self.circuit.dynamics != "state":
                 th.add(error, self.biases[layer - 1], out=latents)
-                add_product(latents, self.activations[layer - 1], self.synapses.weights[layer - 1].mT)
+                add_product(latents, below, weights.mT)
             else:
                 th.sub(latents, self.biases[layer - 1], out=error)
-                below, weights = self.activations[layer - 1], self.synapses.weights[layer - 1]
                 add_product(error, below, weights.mT, sign=-1.0)
             self._activate(layer)
         if output:
@@ -234,3 +235,46 @@ class SettlingChain:
             memory=self.memory,
             n_steps=self.n_steps,
         )
+
+
+def damped(
+    activation: Activation, signal: th.Tensor, latents: th.Tensor, activations: th.Tensor, normalized: Normalized | None
+) -> th.Tensor:
+    """
+    What a signal becomes on its way back through φ and, where latents are normalized, the normalization before it.
+
+    :param signal: (..., B, n); overwritten
+    :param latents: z, (..., B, n)
+    :param activations: φ(z), or φ of the normalized z
+    :param normalized: of ``latents``; None without normalization
+    :return: (..., B, n)
+    """
+    if normalized is None:
+        return activation.damp(signal, latents, activations)
+    return jacobian_product(activation.damp(signal, normalized.values, activations), latents, normalized)
+
+
+def largest_norm_(matrix: th.Tensor, vector: th.Tensor, n_iterations: int = 1) -> th.Tensor:
+    """
+    The largest singular value of a matrix, or of those of all members of an ensemble, by warm-started power iteration.
+
+    :param matrix: (n_out, n_in) or (M, n_out, n_in)
+    :param vector: (n_in,) or (M, n_in), the running estimates of right singular vectors; overwritten
+    :return: the estimate, 0-d, never above the true value
+    """
+    norms = []
+    for one, direction in zip(matrix.view(-1, *matrix.shape[-2:]), vector.view(-1, vector.shape[-1]), strict=True):
+        for _ in range(n_iterations):
+            th.mv(one.t(), one @ direction, out=direction)
+            direction.div_(th.linalg.vector_norm(direction).clamp_min(1e-30))
+        norms.append(th.linalg.vector_norm(one @ direction))
+    return th.stack(norms).max()
+
+
+def settling_rates(forward_norms: list[float], feedback_norms: list[float]) -> list[float]:
+    """
+    The rates β that ``settling_rate="auto"`` uses, one per hidden layer (first to last).
+
+    1 / (1 + ||W|| ||E||) of the weights below the layer, the local curvature of the energy; at most ``MAX_AUTO_RATE``.
+    """
+    return [min(MAX_AUTO_RATE, 1.0 / (1.0 + w * e)) for w, e in zip(forward_norms, feedback_norms, strict=True)]

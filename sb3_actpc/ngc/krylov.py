@@ -11,7 +11,7 @@ Elman & Schultz, 1983) needs few steps. Every sample takes steps of its own size
 import torch as th
 
 from sb3_actpc.ngc.dynamics import SettlingChain
-from sb3_actpc.ngc.products import add_product
+from sb3_actpc.ngc.synapses import add_product
 
 
 def settle_krylov(chain: SettlingChain, n_steps: int, tolerance: float) -> int:
@@ -52,7 +52,8 @@ def settle_krylov(chain: SettlingChain, n_steps: int, tolerance: float) -> int:
 
 def _respond(chain: SettlingChain, drive: th.Tensor) -> tuple[th.Tensor, list[th.Tensor]]:
     """(I + A) ``drive``, (B, n_outputs), with the hidden layers' errors and, after them, the moves of their states."""
-    weights, n_hidden = chain.synapses.weights, chain.n_hidden
+    weights = chain.synapses.weights
+    n_hidden = chain.n_hidden
     errors = [drive] * (n_hidden + 1)
     for layer in range(n_hidden, 0, -1):
         errors[layer - 1] = chain.feedback(layer, errors[layer])

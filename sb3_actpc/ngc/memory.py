@@ -15,7 +15,8 @@ class WorkingMemory(nn.Module):
 
     def __init__(self, n_inputs: int, history: int = 7) -> None:
         super().__init__()
-        self.n_inputs, self.history = n_inputs, history
+        self.n_inputs = n_inputs
+        self.history = history
         std = n_inputs**-0.5  # σ_q, which keeps the scale of the observations
         self.projection = nn.Parameter(th.randn(n_inputs, n_inputs) * std, requires_grad=False)
 

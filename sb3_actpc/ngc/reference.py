@@ -5,8 +5,6 @@ Layers are counted from the input, 0 to L. z[0] is clamped to the input, z[L] to
 below: z̄[l] = g(φ(z[l-1]) W[l]ᵀ + b[l] + α_m m M[l]ᵀ), e[l] = z[l] - z̄[l]. Rows are the batch. There is no autograd.
 """
 
-from dataclasses import dataclass
-
 import torch as th
 
 from sb3_actpc.ngc.circuit import NGCCircuit
@@ -20,19 +18,13 @@ FUNCTIONS = {
 }
 
 
-@dataclass
-class Settled:
-    """
-    :param z: latents z[0] to z[L], (B, n) each
-    :param e: errors e[1] to e[L], (B, n) each; the last one is multiplied by g' of the output
-    """
-
-    z: list[th.Tensor]
-    e: list[th.Tensor]
+Layers = list[th.Tensor]
 
 
 class ReferenceCircuit:
     """
+    Settled latents z[0] to z[L] and errors e[1] to e[L], (B, n) each; the last error is multiplied by g' of the output.
+
     :param circuit: an :class:`~sb3_actpc.ngc.circuit.NGCCircuit` of one member, without normalization; its synapses are used
     """
 
@@ -57,20 +49,22 @@ class ReferenceCircuit:
             total = total + self.circuit.memory_weight * memory @ self.circuit.memory_weights[layer - 1].t()
         return total
 
-    def project(self, x: th.Tensor, memory: th.Tensor | None = None) -> list[th.Tensor]:
+    def project(self, x: th.Tensor, memory: th.Tensor | None = None) -> Layers:
         """Eq. 6, z[l] = z̄[l] from the input on; the output comes last, before g."""
         z = [x]
         for layer in range(1, self.n_layers + 1):
             z.append(self.prediction(layer, z[-1], memory))
         return z
 
-    def errors(self, z: list[th.Tensor], target: th.Tensor, memory: th.Tensor | None) -> list[th.Tensor]:
+    def errors(self, z: Layers, target: th.Tensor, memory: th.Tensor | None) -> Layers:
         """e[1] to e[L] of the present latents."""
         e = [z[layer] - self.prediction(layer, z[layer - 1], memory) for layer in range(1, self.n_layers)]
         output = self.prediction(self.n_layers, z[self.n_layers - 1], memory)
         return [*e, (target - self.g(output)) * self.dg(output)]
 
-    def settle(self, x: th.Tensor, target: th.Tensor, rates: list[float], memory: th.Tensor | None = None) -> Settled:
+    def settle(
+        self, x: th.Tensor, target: th.Tensor, rates: list[float], memory: th.Tensor | None = None
+    ) -> tuple[Layers, Layers]:
         """Eq. 1, K times: z[l] += β (-γ z[l] + (e[l+1] Eᵀ) φ'(z[l]) - e[l]), all layers at once."""
         z = self.project(x, memory)
         for _ in range(self.circuit.n_settling_steps):
@@ -80,17 +74,17 @@ class ReferenceCircuit:
                 drive = (e[layer] @ self.feedback(layer)) * self.dphi(z[layer])
                 moved[layer] = z[layer] + rates[layer - 1] * (drive - e[layer - 1] - self.circuit.leak * z[layer])
             z = moved
-        return Settled(z, self.errors(z, target, memory))
+        return z, self.errors(z, target, memory)
 
-    def sweep(self, x: th.Tensor, target: th.Tensor, memory: th.Tensor | None = None) -> Settled:
+    def sweep(self, x: th.Tensor, target: th.Tensor, memory: th.Tensor | None = None) -> tuple[Layers, Layers]:
         """Scheduled settling: e[l] = (e[l+1] Eᵀ) φ'(z[l]) once from the output to the input, states at projection."""
         z = self.project(x, memory)
         e = [self.errors(z, target, memory)[-1]]
         for layer in range(self.n_layers - 1, 0, -1):
             e.insert(0, (e[0] @ self.feedback(layer)) * self.dphi(z[layer]))
-        return Settled(z, e)
+        return z, e
 
-    def changes(self, settled: Settled) -> list[th.Tensor]:
+    def changes(self, latents: Layers, errors: Layers) -> Layers:
         """Eq. 4, ΔW[l] = e[l]ᵀ φ(z[l-1]), means over the batch."""
-        activities = [settled.z[0], *(self.phi(z) for z in settled.z[1:-1])]
-        return [e.t() @ activity / len(e) for e, activity in zip(settled.e, activities, strict=True)]
+        activities = [latents[0], *(self.phi(z) for z in latents[1:-1])]
+        return [e.t() @ activity / len(e) for e, activity in zip(errors, activities, strict=True)]

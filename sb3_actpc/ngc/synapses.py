@@ -1,4 +1,4 @@
-"""The synapses of a circuit as plain tensors: what a layer predicts, and the way an error takes back."""
+"""The synapses of a circuit as plain tensors: what a layer predicts, the way an error takes back, and their products."""
 
 from typing import NamedTuple
 
@@ -53,3 +53,24 @@ class Synapses(NamedTuple):
         if self.feedback and not tied:
             return self.feedback[layer - (len(self.weights) - len(self.feedback))]
         return self.weights[layer] if tied or scale == 1.0 else scale * self.weights[layer]
+
+
+def affine(bias: th.Tensor, activations: th.Tensor, weights: th.Tensor) -> th.Tensor:
+    """
+    The prediction W φ(z) + b.
+
+    :param bias: (n_out,) or (B, n_out); of an ensemble (M, 1, n_out)
+    :param activations: (B, n_in); of an ensemble (M, B, n_in)
+    :param weights: (n_out, n_in); of an ensemble (M, n_out, n_in)
+    :return: (B, n_out); of an ensemble (M, B, n_out)
+    """
+    if weights.dim() == 2:
+        return th.addmm(bias, activations, weights.t())
+    return th.baddbmm(bias, activations, weights.mT)
+
+
+def add_product(total: th.Tensor, a: th.Tensor, b: th.Tensor, sign: float = 1.0) -> th.Tensor:
+    """Add ``sign`` a b to ``total``, in place; (n, m), (m, k) and (n, k), or a leading dimension of members."""
+    if total.dim() == 2:
+        return total.addmm_(a, b, alpha=sign)
+    return total.baddbmm_(a, b, alpha=sign)

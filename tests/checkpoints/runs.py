@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import multiprocessing
+import signal
 from collections.abc import Callable
 from copy import deepcopy
 from pathlib import Path
@@ -44,18 +45,18 @@ def make_actpc(env: Any, n_envs: int = 1, normalize: bool = False, **keywords: A
     return ActPC(keywords.pop("policy", "MlpPolicy"), vec_env, **deepcopy({**ACTPC, **keywords}))
 
 
-class StopAt(BaseCallback):
-    """Pretends that SIGTERM came between two rollouts."""
+class Terminate(BaseCallback):
+    """SIGTERM to its own process, at the first step from one on."""
 
-    def __init__(self, step: int, checkpoints: CheckpointCallback) -> None:
+    def __init__(self, step: int) -> None:
         super().__init__()
-        self.step, self.checkpoints = step, checkpoints
-
-    def _on_rollout_start(self) -> None:
-        if self.num_timesteps >= self.step:
-            self.checkpoints.signals.received = "SIGTERM"
+        self.step = step
+        self.is_sent = False
 
     def _on_step(self) -> bool:
+        if self.num_timesteps >= self.step and not self.is_sent:
+            self.is_sent = True
+            signal.raise_signal(signal.SIGTERM)
         return True
 
 
@@ -67,30 +68,24 @@ def learn_straight(make: MakeModel, folder: Path, n_steps: int, *more: BaseCallb
 
 
 def learn_in_two(
-    make: MakeModel,
-    folder: Path,
-    n_steps: int,
-    stop_at: int,
-    more: Callable[[], list[BaseCallback]] = list,
-    **options: Any,
+    make: MakeModel, folder: Path, n_steps: int, stop_at: int, more: Callable[[], list[BaseCallback]] = list
 ) -> OffPolicyAlgorithm:
     """The run that is stopped at a step and resumed by a new agent."""
     first = make()
     first.set_logger(configure(str(folder), ["csv"]))
-    checkpoints = CheckpointCallback(folder / "checkpoints", **options)
+    checkpoints = folder / "checkpoints"
     try:
-        first.learn(n_steps, callback=[*more(), StopAt(stop_at, checkpoints), checkpoints], log_interval=1)
+        first.learn(n_steps, callback=[*more(), Terminate(stop_at), CheckpointCallback(checkpoints)], log_interval=1)
+        raise AssertionError("the run was not stopped")
     except TrainingStopped as stopped:
         assert stopped.num_timesteps >= stop_at
-    else:
-        raise AssertionError("the run was not stopped")
     second = make()
     np.random.random(13)
     th.randn(7)
     second.action_space.sample()
     second.set_logger(configure(str(folder), ["csv"]))
-    restored = restore(second, folder / "checkpoints")
-    return continue_learning(restored, [*more(), CheckpointCallback(folder / "checkpoints", **options)], log_interval=1)
+    restored = restore(second, checkpoints)
+    return continue_learning(restored, [*more(), CheckpointCallback(checkpoints)], log_interval=1)
 
 
 def assert_same(one: OffPolicyAlgorithm, other: OffPolicyAlgorithm) -> None:

@@ -78,7 +78,9 @@ def keyword_values(name: str) -> st.SearchStrategy[Any]:
     if name in KEYS_OF:
         keys = st.sampled_from(KEYS_OF[name])
         return st.one_of(VALUES, keys.flatmap(lambda key: st.fixed_dictionaries({key: keyword_values(key)})))
-    return ARCHITECTURES if name == "net_arch" else CIRCUIT_VALUES if name in OF_ONE_CIRCUIT else VALUES
+    if name == "net_arch":
+        return ARCHITECTURES
+    return CIRCUIT_VALUES if name in OF_ONE_CIRCUIT else VALUES
 
 
 def keys_of(value: Any) -> list[str]:

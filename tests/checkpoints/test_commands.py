@@ -19,7 +19,7 @@ from sb3_actpc import ActPC
 from sb3_actpc.checkpoints import EXIT_STOPPED, CheckpointCallback, TrainingStopped, continue_learning, list_bundles, restore
 from sb3_actpc.cli import main
 from tests.actpc.envs import CountingEnv
-from tests.checkpoints.runs import assert_equal, log_rows, make_actpc
+from tests.checkpoints.runs import Terminate, assert_equal, log_rows, make_actpc
 
 TRAIN = ["train", "--env", "SparseReacher-v5", "--preset", "small.yml", "--demonstrations", "none", "--no-progress"]
 TRAIN += ["--eval-freq", "60", "--eval-episodes", "1", "--checkpoint-freq", "40"]
@@ -100,24 +100,17 @@ def test_outside_the_main_thread_there_are_checkpoints_but_no_handlers(tmp_path:
 @pytest.mark.parametrize("algorithm", [ActPC, TD3])
 def test_a_script_that_is_stopped_exits_with_the_code(tmp_path: Path, algorithm: Any) -> None:
     """Nobody has to catch anything: TrainingStopped is a SystemExit."""
-    model = algorithm("MlpPolicy", make_vec_env(CountingEnv), policy_kwargs={"net_arch": [8]}, buffer_size=99, seed=0)
-    callback = CheckpointCallback(tmp_path)
+
+    def make() -> Any:
+        return algorithm("MlpPolicy", make_vec_env(CountingEnv), policy_kwargs={"net_arch": [8]}, buffer_size=99, seed=0)
+
     with pytest.raises(SystemExit) as stop:
-        model.learn(300, [callback, Terminate()])
+        make().learn(300, [CheckpointCallback(tmp_path), Terminate(150)])
     assert isinstance(stop.value, TrainingStopped) and stop.value.code == EXIT_STOPPED == 75
-    again = algorithm("MlpPolicy", make_vec_env(CountingEnv), policy_kwargs={"net_arch": [8]}, buffer_size=99, seed=0)
+    again = make()
     assert continue_learning(restore(again, tmp_path), CheckpointCallback(tmp_path)).num_timesteps == 300
     with pytest.raises(ValueError, match="has no CheckpointCallback"):
         continue_learning(restore(again, tmp_path))
-
-
-class Terminate(BaseCallback):
-    """SIGTERM at step 150."""
-
-    def _on_step(self) -> bool:
-        if self.num_timesteps == 150:
-            os.kill(os.getpid(), signal.SIGTERM)
-        return True
 
 
 def test_a_run_killed_at_random_moments_and_resumed_is_the_run_never_killed() -> None:

@@ -137,77 +137,61 @@ def test_what_a_killed_process_left_is_removed_and_the_last_k_are_kept(tmp_path:
 
 
 class PoisonEnv(CountingEnv):
-    """Gives one wrong number at one step."""
+    """Gives wrong numbers once it is told which."""
 
-    def __init__(self, what: str, value: float, at: int) -> None:
-        super().__init__()
-        self.what, self.value, self.at, self.n_steps = what, value, at, 0
+    poison = ""
 
     def step(self, action: Any) -> Any:
-        observation, reward, terminated, truncated, info = super().step(action)
-        self.n_steps += 1
-        if self.n_steps == self.at and self.what == "rewards":
-            reward = self.value
-        elif self.n_steps == self.at:
-            observation[1] = self.value
-        return observation, reward, terminated, truncated, info
+        observation, reward, *others = super().step(action)
+        if self.poison == "observations":
+            observation[1] = np.inf
+        if self.poison == "rewards":
+            reward = np.nan
+        return (observation, reward, *others)
 
 
-class PoisonWeights(BaseCallback):
-    """Makes one weight of a part wrong after one step."""
+class Poison(BaseCallback):
+    """After one step the environment gives wrong numbers, or a weight of a part is wrong."""
 
-    def __init__(self, value: float, at: int, part: str) -> None:
+    def __init__(self, what: str, at: int) -> None:
         super().__init__()
-        self.value, self.at, self.part = value, at, part
+        self.what = what
+        self.at = at
 
     def _on_step(self) -> bool:
         if self.num_timesteps == self.at:
-            weights = next(value for name, value in self.model.policy.named_parameters() if name.startswith(self.part))
-            weights.data.view(-1)[0] = self.value
+            self.training_env.set_attr("poison", self.what)
+            parts = [weights for name, weights in self.model.policy.named_parameters() if name.startswith(self.what)]
+            for weights in parts[:1]:
+                weights.data.view(-1)[0] = np.nan
         return True
 
 
-def small_agent(algorithm: Any, make_env: Any = CountingEnv) -> Any:
-    keywords = {"policy_kwargs": {"net_arch": [8]}, "learning_starts": 5, "batch_size": 8, "buffer_size": 99, "seed": 0}
-    return algorithm("MlpPolicy", make_vec_env(make_env), **keywords)
-
-
-def assert_good_checkpoint(folder: Path, model: Any, latest: int) -> None:
-    """The newest one is from that step, and once the cause is mended an agent goes on from it."""
-    restored = restore(model, folder, pytest.fail)
-    model.env.envs[0].unwrapped.at = 0
-    assert model.num_timesteps == latest
-    check_weights(model)
-    continue_learning(restored, CheckpointCallback(folder, 10))
-    assert model.num_timesteps == 70
-
-
-@pytest.mark.parametrize(("algorithm", "what", "value"), [(ActPC, "observations", np.inf), (TD3, "rewards", np.nan)])
-def test_what_is_not_finite_is_named_and_the_last_good_checkpoint_is_there(
-    tmp_path: Path, algorithm: Any, what: str, value: float
-) -> None:
-    make = lambda: small_agent(algorithm, lambda: PoisonEnv(what, value, 37))  # noqa: E731
-    callback = CheckpointCallback(tmp_path, 10)
-    with pytest.raises(ValueError, match=f"environment: {what} are not finite at step 37"):
-        make().learn(70, callback)
-    callback.close()
-    assert_good_checkpoint(tmp_path, make(), 30)
-
-
 @pytest.mark.parametrize(
-    ("algorithm", "part", "at", "message"),
+    ("algorithm", "what", "at", "message"),
     [
+        (ActPC, "observations", 36, "environment: observations are not finite at step 37"),
+        (TD3, "rewards", 36, "environment: rewards are not finite at step 37"),
         (ActPC, "actor.", 35, "actor: actions are not finite at step"),
         (TD3, "actor.", 35, "agent: actions are not finite at step"),
         (TD3, "critic.", 40, "critic.*: weights are not finite at step 40"),
         (ActPC, "generator.", 35, "generator.*: .* not finite at step"),
     ],
 )
-def test_a_weight_that_is_not_finite_is_named_and_never_saved(
-    tmp_path: Path, algorithm: Any, part: str, at: int, message: str
-) -> None:
+def test_what_is_not_finite_is_named_and_never_saved(tmp_path: Path, algorithm: Any, what: str, at: int, message: str) -> None:
+    """Once the cause is mended, an agent goes on from the checkpoint before."""
+
+    def make() -> Any:
+        keywords = {"policy_kwargs": {"net_arch": [8]}, "learning_starts": 5, "batch_size": 8, "buffer_size": 99, "seed": 0}
+        return algorithm("MlpPolicy", make_vec_env(PoisonEnv), **keywords)
+
     callback = CheckpointCallback(tmp_path, 10)
     with pytest.raises(ValueError, match=message):
-        small_agent(algorithm).learn(70, [callback, PoisonWeights(np.nan, at, part)])
+        make().learn(70, [callback, Poison(what, at)])
     callback.close()
-    assert_good_checkpoint(tmp_path, small_agent(algorithm), 30)
+    model = make()
+    restored = restore(model, tmp_path, pytest.fail)
+    assert model.num_timesteps == 30
+    check_weights(model)
+    continue_learning(restored, CheckpointCallback(tmp_path, 10))
+    assert model.num_timesteps == 70

@@ -1,31 +1,19 @@
 """PPO and TRPO, stopped and gone on with, are those that never stopped: statistics of the observations, returns and all."""
 
-import os
-import signal
 from pathlib import Path
 from typing import Any
 
 import pytest
-from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_actpc.baselines import LOGO
 from sb3_actpc.checkpoints import CheckpointCallback, TrainingStopped, list_bundles
 from sb3_actpc.experiments.runs import Run, finish_run
-from tests.checkpoints.runs import log_rows
+from tests.checkpoints.runs import Terminate, log_rows
 
 SETTINGS: dict[str, dict[str, Any]] = {
     "ppo": {"n_steps": 32, "batch_size": 16, "n_epochs": 2, "use_sde": True},
     "trpo": {"n_steps": 32, "batch_size": 16, "n_critic_updates": 2},
 }
-
-
-class StopAt(BaseCallback):
-    """Tells its own process to stop."""
-
-    def _on_step(self) -> bool:
-        if self.num_timesteps == 300:
-            os.kill(os.getpid(), signal.SIGTERM)
-        return True
 
 
 def run_of(algo: str, folder: Path) -> Run:
@@ -39,7 +27,7 @@ def run_of(algo: str, folder: Path) -> Run:
 def test_a_stopped_run_goes_on_as_if_it_never_was(algo: str, tmp_path: Path) -> None:
     finish_run(run_of(algo, tmp_path / "straight"))
     with pytest.raises(TrainingStopped):
-        finish_run(run_of(algo, tmp_path / "stopped"), callbacks=[StopAt()])
+        finish_run(run_of(algo, tmp_path / "stopped"), callbacks=[Terminate(300)])
     assert len(list_bundles(tmp_path / "stopped" / "checkpoints")) >= 1
     lines: list[str] = []
     finish_run(run_of(algo, tmp_path / "stopped"), lines.append)

@@ -1,7 +1,6 @@
 """Robosuite runs that are stopped in the middle of an episode."""
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -9,20 +8,12 @@ from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_actpc import ActPC
 from sb3_actpc.envs import ROBOSUITE_IDS
-from tests.checkpoints.runs import SHORT_WARM_UP, assert_same, learn_in_two, learn_straight
+from tests.checkpoints.runs import ACTPC, SHORT_WARM_UP, assert_same, learn_in_two, learn_straight
 from tests.demonstrations.made_up import made_up
 
 pytest.importorskip("robosuite", reason="robosuite is an extra")
 
-SMALL: dict[str, Any] = {
-    **SHORT_WARM_UP,
-    "policy_kwargs": {"net_arch": [16, 16]},
-    "batch_size": 16,
-    "learning_starts": 5,
-    "gradient_steps": -1,
-    "seed": 3,
-    "device": "cpu",
-}
+SETTINGS = {**ACTPC, **SHORT_WARM_UP, "gradient_steps": -1}
 
 
 @pytest.mark.parametrize("env_id", ROBOSUITE_IDS)
@@ -31,7 +22,7 @@ def test_a_run_stopped_within_an_episode_is_the_run_never_stopped(env_id: str, t
 
     def make() -> ActPC:
         env = make_vec_env(env_id, seed=5, env_kwargs={"horizon": 20})
-        return ActPC("MlpPolicy", env, demonstrations=made_up(env_id), **SMALL)
+        return ActPC("MlpPolicy", env, demonstrations=made_up(env_id), **SETTINGS)
 
     straight = learn_straight(make, tmp_path / "straight", 65)
     resumed = learn_in_two(make, tmp_path / "resumed", 65, stop_at=33)

@@ -15,29 +15,37 @@ FUNCTIONS = {
 }
 
 
-def synapses(circuit: NGCCircuit, requires_grad: bool = True) -> list[list[th.Tensor]]:
-    """Copies of weights and biases that autograd can follow."""
-    return [[p.detach().clone().requires_grad_(requires_grad) for p in ps] for ps in (circuit.weights, circuit.biases)]
+def synapses(circuit: NGCCircuit, requires_grad: bool = True, member: int | None = None) -> list[list[th.Tensor]]:
+    """Copies of weights and biases, of a circuit or of one member of an ensemble, that autograd can follow."""
+    kinds = [list(circuit.weights), list(circuit.biases)]
+    if member is not None:
+        kinds = [[p[member] for p in circuit.weights], [p[member].flatten() for p in circuit.biases]]
+    return [[p.detach().clone().requires_grad_(requires_grad) for p in kind] for kind in kinds]
 
 
-def energy(circuit: NGCCircuit, weights, biases, latents, target, m=0.0) -> th.Tensor:
+def energy(circuit: NGCCircuit, weights, biases, latents, target) -> th.Tensor:
     """Sum over the batch of 1/2 Σ ||z - z̄||^2; ``latents`` are the input and the hidden layers."""
-    phi, g = FUNCTIONS[circuit.activation.name], FUNCTIONS[circuit.output_activation.name]
+    phi = FUNCTIONS[circuit.activation.name]
     total = th.zeros((), dtype=target.dtype)
     for layer, (w, b) in enumerate(zip(weights, biases, strict=True)):
         prediction = (latents[layer] if layer == 0 else phi(latents[layer])) @ w.t() + b
-        last = layer == len(weights) - 1
-        below = target if last else latents[layer + 1]
-        total = total + 0.5 * (below - (g(prediction) if last else prediction)).square().sum()
+        if layer == len(weights) - 1:
+            error = target - FUNCTIONS[circuit.output_activation.name](prediction)
+        else:
+            error = latents[layer + 1] - prediction
+        total = total + 0.5 * error.square().sum()
     return total
 
 
 def forward(circuit: NGCCircuit, weights, biases, x) -> th.Tensor:
     """Feed-forward output."""
-    phi, g = FUNCTIONS[circuit.activation.name], FUNCTIONS[circuit.output_activation.name]
     for layer, (w, b) in enumerate(zip(weights, biases, strict=True)):
-        x = (x if layer == 0 else phi(x)) @ w.t() + b
-    return g(x)
+        if layer and circuit.normalization == "layer":
+            x = F.layer_norm(x, x.shape[-1:])
+        if layer:
+            x = FUNCTIONS[circuit.activation.name](x)
+        x = x @ w.t() + b
+    return FUNCTIONS[circuit.output_activation.name](x)
 
 
 def cosine(a: th.Tensor, b: th.Tensor) -> float:

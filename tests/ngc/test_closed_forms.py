@@ -4,9 +4,8 @@ import pytest
 import torch as th
 
 from sb3_actpc.ngc import NGCCircuit, WorkingMemory
-from sb3_actpc.ngc.plasticity import bound_columns_, soft_bound_
-from sb3_actpc.ngc.products import NARROW, TALL, sum_outer
-from sb3_actpc.ngc.stability import settling_rates
+from sb3_actpc.ngc.dynamics import settling_rates
+from sb3_actpc.ngc.plasticity import NARROW, TALL, bound_columns_, soft_bound_, sum_outer
 
 
 def test_a_step_shrinks_in_proportion_to_what_is_left_to_the_soft_bound():
@@ -48,15 +47,11 @@ def test_outer_products_are_summed_whatever_the_shape(n, m, members):
     assert (found - expected).norm() < 1e-5 * expected.norm()
 
 
-def test_memory_is_the_concatenation_of_projected_observations():
-    memory = WorkingMemory(5, history=3)
-    history = th.randn(4, 3, 5)
+def test_memory_is_the_concatenation_of_observations_through_a_fixed_gaussian_projection():
+    memory = WorkingMemory(100, history=3)
+    history = th.randn(4, 3, 100)
     expected = th.cat([history[:, step] @ memory.projection.t() for step in range(3)], dim=1)
-    assert th.allclose(memory(history), expected, atol=1e-6)
-    assert memory.size == 15 and not th.any(memory(th.zeros(1, 3, 5)))
-
-
-def test_the_projection_is_fixed_and_gaussian():
-    memory = WorkingMemory(100)
+    assert th.allclose(memory(history), expected, atol=1e-5)
+    assert memory.size == 300 and not th.any(memory(th.zeros(1, 3, 100)))
     assert not memory.projection.requires_grad
     assert float(memory.projection.std()) == pytest.approx(0.1, rel=0.05)

@@ -27,16 +27,20 @@ def apply_nothing(circuit, memory=None):
 
 
 def test_plain_sgd_adds_the_change():
-    circuit = NGCCircuit(8, 3, (16, 16), feedback="learned")
-    circuit.optimizer = th.optim.SGD(circuit.parameter_groups(0.1))
-    before = [p.clone() for p in (*circuit.weights, *circuit.biases)]
+    """That of error synapses times γ_e, which is a ratio of rates: Adam would cancel a factor on the change."""
+    circuit = NGCCircuit(8, 3, (16, 16), feedback="learned", feedback_rate=0.5, n_memory=6)
+    groups = circuit.parameter_groups(0.1)
+    assert [group["lr"] for group in groups] == [0.1, 0.05]
+    circuit.optimizer = th.optim.SGD(groups)
+    synapses = [*circuit.weights, *circuit.biases, *circuit.memory_weights]
+    before = [p.clone() for p in synapses]
     error_synapses = [p.clone() for p in circuit.feedback_weights]
-    changes = circuit.hebbian_update(circuit.settle(*teacher_batch()))
+    changes = circuit.hebbian_update(circuit.settle(*teacher_batch(), th.randn(128, 6)))
     circuit.apply_changes(changes)
-    for old, new, change in zip(before, (*circuit.weights, *circuit.biases), changes.tensors(), strict=True):
+    for old, new, change in zip(before, synapses, changes.tensors(), strict=True):
         assert change.abs().max() > 0 and th.allclose(new, old + 0.1 * change, atol=1e-7)
     for old, new, change in zip(error_synapses, circuit.feedback_weights, changes.weights[1:], strict=True):
-        assert th.allclose(new, old + 0.1 * circuit.feedback_rate * change, atol=1e-7)
+        assert th.allclose(new, old + 0.05 * change, atol=1e-7)
 
 
 @pytest.mark.parametrize(("settling", "feedback"), [(s, f) for s in ("iterative", "scheduled") for f in ("learned", "tied")])
@@ -86,19 +90,6 @@ def test_weight_decay_spares_the_biases():
         assert th.allclose(parameter, before[name] * (1.0 if name.startswith("biases") else 0.95))
 
 
-def test_halving_gamma_e_halves_the_movement_of_the_error_synapses_under_adam():
-    moved, n_updates = [], 50
-    for feedback_rate in (0.8, 0.4):
-        th.manual_seed(0)
-        circuit = NGCCircuit(8, 3, (32, 32), feedback="learned", feedback_rate=feedback_rate)
-        optimizer = th.optim.Adam(circuit.parameter_groups(1e-3))
-        before = [p.clone() for p in circuit.feedback_weights]
-        batch = teacher_batch()
-        train(circuit, optimizer, n_updates, lambda batch=batch: batch)
-        moved.append(sum(float((p - b).norm()) for p, b in zip(circuit.feedback_weights, before, strict=True)))
-    assert moved[1] == pytest.approx(0.5 * moved[0], rel=0.1)
-
-
 @pytest.mark.parametrize("scaling", ["none", "soft_bound", "column_norm"])
 def test_bounds_bind_under_adam(scaling):
     bound = 1.0 if scaling == "column_norm" else 0.4
@@ -121,13 +112,10 @@ def test_auto_rates_follow_the_spectral_norms():
     assert (circuit.rates < 0.2 * before).all()
 
 
-def test_working_memory_changes_its_own_synapses_and_the_output():
+def test_a_memory_without_weight_counts_for_nothing_and_learns_nothing():
     circuit = NGCCircuit(8, 3, (16, 16), n_memory=6)
     circuit.optimizer = th.optim.SGD(circuit.parameter_groups(0.1))
     (x, target), memory = teacher_batch(), th.randn(128, 6)
-    before = [m.clone() for m in circuit.memory_weights]
-    circuit.apply_changes(circuit.hebbian_update(circuit.settle(x, target, memory)))
-    assert all((m - b).norm() > 1e-4 for m, b in zip(circuit.memory_weights, before, strict=True))
     assert not th.allclose(circuit.project(x, memory), circuit.project(x, 2 * memory))
     circuit.memory_weight = 0.0
     assert th.equal(circuit.project(x, memory), circuit.project(x, 2 * memory))

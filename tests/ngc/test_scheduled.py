@@ -14,18 +14,17 @@ from tests.ngc import oracle
 @pytest.mark.parametrize("hidden", [(16,), (16, 12), (16, 12, 9, 14)], ids=["depth 2", "depth 3", "depth 5"])
 @pytest.mark.parametrize("output_activation", ["identity", "tanh"])
 @pytest.mark.parametrize("activation", ["relu6", "tanh"])
-def test_scheduled_changes_equal_backprop(hidden, output_activation, activation):
-    circuit = NGCCircuit(
-        6, 3, hidden, activation=activation, output_activation=output_activation, settling="scheduled", n_memory=5
-    )
+@pytest.mark.parametrize("normalization", ["none", "layer"])
+def test_scheduled_changes_equal_backprop(hidden, output_activation, activation, normalization):
+    given = {"activation": activation, "output_activation": output_activation, "normalization": normalization}
+    circuit = NGCCircuit(6, 3, hidden, settling="scheduled", n_memory=5, **given)
     x, target, memory = th.randn(32, 6), th.randn(32, 3), th.randn(32, 5)
     weights, biases = oracle.synapses(circuit)
     memory_weights = [m.detach().clone().requires_grad_() for m in circuit.memory_weights]
-    phi = oracle.FUNCTIONS[activation]
-    h = x
-    for layer, (w, b, m) in enumerate(zip(weights, biases, memory_weights, strict=True)):
-        h = (h if layer == 0 else phi(h)) @ w.t() + b + memory @ m.t()
-    (0.5 * (target - oracle.FUNCTIONS[output_activation](h)).square().sum() / len(x)).backward()
+    inputs = [b + memory @ m.t() for b, m in zip(biases, memory_weights, strict=True)]
+    output = oracle.forward(circuit, weights, inputs, x)
+    assert th.allclose(circuit.project(x, memory), output, atol=1e-6)
+    (0.5 * (target - output).square().sum() / len(x)).backward()
     changes = circuit.hebbian_update(circuit.settle(x, target, memory))
     for change, synapse in zip(changes.tensors(), [*weights, *biases, *memory_weights], strict=True):
         assert synapse.grad.abs().max() > 1e-4

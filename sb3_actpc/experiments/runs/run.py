@@ -171,7 +171,8 @@ def _train(
     callbacks: list[BaseCallback] = [evaluations, episodes, *more]
     saver = None
     if run.checkpoint_freq:
-        saver = CheckpointCallback(checkpoints, run.checkpoint_freq, at_end=False, report=report, restored=restored)
+        saver = CheckpointCallback(checkpoints, run.checkpoint_freq, at_end=False, report=report)
+        saver.restored = restored
         callbacks.insert(0, saver)
     # what progress_bar=True does, but closed when training stops early
     bar = ProgressBarCallback() if run.progress else None
