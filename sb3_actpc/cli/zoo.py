@@ -18,7 +18,7 @@ from sb3_actpc.utils.extras import import_extra
 SCRIPTS = {"train": "train:train", "optimize": "train:train", "enjoy": "enjoy:enjoy", "plot": "plots:plot_train"}
 OPTIMIZABLE = ("actpc", "ppo", "sac", "trpo")  # no setting in their presets overrides a sampled one
 RANGES = {"learning_rate": (1e-5, 2e-3), "tau": (1e-3, 0.15), "refresh_weight": (0.1, 3.0)}
-CHOICES = {"gamma": [0.95, 0.98, 0.99, 0.995], "batch_size": [64, 128, 256, 512], "epistemic": [0.0, 0.1, 1.0]}
+CHOICES = {"gamma": [0.95, 0.98, 0.99, 0.995], "batch_size": [64, 128, 256, 512]}
 
 
 def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
@@ -91,19 +91,12 @@ def _register_algorithms() -> None:
         with suppress(ImportError):  # of an extra that is not installed
             zoo.ALGOS[name] = load_algorithm(name)
     search.HYPERPARAMS_SAMPLER["actpc"] = _sample_actpc
-    search.HYPERPARAMS_CONVERTER["actpc"] = _as_keywords
+    search.HYPERPARAMS_CONVERTER["actpc"] = dict
 
 
 def _sample_actpc(trial: Any, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> dict[str, Any]:
     settings = {name: trial.suggest_float(name, *bounds, log=True) for name, bounds in RANGES.items()}
-    settings |= {name: trial.suggest_categorical(name, values) for name, values in CHOICES.items()}
-    return _as_keywords(settings)
-
-
-def _as_keywords(sampled: dict[str, Any]) -> dict[str, Any]:
-    keywords = dict(sampled)
-    keywords["reward_weights"] = {"epistemic": keywords.pop("epistemic")}
-    return keywords
+    return settings | {name: trial.suggest_categorical(name, values) for name, values in CHOICES.items()}
 
 
 def _settings(env_id: str, ours: argparse.Namespace) -> dict[str, Any]:

@@ -36,6 +36,7 @@ from tests.checkpoints.runs import (
 
 REMEMBERING = {"net_arch": [16, 16], "memory_history": 3}
 NOISE = {"action_noise": NormalActionNoise(np.zeros(2), 0.2 * np.ones(2))}
+KEPT_ONCE = {"handle_timeout_termination": False}
 HINDSIGHT = {"replay_buffer_class": HerReplayBuffer, "replay_buffer_kwargs": {"copy_info_dict": True}}
 
 
