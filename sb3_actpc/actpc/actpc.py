@@ -54,7 +54,7 @@ class ActPC(ActPCBase):
     demonstrations and then frozen, gives an instrumental one. Paper: https://arxiv.org/abs/2209.09174.
 
     Defaults are one setting for all demonstrations (README has its results); the paper's own values are in
-    ``hyperparams/actpc_paper.yml``. Keywords whose default is None have one value with demonstrations and one without:
+    ``hyperparams/actpc_paper.yml``. These keywords have one value with demonstrations and one without:
 
     ====================================== ============== =======
     keyword                                demonstrations without

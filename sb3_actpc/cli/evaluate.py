@@ -12,7 +12,8 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
     add = parser.add_argument
     add("folder", type=Path, metavar="RUN", help="run folder, as written by sb3-actpc train")
     add("--episodes", type=count, default=10, metavar="N", help="episodes to play (default: %(default)s)")
-    add("--seed", type=int, default=0, help="seed of the first episode (default: %(default)s)")
+    about = "seed of the first episode (default: %(default)s); the evaluations of the run had other start states"
+    add("--seed", type=int, default=0, help=about)
     add("--video", metavar="FILE", help="video of the first episode, .mp4 or .gif (default: RUN/video.mp4)")
     add("--no-video", action="store_true", help="no video")
 

@@ -84,6 +84,9 @@ def checked(init: Callable[Parameters, None]) -> Callable[Parameters, None]:
             check_value(name, given.arguments[name], signature.parameters[name].annotation)
         init(*given.args, **given.kwargs)
 
+    # help() shows names and defaults: with the checks, a page of them
+    shown = [one.replace(annotation=one.empty) for one in signature.parameters.values()]
+    checking.__signature__ = inspect.Signature(shown)  # type: ignore[attr-defined]
     return checking
 
 
@@ -100,7 +103,7 @@ def check_settings(kind: type, settings: Mapping[str, Any]) -> None:
     annotations: dict[str, Any] = {}
     for init in constructors(kind):
         if hasattr(init, "__wrapped__"):
-            own = inspect.signature(init, eval_str=True).parameters.values()
+            own = inspect.signature(init.__wrapped__, eval_str=True).parameters.values()
             annotations = {**{one.name: one.annotation for one in own}, **annotations}
     annotations = {**OF_SB3, **annotations}
     for name in filter(annotations.__contains__, settings):
