@@ -160,7 +160,7 @@ class Poison(BaseCallback):
 
     def _on_step(self) -> bool:
         if self.num_timesteps == self.at:
-            self.training_env.set_attr("poison", self.what)
+            self.training_env.unwrapped.envs[0].unwrapped.poison = self.what
             parts = [weights for name, weights in self.model.policy.named_parameters() if name.startswith(self.what)]
             for weights in parts[:1]:
                 weights.data.view(-1)[0] = np.nan
