@@ -1,7 +1,6 @@
 """The agent: every part of Algorithm 1 is wired, and does what the paper says it does."""
 
 import dataclasses
-import pickle
 import warnings
 
 import gymnasium as gym
@@ -23,7 +22,9 @@ from tests.actpc.envs import CountingEnv, demonstrations
 
 NO_MEMORY = {"self_imitation_size": 0}
 NO_TIMEOUTS = {"replay_buffer_kwargs": {"handle_timeout_termination": False}}
-LARGEST = np.finfo(np.float32).max
+WHOLE_NUMBERS = gym.spaces.Box(-2, 2, (2,), np.int64)
+WITHOUT_WIDTH = gym.spaces.Box(np.array([-1, 2.0]), np.array([1, 2.0]), dtype=np.float32)
+WITHOUT_BOUNDS = gym.spaces.Box(-np.finfo(np.float32).max, np.finfo(np.float32).max, (2,), np.float32)
 
 
 def remembering(history):
@@ -304,17 +305,6 @@ def test_refresh_imitates_the_agents_own_best_episodes_beside_the_demonstrations
     assert errors[True] < 0.1 < 0.5 < errors[False]
 
 
-def test_demonstrations_fill_their_share_of_the_critic_batch():
-    data = demonstrations()
-    model = make(demonstrations=data, demonstration_fraction=0.5)
-    model.learn(40)
-    batch = next(model.sample_batches(1, 16))
-    rows = {tuple(row) for row in data.observations.tolist()}
-    demonstrated = [tuple(row) in rows for row in batch.features.tolist()]
-    assert sum(demonstrated) == 8 and not demonstrated[0]  # the newest transition comes first
-    assert batch.rewards.shape == (16, 1)
-
-
 def test_demonstrated_returns_reach_n_steps_ahead_and_end_with_the_episode():
     data = demonstrations(n_episodes=2, length=5)
     data = dataclasses.replace(data, rewards=np.arange(10.0), terminations=np.arange(10) == 9)
@@ -349,7 +339,7 @@ def test_with_n_step_returns_generator_and_prior_still_predict_one_step():
     assert not differ([batch.next_features], [batch.bootstrap_features])
 
 
-def test_a_circuit_with_a_smaller_batch_takes_the_newest_and_a_fair_mixture_of_the_rest():
+def test_demonstrations_fill_their_share_of_the_largest_batch_and_a_fair_one_of_a_smaller_circuits():
     data = demonstrations()
     sizes = {"critic_kwargs": {"batch_size": 64}, "generator_kwargs": {"batch_size": 32}}
     model = make(demonstrations=data, demonstration_fraction=0.5, policy_kwargs={"net_arch": [16, 16], **sizes})
@@ -359,8 +349,9 @@ def test_a_circuit_with_a_smaller_batch_takes_the_newest_and_a_fair_mixture_of_t
     shares = []
     for _ in range(50):
         batch = next(model.sample_batches(1, 16))
-        assert len(batch.features) == 64 and tuple(batch.features[0].tolist()) == newest
-        shares.append(np.mean([tuple(row) in rows for row in batch.features[:16].tolist()]))
+        is_shown = [tuple(row) in rows for row in batch.features.tolist()]
+        assert len(is_shown) == 64 and sum(is_shown) == 32 and tuple(batch.features[0].tolist()) == newest
+        shares.append(np.mean(is_shown[:16]))
     assert np.mean(shares) == pytest.approx(0.5, abs=0.07)
 
 
@@ -542,14 +533,6 @@ def test_a_loaded_agents_signals_are_those_asked_for(tmp_path):
     assert type(other.signals.epistemic) is not type(model.signals.epistemic)
 
 
-def test_demonstrations_must_be_recorded_with_the_wrappers_of_the_environment():
-    env = gym.wrappers.RescaleAction(CountingEnv(), np.float32(-1.0), np.float32(1.0))
-    with pytest.raises(ValueError, match=r"'actions': .*: record them in this environment, wrapped as it is here"):
-        make(DummyVecEnv([lambda: env]), demonstrations=demonstrations())
-    shown = Demonstrations.record(lambda observation: np.full(2, 0.5, np.float32), env, 2)
-    assert make(DummyVecEnv([lambda: env]), demonstrations=shown).learn(15).num_timesteps == 15
-
-
 # ---------------------------------------------------------------------- saving, determinism
 
 
@@ -568,14 +551,6 @@ def test_save_and_load_predict_the_same_and_training_goes_on(keywords, tmp_path)
     loaded.load_replay_buffer(tmp_path / "replay")
     loaded.learn(20, reset_num_timesteps=False)
     assert loaded.num_timesteps == 60 and loaded._n_updates > model._n_updates
-
-
-def test_policies_can_be_pickled(tmp_path):
-    model = make(policy_kwargs=remembering(2)).learn(20)
-    obs, start = np.ones((1, 3), np.float32), np.ones(1, bool)
-    th.save(model.policy, tmp_path / "policy.pt")
-    for copied in (pickle.loads(pickle.dumps(model.policy)), th.load(tmp_path / "policy.pt", weights_only=False)):
-        assert np.array_equal(copied.predict(obs, None, start)[0], model.predict(obs, None, start)[0])
 
 
 @pytest.mark.parametrize("own", [{}, {"actor_kwargs": {"learning_rate": 1e-3}, "prior_kwargs": {"learning_rate": 1e-5}}])
@@ -627,12 +602,6 @@ def test_demonstrations_that_are_set_later_are_checked_and_used(tmp_path):
     model.demonstrations = dataclasses.replace(demonstrations(), actions=np.zeros((60, 5), np.float32))
     with pytest.raises(ValueError, match="actions"):
         model.learn(10)
-
-
-@pytest.mark.parametrize("settling", ["iterative", "scheduled"])
-def test_two_seeded_runs_are_bit_identical(settling):
-    runs = [make(settling=settling, demonstrations=demonstrations()).learn(80) for _ in range(2)]
-    assert not differ(weights_of(runs[0].policy), weights_of(runs[1].policy))
 
 
 def test_learning_rates_of_circuits_and_error_synapses_follow_the_schedule():
@@ -752,14 +721,8 @@ def test_vec_normalize_relabels_the_task_reward_alone():
         ({"policy_kwargs": {"n_critics": 0}}, "n_critics=0"),
         ({"policy_kwargs": {"nudge": 0.0}}, "nudge=0.0"),
         ({"policy_kwargs": {"optimizer_kwargs": {"lr": 1.0}}}, "optimizer_kwargs has lr=1.0: use learning_rate="),
-        (
-            {"policy_kwargs": {"circuit_kwargs": {"settling": "iterative"}}},
-            "give settling= to the agent",
-        ),
-        (
-            {"policy_kwargs": {"actor_kwargs": {"settling": "iterative"}}},
-            "critic settling='scheduled' must agree",
-        ),
+        ({"policy_kwargs": {"circuit_kwargs": {"settling": "iterative"}}}, "give settling= to the agent"),
+        ({"policy_kwargs": {"actor_kwargs": {"settling": "iterative"}}}, "critic settling='scheduled' must agree"),
         ({"policy_kwargs": {"net_arch": {"vf": [8]}}}, "unknown keys"),
         ({"policy_kwargs": {"circuit_kwargs": {"activation": "gelu"}}}, "activation='gelu'"),
         ({"policy_kwargs": {"circuit_kwargs": {"n_steps": 3}}}, "a circuit has no keywords"),
@@ -781,34 +744,20 @@ def test_vec_normalize_relabels_the_task_reward_alone():
         ({"device": "xpu"}, "device='xpu' must be 'auto' or a torch device of this machine"),
         ({"guidance_kwargs": {"gat": True}}, "guidance_kwargs=.*'gat'"),
         ({"guidance": "best"}, "guidance='best' must be None, 'default', 'none' or an ActorGuidance"),
+        ({"learning_rat": 0.1}, "ActPC has no keyword 'learning_rat' .did you mean 'learning_rate'"),  # a TypeError
     ],
 )
 def test_a_wrong_keyword_is_named(keywords, named):
-    with pytest.raises(ValueError, match=named):
+    with pytest.raises((ValueError, TypeError), match=named):
         make(**keywords)
-
-
-def test_an_unknown_keyword_is_answered_with_the_nearest_one():
-    with pytest.raises(TypeError, match=r"ActPC has no keyword 'learning_rat' .did you mean 'learning_rate'"):
-        make(learning_rat=0.1)
 
 
 @pytest.mark.parametrize(
     ("policy", "observations", "actions", "named"),
     [
-        (
-            "MlpPolicy",
-            (3,),
-            gym.spaces.Box(-2, 2, (2,), np.int64),
-            r"int64\) must have a floating dtype: wrap the environment",
-        ),
-        (
-            "MlpPolicy",
-            (3,),
-            gym.spaces.Box(np.array([-1, 2.0]), np.array([1, 2.0]), dtype=np.float32),
-            "dimension 1 has low == ",
-        ),
-        ("MlpPolicy", (3,), gym.spaces.Box(-LARGEST, LARGEST, (2,), np.float32), "must have finite bounds"),
+        ("MlpPolicy", (3,), WHOLE_NUMBERS, r"int64\) must have a floating dtype: wrap the environment"),
+        ("MlpPolicy", (3,), WITHOUT_WIDTH, "dimension 1 has low == "),
+        ("MlpPolicy", (3,), WITHOUT_BOUNDS, "must have finite bounds"),
         ("MlpPolicy", (36, 36, 3), None, "ActPCPolicy does not take .*: use 'CnnPolicy'"),
         ("MlpPolicy", {}, None, "MultiInputPolicy"),
         (MlpPolicy, {}, None, "ActPCPolicy does not take .*: use 'MultiInputPolicy'"),
@@ -839,12 +788,6 @@ def test_an_environment_that_is_not_finite_is_named_with_its_step(field):
     step = 5 if field == "last observations" else 15
     with pytest.raises(ValueError, match=rf"environment: {field.split()[-1]} are not finite at step {step}"):
         make(DummyVecEnv([Broken])).learn(100)
-
-
-def test_demonstrations_of_another_task_are_refused():
-    for data, named in ((demonstrations(env_id="Pendulum-v1"), "actions"), (demonstrations(), "env_id")):
-        with pytest.raises(ValueError, match=named):
-            ActPC("MlpPolicy", "Pendulum-v1", demonstrations=data)
 
 
 # ---------------------------------------------------------------------- demonstrations that come and go
