@@ -64,11 +64,6 @@ def test_a_damaged_agent_is_named(tmp_path: Path) -> None:
         load_pretrained(ENV_ID, folder=tmp_path)
 
 
-def test_an_environment_without_an_agent_is_named_with_those_that_have_one() -> None:
-    with pytest.raises(ValueError, match=r"no agent is bundled for 'SparseReacher-v4'.*SparseReacher-v5"):
-        load_pretrained("SparseReacher-v4")
-
-
 @pytest.mark.parametrize("env_id", sorted(read_index()))
 def test_every_bundled_agent_is_small_and_acts(env_id: str) -> None:
     row = read_index()[env_id]

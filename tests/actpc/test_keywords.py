@@ -25,18 +25,6 @@ def test_a_number_is_the_standard_deviation_of_the_action_noise():
     assert make(action_noise=None).action_noise is None and make(action_noise=0).action_noise is None
 
 
-def test_learn_says_once_what_the_reward_is_made_of(capsys):
-    model = make(verbose=1, learning_starts=1000)
-    for _ in range(3):
-        model.learn(5, reset_num_timesteps=False)
-    assert capsys.readouterr().out.count("reward: 1 x task") == 1
-    model.reward_weights = {"task": 0.5}
-    model.learn(5)
-    assert "reward: 0.5 x task" in capsys.readouterr().out
-    make(learning_starts=1000).learn(5)
-    assert capsys.readouterr().out == ""
-
-
 @pytest.mark.parametrize("kind", ["ReplayBuffer", "NStepReplayBuffer", "DictReplayBuffer", "HerReplayBuffer"])
 @pytest.mark.parametrize("dict_observations", [False, True])
 def test_a_buffer_must_fit_the_observations(kind, dict_observations):

@@ -1,10 +1,9 @@
 """Policies, extractors and optimizers of the user."""
 
-import pytest
 import torch as th
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 
-from tests.actpc.agents import imitating, make
+from tests.actpc.agents import imitating
 
 
 class Dropping(BaseFeaturesExtractor):
@@ -28,10 +27,3 @@ def test_an_extractor_is_fixed():
     assert th.equal(model.actor.features(observations), features)
     model.learn(30)
     assert th.equal(norm.running_mean, before)
-
-
-@pytest.mark.parametrize("given", [{"foreach": True}, {"fused": False}, {}])
-def test_adam_takes_the_form_that_it_is_given(given):
-    model = make(policy_kwargs={"optimizer_kwargs": given})
-    assert bool(model.actor.circuit.optimizer.defaults["fused"]) == (not given)
-    model.learn(15)

@@ -15,7 +15,6 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_actpc.baselines import BC, BCRNN
-from sb3_actpc.baselines.bc import BCRNNPolicy
 from sb3_actpc.demonstrations.dataset import Demonstrations
 from sb3_actpc.experiments.runs import Run, train_run
 from sb3_actpc.experiments.runs.evaluation import play_episodes
@@ -144,19 +143,6 @@ def test_a_saved_agent_names_its_demonstrations_as_they_were_given(tmp_path: Pat
 def test_two_runs_with_one_seed_are_equal() -> None:
     first, second = (make(BCRNN, input_noise=0.1).learn(10).policy.state_dict() for _ in range(2))
     assert all(th.equal(first[name], second[name]) for name in first)
-
-
-def test_the_shared_evaluation_carries_the_state() -> None:
-    seen = []
-
-    class Watched(BCRNNPolicy):
-        def predict(self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = False) -> Any:
-            seen.append(None if state is None else state[-1].tolist())
-            return super().predict(observation, state, episode_start, deterministic)
-
-    model = BCRNN(Watched, ENV, demonstrations=record(ENV), policy_kwargs=SMALL_RNN, device="cpu")
-    play_episodes(model, [gym.make(ENV, max_episode_steps=3) for _ in range(2)], 2, 0)
-    assert seen == [None, [1, 1], [2, 2]]
 
 
 @pytest.mark.parametrize(

@@ -99,11 +99,6 @@ def test_an_agent_loaded_to_play_has_no_buffer_until_it_has_an_environment(tmp_p
     assert loaded.replay_buffer.demonstrated.buffer_size == 24
 
 
-def test_demonstrations_of_another_task_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"SparseHopper-v5.*SparseWalker2d-v5|SparseWalker2d-v5.*SparseHopper-v5"):
-        TD3Demo("MlpPolicy", "SparseHopper-v5", demonstrations=record("SparseWalker2d-v5"))
-
-
 class Interrupts(BaseCallback):
     """In the third step."""
 

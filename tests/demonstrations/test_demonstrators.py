@@ -2,8 +2,6 @@
 
 import argparse
 import dataclasses
-import json
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -218,20 +216,6 @@ class TestCommand:
         text = f"mean dense return {poor.dense_returns.mean():.1f} is far below {shown.dense_returns.mean():.1f}"
         printed = capsys.readouterr().out
         assert (text in printed) == ("--steps" in printed) == is_said
-
-    def test_an_environment_of_ones_own(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.chdir(tmp_path)
-        module = "own_pendulum_for_demonstrations"
-        entry_point = "gymnasium.envs.classic_control:PendulumEnv"
-        source = f"import gymnasium\ngymnasium.register('{module}-v0', '{entry_point}', max_episode_steps=20)"
-        Path(f"{module}.py").write_text(source, encoding="utf-8")
-        words = ["--gym-packages", module, "--steps", "2048", "--episodes", "2", "--output", "own.npz", "--save-every", "1000"]
-        assert run_demos("collect", "--env", f"{module}-v0", *words) == 0
-        shown = Demonstrations.load("own.npz")
-        assert shown.env_id == f"{module}-v0" and len(shown) == 40
-        config = json.loads(next(Path("demonstrators").rglob("config.json")).read_text(encoding="utf-8"))
-        assert config["gym_packages"] == [module]
-        del gym.registry[f"{module}-v0"], sys.modules[module]
 
     @pytest.mark.parametrize(
         ("words", "message"),

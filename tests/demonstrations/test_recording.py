@@ -143,15 +143,6 @@ def test_rows_are_copies_of_what_environment_and_demonstrator_write_on() -> None
     assert shown.actions.ravel().tolist() == [0, 0.25, 0.5, 0.75]
 
 
-def test_observations_of_several_sizes_are_named() -> None:
-    class Grows(Corridor):
-        def observe(self) -> Any:
-            return np.zeros(2 + (self.t == 3), np.float32)
-
-    with pytest.raises(ValueError, match="'observations': expected rows of one size"):
-        Demonstrations.record(forward, Grows(), 1)
-
-
 class Clock(Corridor):
     """Observes the seconds since 1970 in double precision, and a constant."""
 
@@ -200,15 +191,6 @@ def test_observations_that_are_no_boxes_are_refused(space: spaces.Space[Any]) ->
         Demonstrations.record(forward, env, 1)
 
 
-def test_sampled_actions_differ_and_deterministic_ones_do_not() -> None:
-    model = PPO("MlpPolicy", "Pendulum-v1", n_steps=8, batch_size=8, device="cpu", seed=0)
-    first, second = (Demonstrations.record(model, "Pendulum-v1", 1, seed=3) for _ in range(2))
-    assert np.array_equal(first.actions, second.actions) and first.env_id == "Pendulum-v1"
-    sampled = Demonstrations.record(model, "Pendulum-v1", 1, deterministic=False, seed=3)
-    assert np.array_equal(first.observations[0], sampled.observations[0])
-    assert not np.allclose(first.actions, sampled.actions)
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -228,13 +210,6 @@ def test_sampled_actions_differ_and_deterministic_ones_do_not() -> None:
 def test_wrong_arguments_are_named(change: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         Demonstrations.record(**{"demonstrator": forward, "env": Corridor(), "n_episodes": 1, **change})
-
-
-def test_repr_is_one_line_that_says_what_there_is() -> None:
-    text = repr(Demonstrations.record(forward, Corridor(dense=True), 2))
-    for part in ("Corridor", "2 episodes", "8 transitions", "observations of 2", "actions of 1", "return 10.0", "dense 100.0"):
-        assert part in text
-    assert len(text) < 200 and "\n" not in text
 
 
 @dataclass

@@ -1,6 +1,4 @@
-"""What 20,000 updates do to a circuit: settling must stay stable and the coupled pair must keep its direction (slow)."""
-
-from itertools import pairwise
+"""What 20,000 updates do to a coupled pair: it must keep its direction (slow)."""
 
 import gymnasium as gym
 import numpy as np
@@ -34,40 +32,6 @@ def transitions() -> dict[str, th.Tensor]:
 def batch_of(transitions, n=256):
     index = th.randint(0, len(transitions["o"]), (n,))
     return (transitions[key][index] for key in "oarn")
-
-
-def energies_while_settling(circuit, x, target):
-    steps = circuit.n_settling_steps
-    energies = []
-    for k in range(1, steps + 1):
-        circuit.n_settling_steps = k
-        energies.append(float(circuit.settle(x, target).total_discrepancy().mean()))
-    circuit.n_settling_steps = steps
-    return energies
-
-
-@pytest.mark.slow
-def test_energy_still_falls_after_20k_updates_on_unnormalised_transitions(transitions):
-    """A fixed rate of 0.1, fine at the start, blows up here (checked at the end)."""
-    circuit = NGCCircuit(23, 17, dynamics="state")
-    circuit.optimizer = th.optim.Adam(circuit.parameter_groups(4e-4), **ADAM)
-    for update in range(N_UPDATES + 1):
-        o, a, _, n = batch_of(transitions)
-        x = th.cat([o, a], dim=1)
-        if update % 5000 == 0:
-            start = float(0.5 * (n - circuit.project(x)).square().sum(1).mean())
-            energies = [start, *energies_while_settling(circuit, x, n)]
-            norms = [round(float(th.linalg.matrix_norm(w, 2)), 1) for w in circuit.weights]
-            print(f"{update} updates: rates {circuit.rates.tolist()}, ||W|| {norms}")
-            print(f"    energy {energies[0]:.3f} -> {energies[-1]:.3f}")
-            assert all(new <= old for old, new in pairwise(energies))
-        circuit.apply_changes(circuit.hebbian_update(circuit.settle(x, n)))
-    assert energies[-1] < 0.9 * energies[0]
-    circuit._keep_rates = False
-    circuit.rates.fill_(0.1)
-    blown = energies_while_settling(circuit, x, n)
-    print(f"at the fixed rate 0.1: {energies[0]:.3f} -> {blown[-1]:.3f}")
-    assert blown[-1] > energies[0]
 
 
 @pytest.mark.slow

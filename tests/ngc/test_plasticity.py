@@ -43,16 +43,6 @@ def test_plain_sgd_adds_the_change():
         assert th.allclose(new, old + 0.05 * change, atol=1e-7)
 
 
-@pytest.mark.parametrize(("settling", "feedback"), [(s, f) for s in ("iterative", "scheduled") for f in ("learned", "tied")])
-def test_a_circuit_learns_a_function(settling, feedback):
-    circuit = NGCCircuit(8, 3, (64, 64), settling=settling, feedback=feedback)
-    optimizer = th.optim.Adam(circuit.parameter_groups(1e-3))
-    x, target = teacher_batch(1024)
-    start = (target - circuit.project(x)).square().mean()
-    train(circuit, optimizer, 1500)
-    assert (target - circuit.project(x)).square().mean() < 0.2 * start
-
-
 @pytest.mark.parametrize("optimizer_class", [th.optim.SGD, th.optim.Adam])
 @pytest.mark.parametrize("weight_decay", [0.0, 5.0])
 def test_the_gap_between_error_synapses_and_weights_shrinks_by_the_decay_alone(optimizer_class, weight_decay):

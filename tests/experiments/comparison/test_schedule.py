@@ -5,11 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from sb3_actpc.checkpoints import list_bundles
 from sb3_actpc.cli import main
 from sb3_actpc.experiments.comparison.schedule import FAILED, FINISHED, NEW, UNFINISHED, read_error, run_status
 from sb3_actpc.experiments.runs.record import read_run
-from sb3_actpc.experiments.runs.run import CHECKPOINTS
 from sb3_actpc.utils.files import FolderBusy, folder_lock
 from tests.experiments.comparison.tasks import bring_to_end, interrupt_after, measured, small_runs, straight
 
@@ -42,17 +40,6 @@ def test_an_unfinished_run_goes_on_from_its_checkpoint_and_ends_as_the_one_never
     assert [row["timesteps"] for row in measured(run)[1]] == ["8", "16", "24", "32", "40", "48", "56"]
     stored = read_run(run.folder)
     assert (stored.threads, stored.checkpoint_freq) == (2, 7)
-
-
-def test_a_truncated_checkpoint_is_passed_over_for_the_one_before() -> None:
-    [run] = small_runs(OUT)
-    interrupt_after(run, 33)
-    newest = list_bundles(run.folder / CHECKPOINTS)[-1] / "state.json"
-    newest.write_bytes(newest.read_bytes()[:100])
-    _, lines = bring_to_end([run], OUT)
-    assert "damaged checkpoint skipped" in lines[0] and "state.json" in lines[0]
-    assert "from step 30" in lines[1]
-    assert [measured(run)] == straight()
 
 
 def test_a_failed_run_stops_no_other_and_is_tried_again_on_request_only() -> None:
