@@ -132,27 +132,18 @@ def test_the_command_line_imports_heavy_modules_inside_functions_only(package: s
     assert heavy == []
 
 
-def loaded_after(statement: str) -> set[str]:
-    """Names of the modules that a new interpreter holds after a statement."""
+@pytest.mark.parametrize(
+    ("statement", "loaded", "left_out"),
+    [
+        ("import sb3_actpc", "sb3_actpc", LAZY),
+        ("from sb3_actpc import ActPC; ActPC.__name__", "sb3_actpc.actpc", LAZY),
+        ("from sb3_actpc import Demonstrations", "sb3_actpc.demonstrations", ("torch", "stable_baselines3", "mujoco", "h5py")),
+        ("from sb3_actpc.cli import main; main(['list', 'presets'])", "actpc_paper", HEAVY),  # it is printed, too
+    ],
+)
+def test_what_a_statement_imports_leaves_the_rest_alone(statement: str, loaded: str, left_out: tuple[str, ...]) -> None:
     code = f"{statement}; import sys; print(' '.join(sys.modules))"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=PACKAGE.parent, check=False)
     assert result.returncode == 0, result.stderr
-    return set(result.stdout.split())
-
-
-def test_importing_the_package_leaves_the_extras_alone() -> None:
-    loaded = loaded_after("import sb3_actpc")
-    assert "sb3_actpc" in loaded
-    assert loaded.isdisjoint(LAZY)
-
-
-def test_presets_are_listed_without_what_is_heavy() -> None:
-    loaded = loaded_after("from sb3_actpc.cli import main; main(['list', 'presets'])")
-    assert "actpc_paper" in loaded  # it is printed, too
-    assert loaded.isdisjoint(HEAVY)
-
-
-def test_the_agent_is_importable_from_the_package() -> None:
-    loaded = loaded_after("from sb3_actpc import ActPC; ActPC.__name__")
-    assert "sb3_actpc.actpc" in loaded
-    assert loaded.isdisjoint(LAZY)
+    found = set(result.stdout.split())
+    assert loaded in found and found.isdisjoint(left_out)

@@ -2,11 +2,10 @@
 
 import numpy as np
 import pytest
-from stable_baselines3.common.callbacks import BaseCallback, StopTrainingOnMaxEpisodes
+from stable_baselines3.common.callbacks import StopTrainingOnMaxEpisodes
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_actpc import ActPC
-from tests.actpc.agents import make
 from tests.actpc.envs import CountingEnv
 
 
@@ -29,20 +28,3 @@ def test_a_callback_that_stops_at_the_end_of_an_episode_loses_nothing(is_truncat
     assert [rows[: buffer.pos].sum() for rows in (buffer.rewards, buffer.dones, buffer.timeouts)] == [6, 6, 6 * is_truncated]
     assert sorted(buffer.self_imitation.lengths) == [7, 7, 7, 8, 8, 8]
     assert_one_step_each(buffer)
-
-
-@pytest.mark.parametrize("n_envs", [1, 3])
-@pytest.mark.parametrize("train_freq", [1, 4])
-def test_ctrl_c_in_a_callback_stores_the_step_that_was_made(n_envs, train_freq):
-    class Interrupts(BaseCallback):
-        def _on_step(self):
-            if self.n_calls == 10:
-                raise KeyboardInterrupt
-            return True
-
-    model = make(DummyVecEnv([CountingEnv] * n_envs), learning_starts=0, train_freq=train_freq)
-    with pytest.raises(KeyboardInterrupt):
-        model.learn(1000, callback=Interrupts())
-    assert model.replay_buffer.pos == 10 and model.num_timesteps == 10 * n_envs
-    model.learn(30 * n_envs, reset_num_timesteps=False)
-    assert_one_step_each(model.replay_buffer)

@@ -10,14 +10,12 @@ import pytest
 import torch as th
 from gymnasium import spaces
 from stable_baselines3 import DDPG, SAC, TD3
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_actpc.baselines import BC, LOGO, DDPGDemo, TD3Demo
 from sb3_actpc.baselines.demonstrated import DemonstrationNStepReplayBuffer, DemonstrationReplayBuffer
 from sb3_actpc.demonstrations import Demonstrations, fit_demonstrations
 from tests.recordings import record
-from tests.utils.one_array import OneArray, assert_no_transition_is_wrong
 
 BOX = spaces.Box(-1.0, 1.0, (2,), np.float32)
 WIDE = spaces.Box(-2.0, 2.0, (1,), np.float32)
@@ -97,28 +95,6 @@ def test_an_agent_loaded_to_play_has_no_buffer_until_it_has_an_environment(tmp_p
     loaded.set_env(model.env)
     assert loaded.replay_buffer.buffer_size == model.buffer_size
     assert loaded.replay_buffer.demonstrated.buffer_size == 24
-
-
-class Interrupts(BaseCallback):
-    """In the third step."""
-
-    def _on_step(self) -> bool:
-        if self.n_calls == 3:
-            raise KeyboardInterrupt
-        return True
-
-
-@pytest.mark.parametrize("reset_num_timesteps", [True, False])
-@pytest.mark.parametrize("n_steps", [1, 3])
-def test_no_return_is_of_two_episodes_after_an_interruption(n_steps: int, reset_num_timesteps: bool) -> None:
-    model = TD3Demo("MlpPolicy", OneArray(), n_steps=n_steps, **SMALL)
-    with pytest.raises(KeyboardInterrupt):
-        model.learn(100, callback=Interrupts())
-    model.learn(6, reset_num_timesteps=reset_num_timesteps)
-    assert_no_transition_is_wrong(model, 9)
-    batch = model.replay_buffer.sample(200)
-    assert (batch.observations[:, 0] == batch.next_observations[:, 0]).all()
-    assert (batch.next_observations[:, 1] - batch.observations[:, 1]).max() <= n_steps
 
 
 class WithActions(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]):

@@ -16,14 +16,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_actpc import ActPC
-from sb3_actpc.checkpoints import (
-    CheckpointCallback,
-    DamagedCheckpoint,
-    continue_learning,
-    find_bundle,
-    list_bundles,
-    restore,
-)
+from sb3_actpc.checkpoints import CheckpointCallback, DamagedCheckpoint, continue_learning, find_bundle, list_bundles, restore
 from sb3_actpc.checkpoints.bundle import VERSION, manifest_hash
 from sb3_actpc.utils.weights import check_weights
 from tests.actpc.envs import CountingEnv

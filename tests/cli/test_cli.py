@@ -221,13 +221,11 @@ def test_evaluate_replays_a_run_and_writes_a_video(capsys: pytest.CaptureFixture
         ([*TRAIN, "--set", "gamma"], "expected key=value"),
         ([*TRAIN, "--set", "seed=1"], "use --seed"),
         (["train", "--env", ENV_ID, "--algo", "td3", "--preset", "none.yml"], "no preset file at none.yml"),
-        (["train", "--env", ENV_ID, "--steps", "0"], "steps='0' must be greater than or equal to 1"),
         (["train", "--env", ENV_ID, "--device", "abacus"], "'abacus'"),
         ([*PLAIN, "--env-kwarg", "colour=red"], "colour"),
         ([*PLAIN, "--set", "policy_kwargs=[64,64]"], "policy_kwargs=[64, 64] must be a dictionary"),
         ([*PLAIN, "--set", "noise_type=normal"], "give noise_std, such as 0.1"),
         ([*PLAIN, "--steps", "many"], "steps='many' must be a number"),
-        ([*PLAIN, "--eval-freq", "1.5"], "eval_freq=1.5 must be a valid integer"),
         ([*PLAIN, "--env-kwarg", "gain=.nan"], "environment: info['dense_reward'] is nan: check the environment"),
         (["train", "--env", "Own-v0", "--gym-packages", "no_such_task"], "No module named 'no_such_task'"),
         (["train", "--env", "CartPole-v1", "--algo", "td3", "--preset", "small.yml"], "only supports"),
@@ -244,6 +242,26 @@ def test_mistakes_give_one_line_and_exit_code_2(
     assert errors.startswith("sb3-actpc: error: ")
     assert "\n" not in errors
     assert not list(Path("runs").rglob("result.json"))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("default: &a {policy_kwargs: *a}", "maximum recursion depth exceeded"),
+        ("default: {n_envs: .nan}", "n_envs=nan must be a finite number"),
+        ("default: {replay_buffer_class: HerReplayBuffer}", "replay_buffer_class='HerReplayBuffer' does not keep"),
+        ("default: {policy_kwargs: {net_arch: [1048576, 1048576, 1048576]}}", "memory"),
+        ("default: []", "p.yml"),
+        ("[1]", "p.yml"),
+        ("\0", "p.yml"),
+    ],
+)
+def test_a_preset_that_cannot_be_used_gives_one_line_too(text: str, message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    Path("p.yml").write_text(text, encoding="utf-8")
+    command = ["train", "--env", ENV_ID, "--preset", "p.yml", "--demonstrations", "none", "--steps", "12"]
+    assert main([*command, "--no-progress"]) == 2
+    errors = capsys.readouterr().err.strip()
+    assert message in errors and "\n" not in errors
 
 
 def test_presets_are_plain_and_an_entry_replaces_the_default() -> None:

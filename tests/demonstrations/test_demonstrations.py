@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import os
-import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -464,14 +463,6 @@ def test_an_unknown_task_has_nothing_shipped_and_near_ones_are_named() -> None:
     with pytest.raises(FileNotFoundError, match="of SparseHoper-v0 are shipped: collect"):
         shipped_demonstrations("SparseHoper-v0")
     del gym.registry["SparseHoper-v0"]
-
-
-def test_demonstrations_are_imported_without_what_is_heavy() -> None:
-    program = "import sys; from sb3_actpc import Demonstrations; from sb3_actpc.demonstrations import Demonstrations as Same; "
-    program += (
-        "assert Same is Demonstrations; print(sorted({'torch', 'stable_baselines3', 'mujoco', 'h5py'} & set(sys.modules)))"
-    )
-    assert subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout.strip() == "[]"
 
 
 def test_an_episode_of_ones_own_arrays() -> None:

@@ -8,13 +8,7 @@ import pytest
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import (
-    DummyVecEnv,
-    SubprocVecEnv,
-    VecFrameStack,
-    VecMonitor,
-    VecNormalize,
-)
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack, VecMonitor, VecNormalize
 
 from sb3_actpc import ActPC
 from sb3_actpc.baselines.her import HER
@@ -163,6 +157,30 @@ def test_returns_of_several_steps_stay_within_an_episode_when_others_play(algori
     for _ in range(20):
         batch = model.replay_buffer.sample(8)
         assert (batch.observations[:, 0] == batch.next_observations[:, 0]).all()
+
+
+class Interrupts(BaseCallback):
+    """In the third step."""
+
+    def _on_step(self) -> bool:
+        if self.n_calls == 3:
+            raise KeyboardInterrupt
+        return True
+
+
+@pytest.mark.parametrize("algorithm", [ActPC, TD3Demo])
+@pytest.mark.parametrize("reset_num_timesteps", [True, False])
+@pytest.mark.parametrize(("n_envs", "n_steps"), [(1, 1), (1, 3), (3, 3)])
+def test_an_interrupted_step_is_stored_and_no_return_is_of_two_episodes(algorithm, reset_num_timesteps, n_envs, n_steps):
+    """The interruption falls into the middle of a rollout."""
+    model = agent(algorithm, vec_env(n_envs=n_envs, monitor=False), n_steps=n_steps, train_freq=2)
+    with pytest.raises(KeyboardInterrupt):
+        model.learn(100, callback=Interrupts())
+    model.learn(6 * n_envs, reset_num_timesteps=reset_num_timesteps)
+    assert_no_transition_is_wrong(model, 9 * n_envs)
+    batch = model.replay_buffer.sample(200)
+    assert (batch.observations[:, 0] == batch.next_observations[:, 0]).all()
+    assert (batch.next_observations[:, 1] - batch.observations[:, 1]).max() <= n_steps
 
 
 def test_the_environment_that_was_passed_is_played_below_the_monitor_that_sb3_adds():
