@@ -65,10 +65,7 @@ EXPECTED_FAILURES = {
 
 
 def main() -> int:
-    """Fetch, unpack, run.
-
-    :return: exit code
-    """
+    """Fetch, unpack, run; the exit code."""
     parser = argparse.ArgumentParser(description="Run Stable-Baselines3's own tests with ActPC in the place of TD3.")
     parser.add_argument("--workers", default="2", help="pytest-xdist workers (default: %(default)s)")
     args = parser.parse_args()
@@ -95,10 +92,7 @@ def main() -> int:
 
 
 def fetch_archive() -> Path | None:
-    """The source archive of the installed version, from the cache or from PyPI.
-
-    :return: the ``.tar.gz`` file, or None (and one line is printed) when it cannot be fetched
-    """
+    """The source archive of the installed version, from the cache or from PyPI; None, with a line, where it is not there."""
     installed = version(DISTRIBUTION)
     pattern = f"stable[_-]baselines3-{installed}.tar.gz"
     if not any(CACHE.glob(pattern)):
@@ -115,11 +109,7 @@ def fetch_archive() -> Path | None:
 
 
 def unpack(archive: Path, folder: Path) -> None:
-    """Copy the archive's ``tests/`` and its ``pyproject.toml`` (pytest's settings), and nothing else.
-
-    :param archive: source archive
-    :param folder: where to write them
-    """
+    """Copy the archive's ``tests/`` and its ``pyproject.toml`` (pytest's settings), and nothing else."""
     with tarfile.open(archive) as tar:
         for member in tar:
             path = PurePosixPath(*PurePosixPath(member.name).parts[1:])
@@ -131,12 +121,7 @@ def unpack(archive: Path, folder: Path) -> None:
 
 
 def run_tests(folder: Path, workers: str) -> tuple[set[str], int]:
-    """Run what selects ActPC, the expected failures included.
-
-    :param folder: holds ``tests/``
-    :param workers: number of processes
-    :return: ids of the tests that failed, and how many ran
-    """
+    """Run what selects ActPC, the expected failures included: ids of the tests that failed, and how many ran."""
     report = folder / "report.xml"
     command = [sys.executable, "-m", "pytest", "-q", "-rfE", "--tb=short", "-p", "no:cacheprovider", "-n", workers]
     # test_utils imports ale_py and holds no test of ours

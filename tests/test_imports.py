@@ -39,10 +39,7 @@ def module_name(path: Path) -> str:
 
 
 def imports_of(path: Path) -> list[Import]:
-    """Every import statement of a file, with relative ones made absolute.
-
-    ``from a import b`` counts as ``a.b``, since b may be a module.
-    """
+    """Every import statement of a file, relative ones made absolute; ``from a import b`` is ``a.b``: b may be a module."""
     module = module_name(path)
     package = module.split(".") if path.name == "__init__.py" else module.split(".")[:-1]
     found: list[Import] = []

@@ -1,5 +1,5 @@
-"""Every batch holds the asked share of demonstrations, as the environment would have shown and paid them. No transition is
-lost or misjoined, bad action spaces are refused, and the caller's settings stay."""
+"""Every batch holds the asked share of demonstrations, as the environment would have shown and paid them. Bad action spaces
+are refused, and the caller's settings stay."""
 
 from copy import deepcopy
 from typing import Any

@@ -40,8 +40,7 @@ def made_up(env_id: str, lengths: tuple[int, ...] = (4, 3, 5), obs: str = "paper
 
 
 def unit(quats: np.ndarray) -> np.ndarray:
-    """:param quats: (N, 4)
-    :return: the same, each of norm 1"""
+    """Quaternions, (N, 4), scaled to a norm of 1."""
     return quats / np.linalg.norm(quats, axis=1, keepdims=True)
 
 
