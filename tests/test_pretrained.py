@@ -37,10 +37,13 @@ def test_a_saved_agent_acts_as_the_deployed_policy(trained: ActPC, observations:
     assert loaded.gamma == trained.gamma
 
 
-def test_an_agent_is_refused_by_an_environment_with_other_spaces(trained: ActPC, tmp_path: Path) -> None:
+def test_an_agent_of_other_spaces_and_a_file_of_another_kind_are_refused(trained: ActPC, tmp_path: Path) -> None:
     path = save_agent(trained, tmp_path / "agent.safetensors")
     with pytest.raises(ValueError, match="was trained with observation_space="):
         load_agent(path, "Pendulum-v1")
+    path.write_bytes(b"no agent")
+    with pytest.raises(ValueError, match=r"agent\.safetensors: not a file of save_agent"):
+        load_agent(path, ENV_ID)
 
 
 def test_an_agent_that_is_too_large_is_not_written(tmp_path: Path) -> None:
@@ -48,12 +51,6 @@ def test_an_agent_that_is_too_large_is_not_written(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=f"at most {LARGEST_FILE}"):
         save_agent(large, tmp_path / "agent.safetensors")
     assert not list(tmp_path.iterdir())
-
-
-def test_a_file_of_another_kind_is_named(tmp_path: Path) -> None:
-    (tmp_path / "agent.safetensors").write_bytes(b"no agent")
-    with pytest.raises(ValueError, match=r"agent\.safetensors: not a file of save_agent"):
-        load_agent(tmp_path / "agent.safetensors", ENV_ID)
 
 
 def test_a_damaged_agent_is_named(tmp_path: Path) -> None:
@@ -108,11 +105,8 @@ def test_what_cannot_be_played_is_said_in_one_line(
     assert message in capsys.readouterr().err
 
 
-def test_a_bundled_agent_does_not_learn():
+def test_a_bundled_agent_neither_learns_nor_takes_keywords_for_it():
     with pytest.raises(ValueError, match="comes without its critic and only acts"):
         load_pretrained(ENV_ID).learn(100)
-
-
-def test_keywords_for_learning_are_refused():
     with pytest.raises(ValueError, match="train a new agent"):
-        load_pretrained("SparseReacher-v5", guidance="default")
+        load_pretrained(ENV_ID, guidance="default")

@@ -355,15 +355,6 @@ def test_demonstrations_fill_their_share_of_the_largest_batch_and_a_fair_one_of_
     assert np.mean(shares) == pytest.approx(0.5, abs=0.07)
 
 
-def test_signals_of_demonstrations_are_there_from_the_first_batch_also_after_loading(tmp_path):
-    model = make(demonstrations=demonstrations(), demonstration_fraction=0.5).learn(40)
-    model.save(tmp_path / "agent")
-    loaded = ActPC.load(tmp_path / "agent", env=DummyVecEnv([CountingEnv]))
-    loaded.learn(20, reset_num_timesteps=False)
-    for agent in (model, loaded):
-        assert agent.expert.epistemic.min() > 0 and agent.expert.instrumental.max() < 0
-
-
 @pytest.mark.parametrize(("norm_obs", "fitted"), [(True, False), (False, True)])
 def test_what_vec_normalize_normalises_is_not_normalised_again(norm_obs, fitted):
     """It begins with a mean of 0: what the demonstrations look like to it then says nothing of later."""

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 import torch as th
 
+from sb3_actpc import ActPC
 from sb3_actpc.actpc.reward_signals import InternalSignals, RewardWeights, RunningQuantile
 from tests.actpc.agents import make
-from tests.actpc.envs import demonstrations
+from tests.actpc.envs import CountingEnv, demonstrations
 
 SGD = {"optimizer_class": th.optim.SGD}  # its steps are the changes themselves
 
@@ -46,10 +47,13 @@ def test_signals_outlive_the_surprises_of_the_first_steps_by_default():
         assert signals.rewards_of_errors[0](later) == pytest.approx(expected, rel=0.02)
 
 
-def test_demonstrated_steps_are_rewarded_by_surprise_and_punished_for_leaving_the_prior():
-    """What the generator does not foresee draws the agent on, what the prior does not know keeps it back."""
+def test_demonstrated_steps_are_rewarded_by_surprise_and_punished_for_leaving_the_prior(tmp_path):
+    """What the generator does not foresee draws on, what the prior does not know keeps back; after loading too."""
     model = make(demonstrations=demonstrations(), demonstration_fraction=0.5).learn(40)
-    assert model.expert.epistemic.min() > 0.0 > model.expert.instrumental.max()
+    model.save(tmp_path / "agent")
+    loaded = ActPC.load(tmp_path / "agent", env=CountingEnv()).learn(20, reset_num_timesteps=False)
+    for agent in (model, loaded):
+        assert agent.expert.epistemic.min() > 0.0 > agent.expert.instrumental.max()
 
 
 def test_the_bootstrapped_action_is_that_of_the_next_observation_with_the_memory_it_will_have():

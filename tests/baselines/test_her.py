@@ -71,11 +71,12 @@ def test_a_condition_without_a_position_has_no_goal_version() -> None:
         gym.make("GoalHopper-v5", condition="forward")
 
 
+@pytest.mark.parametrize("kind", ["Sparse", ""])
 @pytest.mark.parametrize("env_id", ["GoalReacher-v5", "GoalReacher-v4", "GoalHopper-v5", "GoalSwimmer-v4"])
-def test_demonstrations_of_the_sparse_task_become_those_that_the_goal_task_records(env_id: str) -> None:
+def test_demonstrations_of_either_task_without_goals_become_those_that_the_goal_task_records(env_id: str, kind: str) -> None:
     """The same random actions from the same seeds, recorded in both."""
     env = make_vec_env(env_id)
-    shown = fit_demonstrations(record(sparse_env_id(env_id)), env, env.observation_space, env.action_space)
+    shown = fit_demonstrations(record(env_id.replace("Goal", kind)), env, env.observation_space, env.action_space)
     live = gym.make(env_id, max_episode_steps=12)
     live.action_space.seed(0)
     rows, rewards = [], []

@@ -29,10 +29,7 @@ START_METHOD = "fork" if "fork" in multiprocessing.get_all_start_methods() else 
 MakeModel = Callable[[], OffPolicyAlgorithm]
 SMALL: dict[str, Any] = {"policy_kwargs": {"net_arch": [16, 16]}, "learning_starts": 10, "batch_size": 16, "seed": 3}
 # every circuit has a role; what is not said is the recipe of the constructor's defaults
-SIGNALS: dict[str, Any] = {
-    "reward_weights": {"epistemic": 0.5, "instrumental": 0.5},
-    "signal_kwargs": {"prior_updates": 5},
-}
+SIGNALS: dict[str, Any] = {"reward_weights": {"epistemic": 0.5, "instrumental": 0.5}, "signal_kwargs": {"prior_updates": 5}}
 ACTPC: dict[str, Any] = {**SMALL, **SIGNALS, "buffer_size": 200, "device": "cpu"}
 SHORT_WARM_UP: dict[str, Any] = {"guidance_kwargs": {"bc_updates": 3, "critic_warmup": 5}}  # with demonstrations
 

@@ -313,15 +313,6 @@ def test_demonstrations_of_the_dense_base_task_fit_the_sparse_one() -> None:
     env.close()
 
 
-@pytest.mark.parametrize("recorded_id", ["Hopper-v5", "SparseHopper-v5"])
-def test_demonstrations_of_either_task_without_goals_fit_the_goal_task(recorded_id: str) -> None:
-    shown = record(recorded_id)
-    env = DummyVecEnv([lambda: gym.make("GoalHopper-v5")])
-    fitted = fit_demonstrations(shown, env, env.observation_space, env.action_space)
-    assert fitted.env_id == "GoalHopper-v5" and fitted.observations.shape == (len(shown), 13)
-    env.close()
-
-
 @pytest.mark.parametrize(
     ("recorded_id", "env_id", "message"),
     [

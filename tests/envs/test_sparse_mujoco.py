@@ -20,7 +20,6 @@ pytestmark = pytest.mark.filterwarnings("ignore:.*out of date.*", "ignore:.*infi
 
 REACHER_IDS = [env_id for env_id in SPARSE_MUJOCO_IDS if "Reacher" in env_id]
 LOCOMOTION_IDS = [env_id for env_id in SPARSE_MUJOCO_IDS if "Reacher" not in env_id]
-FALLING_IDS = [env_id for env_id in LOCOMOTION_IDS if "Hopper" in env_id or "Walker2d" in env_id]
 DISTANCES = {"HalfCheetah": 20.0, "Hopper": 2.0, "Walker2d": 2.0, "Swimmer": 1.0}
 VELOCITIES = {"HalfCheetah": 3.5, "Hopper": 1.0, "Walker2d": 1.0, "Swimmer": 0.3}
 
@@ -149,21 +148,6 @@ def test_forward_is_paid_above_the_velocity_and_success_is_still_the_distance(en
     reward, _, info = still_step(env)
     assert (reward, info["is_success"]) == (0.0, True)
     env.close()
-
-
-@pytest.mark.parametrize("env_id", FALLING_IDS)
-def test_a_fall_terminates_unless_the_base_keyword_says_otherwise(env_id: str) -> None:
-    for kwargs, expected in (({}, True), ({"terminate_when_unhealthy": False}, False)):
-        env = gym.make(env_id, **kwargs)
-        env.reset(seed=0)
-        simulator = env.unwrapped
-        qpos = simulator.data.qpos.copy()
-        qpos[1] = 0.3
-        simulator.set_state(qpos, simulator.data.qvel.copy())
-        reward, terminated, _ = still_step(env)
-        assert terminated is expected
-        assert reward == 0.0
-        env.close()
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ import yaml
 from sb3_actpc import ActPC
 from sb3_actpc.cli import main
 from sb3_actpc.experiments.cards import bundle_agent
-from sb3_actpc.experiments.runs import Run, resolve, train_run, video
+from sb3_actpc.experiments.runs import Run, resolve, train_run
 from sb3_actpc.experiments.runs.record import read_run
 from sb3_actpc.pretrained import load_pretrained, read_index
 
@@ -60,14 +60,6 @@ def test_a_card_holds_what_the_hub_asks_for_and_how_to_use_and_train_the_agent(
     for name in ("settings", "n_timesteps", "policy", "n_envs", "env_kwargs", "normalize", "noise_type"):
         assert getattr(again, name) == getattr(before, name)
     assert again.settings["policy_kwargs"] == {"net_arch": [16, 16]}
-
-
-def test_a_card_has_a_video_where_the_machine_can_render(run_folder: Path, tmp_path: Path) -> None:
-    if video.choose_gl_backend() is None:
-        pytest.skip("this machine cannot render")
-    assert main(["card", str(run_folder), "--output", str(tmp_path / "card"), "--episodes", "1"]) == 0
-    assert (tmp_path / "card" / "replay.mp4").stat().st_size > 0
-    assert "replay.mp4" in (tmp_path / "card" / "README.md").read_text(encoding="utf-8")
 
 
 def test_a_folder_with_files_is_not_written_over(run_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -225,20 +225,6 @@ def test_guidance_none_has_no_deployed_policy_and_no_bc():
     assert not differ(before, weights_of(model.actor.circuit))
 
 
-def test_a_guidance_of_ones_own_takes_part():
-    class HalfImitation(ActorGuidance):
-        def critic_weight(self, n_updates: int) -> float:
-            return 0.0
-
-        def imitation_weight(self, n_updates: int) -> float:
-            return 0.0
-
-    model = make(demonstrations=demonstrations(), guidance=HalfImitation(), learning_starts=5)
-    before = weights_of(model.actor.circuit)
-    model.learn(30)
-    assert not differ(before, weights_of(model.actor.circuit))
-
-
 @pytest.mark.parametrize(
     ("wrong", "named"),
     [

@@ -149,13 +149,3 @@ def test_no_run_is_planned_that_would_fail_or_not_be_what_was_said(given: dict[s
     Path("text.npz").write_text("no demonstrations", encoding="utf-8")
     with pytest.raises((ValueError, FileNotFoundError, gym.error.Error), match=re.escape(message)):
         plan(**given)
-
-
-@pytest.mark.parametrize(
-    ("file", "message"), [("nowhere.yml", "no comparison file at nowhere.yml"), ("list.yml", "a mapping")]
-)
-def test_mistakes_give_one_line_and_exit_code_2(file: str, message: str, capsys: pytest.CaptureFixture[str]) -> None:
-    Path("list.yml").write_text("[1]", encoding="utf-8")
-    assert main(["compare", file]) == 2
-    errors = capsys.readouterr().err.strip()
-    assert message in errors and "\n" not in errors

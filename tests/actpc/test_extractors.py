@@ -1,4 +1,4 @@
-"""Policies, extractors and optimizers of the user."""
+"""Features extractors of the user."""
 
 import torch as th
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
