@@ -122,14 +122,7 @@ def check(make: Any, folder: Path, n_steps: int, stop_at: int) -> Any:
         (41, {"settling": "iterative", "policy_kwargs": {"net_arch": [16, 16], "circuit_kwargs": {"feedback": "tied"}}}),
         (41, {"n_steps": 3, "signal_kwargs": {"normalizer": "quantile", "prior_updates": 5}, "target_policy_noise": 0.0}),
         (41, {"n_steps": 4, "policy_kwargs": REMEMBERING}),
-        (
-            41,
-            {
-                "optimize_memory_usage": True,
-                "replay_buffer_kwargs": {"handle_timeout_termination": False},
-                "reward_weights": {},
-            },
-        ),
+        (41, {"optimize_memory_usage": True, "replay_buffer_kwargs": KEPT_ONCE, "reward_weights": {}}),
         (41, {"demonstration_fraction": 0.0, "guidance_kwargs": {"gate": False}, "observation_normalization": "none"}),
         (41, {"tau": 1.0, "target_update_interval": 7, "train_freq": (3, "step"), "gradient_steps": -1}),
     ],

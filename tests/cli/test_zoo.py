@@ -119,13 +119,6 @@ def test_trained_agents_are_played(ran: tuple[Path, dict[str, str]], command: st
     assert "Success rate" in ran[1][command]
 
 
-def test_help_is_rl_zoo3s_with_our_algorithms() -> None:
-    pytest.importorskip("rl_zoo3")
-    command = [sys.executable, "-m", "sb3_actpc", "zoo", "train", "--help"]
-    shown = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=120, check=True).stdout
-    assert "--optimize-hyperparameters" in shown and "actpc" in shown and "logo" in shown
-
-
 def test_a_search_tries_settings(ran: tuple[Path, dict[str, str]]) -> None:
     folder, printed = ran
     assert "Number of finished trials:  2" in printed["optimize"]

@@ -186,10 +186,7 @@ BAD_FILES: dict[str, tuple[Callable[[h5py.File], object], str]] = {
     "action range": (lambda f: replace(f, "data/demo_1/actions", np.full((3, 7), 2.0)), r"'actions': expected values in \[-1"),
     "no rows": (lambda f: replace(f, "data/demo_1/actions", np.zeros((0, 7))), r"demo_1/actions must hold numbers of shape"),
     "obs missing": (lambda f: f["data/demo_1"].pop("obs"), r"demo_1/obs/robot0_joint_pos_cos is missing"),
-    "length": (
-        lambda f: replace(f, "data/demo_2/obs/object", np.zeros((4, 10))),
-        r"demo_2/obs/object .*\(5, 10\).*\(4, 10\)",
-    ),
+    "length": (lambda f: replace(f, "data/demo_2/obs/object", np.zeros((4, 10))), r"demo_2/obs/object .*\(5, 10\).*\(4, 10\)"),
     "nan": (
         lambda f: f["data/demo_1/obs/robot0_joint_vel"].write_direct(np.full((3, 7), np.nan)),
         "'observations': expected finite float32 values, found nan at index",
