@@ -14,7 +14,7 @@ from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_actpc.actpc.base import ActPCBase
-from sb3_actpc.actpc.batches import Batch
+from sb3_actpc.actpc.batches import Batch, last_observations
 from sb3_actpc.actpc.buffers import SignalReplay, relabels
 from sb3_actpc.actpc.policies import POLICIES, ActPCPolicy, check_policy
 from sb3_actpc.actpc.reward_signals import InternalSignals, check_reward_weights
@@ -76,7 +76,7 @@ class ActPC(ActPCBase):
     :param gamma: discount
     :param train_freq: environment steps (or episodes) between updates
     :param gradient_steps: updates each time; -1 for as many as steps were collected
-    :param action_noise: exploration noise on actions in [-1, 1]: the standard deviation of Gaussian noise, or one of SB3's
+    :param action_noise: exploration noise on actions in [-1, 1]: a Gaussian's standard deviation, one of SB3's noises, or None
     :param replay_buffer_class: None, or one of SB3's classes or its name (its ActPC counterpart is used)
     :param replay_buffer_kwargs: keywords of :class:`~sb3_actpc.actpc.buffers.SignalReplay` and of SB3's class
     :param optimize_memory_usage: as in SB3; not with an epistemic weight, as the generator learns where every step led
@@ -249,18 +249,29 @@ class ActPC(ActPCBase):
         dones: np.ndarray,
         infos: list[dict[str, Any]],
     ) -> None:
-        """As in SB3: store (o_t, a_t, r_t, o_t+1), then its signals; and tell guidance of the step."""
+        """As in SB3; integer observations behind VecNormalize are stored as they were."""
         assert isinstance(replay_buffer, SignalReplay)
         check_step(new_obs, reward, infos, self.num_timesteps)
-        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+        # Observations and rewards as the environment gave them, before VecNormalize and before its reset
+        normalize = self._vec_normalize_env
+        observations = self._last_obs
+        next_observations = new_obs
+        rewards = reward
+        if normalize is not None:
+            observations = self._last_original_obs
+            next_observations = normalize.get_original_obs()
+            rewards = normalize.get_original_reward()
+        last = last_observations(next_observations, dones, infos, normalize)
+        # Store (o_t, a_t, r_t, o_t+1), then its signals
+        replay_buffer.add(observations, last, buffer_action, rewards, dones, infos)
         if self.used_weights.has_signals:
             replay_buffer.store_signals(*self.score_newest())
+        self._last_obs = new_obs
+        self._last_original_obs = next_observations
         starts = self._rollout_starts
         self._rollout_starts = np.array(dones, dtype=bool)
         # Guidance counts steps of policies, not random ones
         if self.num_timesteps >= self.learning_starts + self.n_envs:
-            normalize = self._vec_normalize_env
-            rewards = reward if normalize is None else normalize.get_original_reward()
             self.actor_guidance.on_step(self._context(starts), rewards, dones, self._n_updates)
         if self.expert is not None and np.any(dones):
             self.expert.check_scale(replay_buffer.rewards[: replay_buffer.size()])

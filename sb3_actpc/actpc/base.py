@@ -28,6 +28,7 @@ from sb3_actpc.demonstrations.mixin import LearnsFromDemonstrations
 from sb3_actpc.guidance import ActorGuidance, GuidanceContext
 from sb3_actpc.guidance.base import ImitationBatch
 from sb3_actpc.guidance.guidance import make_guidance
+from sb3_actpc.utils.arguments import check_noise
 from sb3_actpc.utils.checks import Settings, check_finite, named_in_errors
 from sb3_actpc.utils.noise import as_action_noise
 from sb3_actpc.utils.rollouts import StoresLastTransition
@@ -130,6 +131,7 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
     def _check_settings(self) -> None:
         """:raises ValueError: for settings, which can change after the agent was made, that do not go together"""
         check_reward_weights("reward_weights", self.reward_weights)
+        check_noise("action_noise", self.action_noise)
         self.action_noise = as_action_noise(self.action_noise, self.action_space.shape)
         epistemic = self.used_weights.epistemic
         if epistemic and self.optimize_memory_usage:
@@ -212,8 +214,9 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
         self._used_demonstrations = self.demonstrations, self.n_demonstrations
         self.expert = None
         if self.demonstrations is not None:
-            spaces_ = self.observation_space, self.action_space
-            self.expert = DemonstrationReplay(self._fitted_demonstrations(), *spaces_, self.policy.memory_history)
+            self.expert = DemonstrationReplay(
+                self._fitted_demonstrations(), self.observation_space, self.action_space, self.policy.memory_history
+            )
         # An actor that has imitated keeps the statistics of its demonstrations
         is_normalised = self._vec_normalize_env is not None and bool(self._vec_normalize_env.norm_obs)
         parts: Iterable[Any]
@@ -245,17 +248,19 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
         memory = self.replay_buffer.self_imitation
         if memory is not None:
             memory.takes_all = self.actor_guidance.stores == "positive" and self.expert is not None
-        if self.demonstrations is not None:
-            return
+        if self.demonstrations is None:
+            self._go_on_without_demonstrations()
+
+    def _go_on_without_demonstrations(self) -> None:
         self.demonstration_fraction = 0.0
         self.n_demonstrations = None
         if self.is_pretrained and self.refresh_weight:
             warnings.warn(
-                "the agent was taught by demonstrations and goes on without them: pass demonstrations=", stacklevel=5
+                "the agent was taught by demonstrations and goes on without them: pass demonstrations=", stacklevel=6
             )
         unused = (self.reward_weights or {}).get("instrumental")
         if unused:
-            warnings.warn(f"reward_weights['instrumental']={unused:g} has no effect without demonstrations=", stacklevel=5)
+            warnings.warn(f"reward_weights['instrumental']={unused:g} has no effect without demonstrations=", stacklevel=6)
 
     def pretrain(self) -> None:
         """Train the prior on the demonstrations and let guidance start, once; ``learn`` calls this."""
@@ -277,7 +282,8 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
             batch_size = self.policy.batch_sizes(self.batch_size)["prior"]
             self.policy.set_learning_rate(self.lr_schedule(1.0))
             for _ in range(n_updates):
-                self.instrumental.update(expert.batch(expert.draw(batch_size), self.actor, env, self.used_weights, self.gamma))
+                rows = expert.draw(batch_size)
+                self.instrumental.update(expert.batch(rows, self.actor, env, self.used_weights, self.gamma))
                 self.policy.n_prior_updates.add_(1)
         # BC is of demonstrations: an agent without does not imitate its own episodes first
         self.actor_guidance.on_training_start(self._context(), self.is_pretrained or expert is None)

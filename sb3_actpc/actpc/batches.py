@@ -9,6 +9,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from torch.utils._pytree import tree_map
 
 from sb3_actpc.actpc.policies import ActPCActor
+from sb3_actpc.utils.nested import map_observations
 
 Observations = np.ndarray | dict[str, np.ndarray]
 TensorObservations = th.Tensor | dict[str, th.Tensor]
@@ -134,6 +135,23 @@ def minibatches(
             rest = order[n_newest:]
             order[n_newest:] = rest[th.randperm(len(rest), device=rest.device)]
         yield everything.rows(order)
+
+
+def last_observations(
+    observations: Observations, dones: np.ndarray, infos: list[dict[str, Any]], env: VecNormalize | None
+) -> Observations:
+    """What each step led to: ``observations``, where an episode ended its last one instead of the next episode's first."""
+    last: Any = map_observations(np.array, observations)
+    for index in np.flatnonzero(dones):
+        terminal: Any = infos[index].get("terminal_observation")
+        if terminal is None:
+            continue
+        if env is not None:
+            terminal = env.unnormalize_obs(terminal)
+        parts = [(last[key], terminal[key]) for key in last] if isinstance(last, dict) else [(last, terminal)]
+        for array, value in parts:
+            array[index] = np.rint(value) if array.dtype.kind in "iu" else value
+    return last
 
 
 def normalized(observations: Observations | None, env: VecNormalize | None) -> Any:

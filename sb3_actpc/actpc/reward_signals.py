@@ -32,6 +32,8 @@ class RewardWeights(NamedTuple):
 
 def check_reward_weights(name: str, weights: Mapping[str, Any] | None) -> None:
     """:raises ValueError: for another key than those of :class:`RewardWeights`, no number, or a negative weight of a signal"""
+    if weights is not None and not isinstance(weights, Mapping):
+        raise ValueError(f"{name}={weights!r} must be a dictionary with keys from {list(RewardWeights._fields)}")
     for key, value in (weights or {}).items():
         if key not in RewardWeights._fields:
             raise ValueError(f"{name} has an unknown key {key!r}: choose from {list(RewardWeights._fields)}")

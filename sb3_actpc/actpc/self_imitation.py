@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any, Literal, NamedTuple
 
@@ -135,7 +135,8 @@ class SelfImitationMemory:
 
     def checkpoint_state(self) -> dict[str, Any]:
         """The stored episodes and their returns, for a checkpoint."""
-        return {**vars(self), "episodes": None if self.episodes is None else asdict(self.episodes)}
+        episodes = None if self.episodes is None else {one.name: getattr(self.episodes, one.name) for one in fields(Episodes)}
+        return {**vars(self), "episodes": episodes}
 
     def restore_checkpoint_state(self, state: dict[str, Any]) -> None:
         """:param state: what :meth:`checkpoint_state` returned"""

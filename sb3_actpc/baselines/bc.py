@@ -237,7 +237,9 @@ class BCRNNPolicy(BCPolicy):
         self.set_training_mode(False)
         rows, is_batch = self.obs_to_tensor(observation)
         n = len(rows)
-        hidden, steps = (np.zeros((n, self.hidden_size)), np.zeros(n, dtype=np.int64)) if state is None else state
+        if state is None:
+            state = np.zeros((n, self.hidden_size)), np.zeros(n, dtype=np.int64)
+        hidden, steps = state
         begins = steps >= self.restart_every
         if episode_start is not None:
             begins = begins | np.ravel(episode_start).astype(bool)
@@ -304,7 +306,8 @@ class BC(OfflineAlgorithm):
 
     def _copy(self) -> BCPolicy:
         """A network of its own with the policy's normalization; of an agent that was loaded, with all of the policy."""
-        network, kept = self._new_policy(), self.policy.state_dict()
+        network = self._new_policy()
+        kept = self.policy.state_dict()
         if not self._n_updates:
             kept = {name: kept[name] for name in ("mean", "spread")}
         network.load_state_dict(kept, strict=False)

@@ -26,6 +26,7 @@ from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 from sb3_actpc.checkpoints.bundle import Bundle, Report, Write, find_bundle
 from sb3_actpc.checkpoints.encoding import Decoder, Encoder
 from sb3_actpc.utils.extras import installed_version
+from sb3_actpc.utils.noise import GaussianNoise
 from sb3_actpc.utils.tasks import task_id
 from sb3_actpc.utils.weights import check_weights
 
@@ -70,7 +71,8 @@ class Restored:
             if self.starts_again and hasattr(callback, "cut_running_episodes"):
                 callback.cut_running_episodes()
         _restore_logger(model, decoder.decode(self.state["logger"]))
-        decoder.decode(self.state["noise"], getattr(model, "action_noise", None))
+        if self.state["noise"] is not None:
+            decoder.decode(self.state["noise"], model.action_noise)
         for name, value in decoder.decode(self.state["matrices"]).items():
             if value is not None:
                 setattr(_action_dist(model), name, value.to(model.device))
@@ -81,6 +83,12 @@ class Restored:
         th.set_rng_state(generators["torch"])
         if generators["cuda"] is not None and model.device.type == "cuda":
             th.cuda.set_rng_state(generators["cuda"], model.device)
+
+
+def _noise_with_state(model: BaseAlgorithm) -> Any:
+    """The action noise, if it changes by being drawn; that of a standard deviation is a setting."""
+    noise = getattr(model, "action_noise", None)
+    return None if isinstance(getattr(noise, "base_noise", noise), GaussianNoise) else noise
 
 
 def capture_model(model: BaseAlgorithm, callbacks: Sequence[BaseCallback], write: Write) -> None:
@@ -102,7 +110,7 @@ def capture_model(model: BaseAlgorithm, callbacks: Sequence[BaseCallback], write
             "cuda": th.cuda.get_rng_state(model.device) if model.device.type == "cuda" else None,
         },
         "spaces": [model.action_space, model.observation_space],
-        "noise": getattr(model, "action_noise", None),
+        "noise": _noise_with_state(model),
         "own": model.checkpoint_state() if hasattr(model, "checkpoint_state") else None,
         "buffer": None if buffer is None else _buffer_state(buffer, write),
     }

@@ -134,7 +134,10 @@ def check_limit(name: str, limit: Any) -> None:
     """None, a number of episodes, or a number with its unit."""
     if limit is None:
         return
-    number, unit = limit if isinstance(limit, (tuple, list)) and len(limit) == 2 else (limit, "episodes")
+    number = limit
+    unit = "episodes"
+    if isinstance(limit, (tuple, list)) and len(limit) == 2:
+        number, unit = limit
     is_number = isinstance(number, Integral) and not isinstance(number, bool) and int(number) >= 1
     if not is_number or unit not in ("episodes", "transitions"):
         raise ValueError(

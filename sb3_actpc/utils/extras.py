@@ -5,7 +5,7 @@ import sys
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
-NUMPY_1_PYTHON = (3, 12)  # the newest with wheels of NumPy 1, which robosuite and robomimic need
+NUMPY_1_PYTHON = (3, 12)  # the newest with wheels of NumPy 1, which robosuite needs
 
 
 def import_extra(module: str, extra: str) -> Any:

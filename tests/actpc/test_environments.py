@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from gymnasium.wrappers import TimeLimit
 from stable_baselines3.common.noise import NormalActionNoise
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
 from sb3_actpc import ActPC
 from sb3_actpc.utils.tasks import task_id
@@ -47,3 +47,22 @@ def test_noise_of_several_environments_is_that_of_one_in_another_number_of_them(
     for n_envs in (1, 3):
         loaded = ActPC.load(tmp_path / "agent", env=DummyVecEnv([CountingEnv] * n_envs)).learn(30)
         assert loaded.num_timesteps == 30 and getattr(loaded.action_noise, "n_envs", 1) == n_envs
+
+
+class WholeNumbers(CountingEnv):
+    """Observations are the whole numbers 0, 10, 20, ... of an episode."""
+
+    def __init__(self):
+        super().__init__()
+        self.observation_space = gym.spaces.Box(0, 255, (2,), np.int32)
+
+    def _observation(self):
+        return np.full(2, 10 * self.count, np.int32)
+
+
+def test_last_observations_of_whole_numbers_are_stored_as_they_were():
+    """SB3 rounds them: it writes the normalized ones among whole numbers."""
+    model = make(VecNormalize(DummyVecEnv([WholeNumbers]))).learn(20)
+    buffer = model.replay_buffer
+    assert buffer.dones[:20].sum() >= 2
+    np.testing.assert_array_equal(buffer.next_observations[:20] - buffer.observations[:20], 10)

@@ -16,9 +16,9 @@ from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_actpc import ActPC
-from sb3_actpc.checkpoints import CheckpointCallback, load_checkpoint
+from sb3_actpc.checkpoints import CheckpointCallback, TrainingStopped, continue_learning, load_checkpoint
 from tests.actpc.envs import CountingEnv, demonstrations
-from tests.checkpoints.runs import SHORT_WARM_UP, assert_same, make_actpc
+from tests.checkpoints.runs import SHORT_WARM_UP, Terminate, assert_same, make_actpc
 
 KEYWORDS: dict[str, Any] = {
     "train_freq": (2, "step"),
@@ -86,6 +86,14 @@ def test_a_checkpoint_is_loaded_without_running_code(tmp_path: Path, request: py
     request.getfixturevalue("no_code")
     loaded = load_checkpoint(ActPC, tmp_path, make_vec_env(CountingEnv))
     assert_same(model, loaded.model)
+
+
+@pytest.mark.parametrize(("std", "noise"), [(0.5, "GaussianNoise(std=0.5)"), (0.0, "None")])
+def test_another_noise_replaces_the_stored_one(tmp_path: Path, std: float, noise: str) -> None:
+    with pytest.raises(TrainingStopped):
+        make_actpc(CountingEnv, action_noise=0.1).learn(60, [Terminate(30), CheckpointCallback(tmp_path)])
+    restored = load_checkpoint(ActPC, tmp_path, make_vec_env(CountingEnv), action_noise=std)
+    assert repr(continue_learning(restored, CheckpointCallback(tmp_path)).action_noise) == noise
 
 
 def test_what_cannot_be_named_must_be_given_again(tmp_path: Path) -> None:

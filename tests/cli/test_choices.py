@@ -169,7 +169,8 @@ def test_bringing_a_run_to_its_end_begins_goes_on_or_does_nothing() -> None:
         assert finish_run(Run(**{**run.model_dump(), "n_timesteps": steps}), lines.append)["timesteps"] == end
     assert lines == []
     for changed, difference in (
-        ({"settings": {"gamma": 0.5}}, "gamma=None and not 0.5"),
+        ({"settings": {"gamma": 0.5}}, "gamma=unset and not 0.5"),
+        ({"settings": {"replay_buffer_kwargs": None}}, "replay_buffer_kwargs=unset and not None"),
         ({"keep": "best"}, "keep=last and not best"),
     ):
         with pytest.raises(ValueError, match=f"mine holds another run, with {difference}"):

@@ -26,6 +26,7 @@ from sb3_actpc.experiments.runs.schema import CONTENT, Run
 from sb3_actpc.utils.extras import import_extra
 from sb3_actpc.utils.files import atomic_write, folder_lock
 
+UNSET = "unset"  # a setting that is left to its default, which null is not
 CHECKPOINTS = "checkpoints"  # folder in the run's folder
 DIAGNOSTICS = "diagnostics.csv"  # what the agent logs about itself
 MAY_CHANGE = ("threads", "device", "checkpoint_freq", "progress")  # of a run that is gone on with
@@ -103,10 +104,12 @@ def _check_same(stored: Run, run: Run) -> None:
     old = _decisive(stored)
     new = _decisive(run)
     for name in sorted(old.keys() | new.keys()):
-        if old.get(name) != new.get(name):
+        before = old.get(name, UNSET)
+        now = new.get(name, UNSET)
+        if before != now:
             raise ValueError(
-                f"{run.folder} holds another run, with {name}={old.get(name)} and not {new.get(name)}: remove it, choose "
-                f"another folder (--output; of `demos collect` --work-dir), or give the old {name}"
+                f"{run.folder} holds another run, with {name}={before} and not {now}: remove it, choose another folder "
+                f"(--output; of `demos collect` --work-dir), or give the old {name}"
             )
 
 
@@ -133,7 +136,6 @@ def _run(
         train_env = make_train_env(run.env, run.env_kwargs, run.n_envs or 1, run.seed, run.normalize)
         stack.callback(train_env.close)
         model = build_model(run, train_env)
-        stack.callback(getattr(model, "close", lambda: None))  # its other process, where it has one
         if not is_held:
             stack.enter_context(folder_lock(run.folder))
         if not resumes:
@@ -223,7 +225,6 @@ def evaluate_run(folder: Path, n_episodes: int = 10, seed: int = 0) -> dict[str,
     the environment is unknown."""
     run, model = load_run(folder)
     with ExitStack() as stack:
-        stack.callback(getattr(model, "close", lambda: None))
         envs = [stack.enter_context(env) for env in make_eval_envs(run.env, run.env_kwargs, n_episodes)]
         statistics = evaluation.play_episodes(model, envs, n_episodes, seed)
     return {
