@@ -30,14 +30,13 @@ from sb3_actpc.utils.arguments import (
     Share,
     Size,
     Weight,
-    check_computes,
     check_env,
     check_learning_rate,
     check_noise,
     check_train_freq,
     checked,
 )
-from sb3_actpc.utils.checks import Settings, check_finite
+from sb3_actpc.utils.checks import Settings, check_device, check_finite
 
 # the mean absolute action-value that divides the critic term is at least this: before any reward was seen, the critic's
 # noise must not be scaled up to full strength
@@ -149,7 +148,7 @@ class ActPC(ActPCBase):
         policy_kwargs: Settings | None = None,
         tensorboard_log: str | None = None,
         verbose: int = 0,
-        device: Annotated[th.device | str, check_computes] = "auto",
+        device: Annotated[th.device | str, check_device] = "auto",
         seed: Annotated[int | None, Between(0, MAX_SEED)] = None,
         _init_setup_model: bool = True,
     ) -> None:

@@ -29,7 +29,7 @@ class NormalizingPolicy(BasePolicy):
     mean: th.Tensor
     spread: th.Tensor
 
-    def __init__(self, observation_space: spaces.Space, action_space: spaces.Box, lr_schedule: Schedule) -> None:
+    def __init__(self, observation_space: spaces.Space, action_space: spaces.Box) -> None:
         super().__init__(observation_space, action_space, normalize_images=False, squash_output=True)
         self.n_inputs, self.n_outputs = (int(np.prod(space.shape or ())) for space in (observation_space, action_space))
         self.register_buffer("mean", th.zeros(self.n_inputs))
@@ -97,8 +97,7 @@ class OfflineAlgorithm(LearnsFromDemonstrations):
             self._load_demonstrations()
 
     def _new_policy(self) -> Any:
-        policy = self.policy_class(self.observation_space, self.action_space, self.lr_schedule, **self.policy_kwargs)
-        return policy.to(self.device)
+        return self.policy_class(self.observation_space, self.action_space, **self.policy_kwargs).to(self.device)
 
     @abstractmethod
     def _take(self, demonstrations: Demonstrations) -> None:
@@ -113,9 +112,7 @@ class OfflineAlgorithm(LearnsFromDemonstrations):
 
     def _load_demonstrations(self) -> None:
         if self.demonstrations is None or self.get_vec_normalize_env() is not None:
-            raise ValueError(
-                "demonstrations=None, or VecNormalize: an offline method needs a file and normalizes by it itself"
-            )
+            raise ValueError("demonstrations=None, or VecNormalize: an offline method needs a file, normalizes by it itself")
         self._take(self._fitted_demonstrations())
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
@@ -160,25 +157,16 @@ class OfflineAlgorithm(LearnsFromDemonstrations):
 class BCPolicy(NormalizingPolicy):
     """A multilayer perceptron.
 
-    :param observation_space: a Box
-    :param action_space: of the environment
-    :param lr_schedule: of the optimiser, AdamW
+    :param args: spaces of observations and actions
     :param net_arch: hidden sizes, by default two of 256
-    :param optimizer_kwargs: of AdamW, which has no ``weight_decay`` unless given
+    :param optimizer_kwargs: of AdamW, which has no ``weight_decay`` unless given; the algorithm sets its learning rate
     """
 
-    def __init__(
-        self,
-        observation_space: spaces.Space,
-        action_space: spaces.Box,
-        lr_schedule: Schedule,
-        net_arch: list[int] | None = None,
-        optimizer_kwargs: dict[str, Any] | None = None,
-    ) -> None:
-        super().__init__(observation_space, action_space, lr_schedule)
+    def __init__(self, *args: Any, net_arch: list[int] | None = None, optimizer_kwargs: dict[str, Any] | None = None) -> None:
+        super().__init__(*args)
         self._build([256, 256] if net_arch is None else net_arch)
         optimizer_kwargs = {"weight_decay": 0.0, **(optimizer_kwargs or {})}
-        self.optimizer = th.optim.AdamW(self.parameters(), lr=lr_schedule(1), **optimizer_kwargs)
+        self.optimizer = th.optim.AdamW(self.parameters(), **optimizer_kwargs)
 
     def _build(self, net_arch: list[int]) -> None:
         self.network = nn.Sequential(*create_mlp(self.n_inputs, self.n_outputs, net_arch, nn.ReLU))
@@ -194,23 +182,16 @@ class BCPolicy(NormalizingPolicy):
 class BCRNNPolicy(BCPolicy):
     """A GRU, whose state begins anew after as many steps as the sequences that it learned from have.
 
-    :param args: spaces and schedule, as :class:`BCPolicy`'s
+    :param args: spaces of observations and actions
     :param hidden_size: H, units of the GRU
     :param restart_every: steps after which the state begins anew
-    :param optimizer_kwargs: as :class:`BCPolicy`'s
     :raises ValueError: for a keyword with a value that is not allowed
     """
 
     @checked
-    def __init__(
-        self,
-        *args: Any,
-        hidden_size: Positive = 256,
-        restart_every: Positive = 10,
-        optimizer_kwargs: dict[str, Any] | None = None,
-    ) -> None:
+    def __init__(self, *args: Any, hidden_size: Positive = 256, restart_every: Positive = 10) -> None:
         self.hidden_size, self.restart_every = hidden_size, restart_every
-        super().__init__(*args, optimizer_kwargs=optimizer_kwargs)  # type: ignore[misc]
+        super().__init__(*args)
 
     def _build(self, net_arch: list[int]) -> None:
         self.memory = nn.GRU(self.n_inputs, self.hidden_size, batch_first=True)
@@ -302,6 +283,7 @@ class BC(OfflineAlgorithm):
         self._validation_rows = is_held_out.nonzero()[:, 0]
         self._training_rows = (~is_held_out).nonzero()[:, 0]
         self._smallest_error = np.inf
+<<<<<<< HEAD
         self._networks = [self._copy() for _ in range(self.n_seeds)] if held_out.any() else [self.policy]
 
     def _copy(self) -> BCPolicy:
@@ -312,6 +294,13 @@ class BC(OfflineAlgorithm):
             kept = {name: kept[name] for name in ("mean", "spread")}
         network.load_state_dict(kept, strict=False)
         return network
+=======
+        self._networks = [self._new_policy() for _ in range(self.n_seeds)] if held_out.any() else [self.policy]
+        for network in self._networks:
+            network.fit_normalization(demonstrations.observations)
+            if self._n_updates:  # an agent that was loaded goes on from its policy
+                network.load_state_dict(self.policy.state_dict())
+>>>>>>> part-s
 
     def _gradient_step(self) -> dict[str, th.Tensor]:
         losses = []

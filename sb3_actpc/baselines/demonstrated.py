@@ -11,6 +11,7 @@ from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
+from torch.utils._pytree import tree_map
 
 from sb3_actpc.demonstrations import Demonstrations, scaled_actions
 from sb3_actpc.demonstrations.mixin import LearnsFromDemonstrations
@@ -20,8 +21,8 @@ from sb3_actpc.utils.nested import map_observations
 from sb3_actpc.utils.rollouts import StoresLastTransition
 
 
-class WithDemonstrations(ReplayBuffer):
-    """What the buffers of this module add to SB3's; combine it with one of them.
+class DemonstrationReplayBuffer(ReplayBuffer):
+    """SB3's replay buffer with demonstrations; combine it with another of SB3's, as the classes below do.
 
     The demonstrations stay in a buffer of their own, of the SB3 class, so that whatever that class does to its transitions
     (n-step returns, hindsight relabelling, normalisation) is done to them too. They come last in the batch.
@@ -83,19 +84,15 @@ class WithDemonstrations(ReplayBuffer):
             self.timeouts[newest] = np.logical_or(self.timeouts[newest], np.logical_not(self.dones[newest]))
 
 
-class DemonstrationReplayBuffer(WithDemonstrations):
-    """SB3's replay buffer with demonstrations; see :class:`WithDemonstrations`."""
-
-
-class DemonstrationNStepReplayBuffer(WithDemonstrations, NStepReplayBuffer):
+class DemonstrationNStepReplayBuffer(DemonstrationReplayBuffer, NStepReplayBuffer):
     """SB3's n-step replay buffer with demonstrations, whose returns are n-step too."""
 
 
-class DemonstrationDictReplayBuffer(WithDemonstrations, DictReplayBuffer):
+class DemonstrationDictReplayBuffer(DemonstrationReplayBuffer, DictReplayBuffer):
     """SB3's replay buffer for Dict observations with demonstrations."""
 
 
-class DemonstrationHerReplayBuffer(WithDemonstrations, HerReplayBuffer):
+class DemonstrationHerReplayBuffer(DemonstrationReplayBuffer, HerReplayBuffer):
     """SB3's hindsight replay buffer with demonstrations, which are relabelled as the agent's own transitions are."""
 
     def set_env(self, env: VecEnv) -> None:
@@ -105,7 +102,7 @@ class DemonstrationHerReplayBuffer(WithDemonstrations, HerReplayBuffer):
             self.demonstrated.set_env(env)
 
     def cut_running_episodes(self) -> None:
-        """As :meth:`WithDemonstrations.cut_running_episodes`."""
+        """As :meth:`DemonstrationReplayBuffer.cut_running_episodes`."""
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # SB3 warns that it does what is asked for
             self.truncate_last_trajectory()
@@ -115,12 +112,10 @@ def join_batches(own: Any, demonstrated: Any) -> Any:
     """Two batches of SB3's, named tuples of tensors (B, ...) and (C, ...), as one, (B + C, ...); fields that SB3 leaves at
     None stay None."""
 
-    def join(mine: Any, theirs: Any) -> Any:
-        if isinstance(mine, dict):
-            return {key: th.cat([part, theirs[key]]) for key, part in mine.items()}
+    def join(mine: th.Tensor | None, theirs: Any) -> th.Tensor | None:
         return None if mine is None else th.cat([mine, theirs])
 
-    return type(own)(*map(join, own, demonstrated))
+    return tree_map(join, own, demonstrated)
 
 
 class DemonstratedAlgorithm(LearnsFromDemonstrations, StoresLastTransition):
@@ -134,6 +129,8 @@ class DemonstratedAlgorithm(LearnsFromDemonstrations, StoresLastTransition):
     :param options: keywords of :class:`LearnsFromDemonstrations` and of the algorithm
     :raises ValueError: as there, for a share out of range, and for a ``replay_buffer_class``
     """
+
+    replay_buffer: DemonstrationReplayBuffer
 
     @checked
     def __init__(self, *args: Any, demonstration_fraction: Share = 0.5, **options: Any) -> None:
@@ -150,12 +147,12 @@ class DemonstratedAlgorithm(LearnsFromDemonstrations, StoresLastTransition):
         self.replay_buffer_class = None
         self.replay_buffer = buffer
 
-    def _replay_class(self) -> type[WithDemonstrations]:
+    def _replay_class(self) -> type[DemonstrationReplayBuffer]:
         if isinstance(self.observation_space, spaces.Dict):
             return DemonstrationDictReplayBuffer
         return DemonstrationReplayBuffer if self.n_steps == 1 else DemonstrationNStepReplayBuffer
 
-    def _make_replay_buffer(self) -> WithDemonstrations:
+    def _make_replay_buffer(self) -> DemonstrationReplayBuffer:
         kind, is_played = self._replay_class(), self.env is None
         kwargs = dict(self.replay_buffer_kwargs)
         if issubclass(kind, NStepReplayBuffer):
@@ -173,10 +170,6 @@ class DemonstratedAlgorithm(LearnsFromDemonstrations, StoresLastTransition):
             demonstration_fraction=self.demonstration_fraction,
             **kwargs,
         )
-
-    def _cut_running_episodes(self) -> None:
-        assert isinstance(self.replay_buffer, WithDemonstrations)
-        self.replay_buffer.cut_running_episodes()
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         """As SB3's; an agent that was loaded without an environment gets its replay buffer and its demonstrations now."""

@@ -4,10 +4,9 @@ from typing import Any
 
 import numpy as np
 import torch as th
-from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_actpc.baselines.demonstrated import DemonstrationHerReplayBuffer, WithDemonstrations, join_batches
+from sb3_actpc.baselines.demonstrated import DemonstrationHerReplayBuffer, join_batches
 from sb3_actpc.baselines.td3 import DDPGDemo
 from sb3_actpc.utils.arguments import Share, Weight, checked
 
@@ -132,7 +131,7 @@ class HER(DDPGDemo):
         options = {"cloning_weight": 0.0, "demonstration_fraction": 0.5, **options, "replay_buffer_kwargs": buffer}
         super().__init__(*args, **options)
 
-    def _replay_class(self) -> type[WithDemonstrations]:
+    def _replay_class(self) -> type[DemonstrationHerReplayBuffer]:
         if "desired_goal" not in getattr(self.observation_space, "spaces", {}):
             raise ValueError(f"HER needs a goal task such as GoalReacher-v5, found observations of {self.observation_space}")
         return PrioritizedHerReplayBuffer if self.prioritized else DemonstrationHerReplayBuffer
@@ -142,13 +141,11 @@ class HER(DDPGDemo):
         """ε at the present step."""
         return max(self.random_action_end, self.random_action_start * self.random_action_decay**self.num_timesteps)
 
-    def _sample_action(
-        self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
-    ) -> tuple[np.ndarray, np.ndarray]:
-        actions, scaled = super()._sample_action(learning_starts, action_noise, n_envs)
-        random = np.random.random(n_envs) < self.random_action_probability
+    def _sample_action(self, *args: Any, **options: Any) -> tuple[np.ndarray, np.ndarray]:
+        actions, scaled = super()._sample_action(*args, **options)
+        random = np.random.random(self.n_envs) < self.random_action_probability
         if random.any():
-            drawn = np.array([self.action_space.sample() for _ in range(n_envs)])
+            drawn = np.array([self.action_space.sample() for _ in range(self.n_envs)])
             scaled = np.where(random[:, None], self.policy.scale_action(drawn), scaled)
             actions = self.policy.unscale_action(scaled)
         return actions, scaled

@@ -3,8 +3,6 @@
 from typing import Any, ClassVar
 
 import torch as th
-from gymnasium import spaces
-from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy, ContinuousCritic
 from stable_baselines3.common.torch_layers import create_mlp
 from stable_baselines3.common.type_aliases import PyTorchObs
@@ -21,18 +19,15 @@ N_TARGET_CRITICS = 2  # drawn to bootstrap (REDQ, arXiv 2101.05982)
 class IBRLPolicy(TD3Policy):
     """SB3's TD3 policy with layer-normalized critics and the frozen BC policy, ``bc``.
 
-    :param args: as SB3's
     :param n_critics: number of critics
     :param exploration_noise: standard deviation of Gaussian noise on the actor's proposal, in units of [-1, 1], while learning
-    :param options: further keywords, as SB3's
     """
 
     def __init__(self, *args: Any, n_critics: int = 5, exploration_noise: float = 0.1, **options: Any) -> None:
         self.exploration_noise = exploration_noise
         self.follows_bc = False  # the actor proposes nothing yet
         super().__init__(*args, **{**options, "n_critics": n_critics})
-        assert isinstance(self.action_space, spaces.Box)
-        self.bc = BCPolicy(self.observation_space, self.action_space, lambda progress: 0.0).requires_grad_(False)
+        self.bc = BCPolicy(self.observation_space, self.action_space).requires_grad_(False)
 
     def make_critic(self, features_extractor: Any = None) -> ContinuousCritic:
         """SB3's critics with a layer normalization after each hidden layer."""
@@ -107,9 +102,9 @@ class IBRL(TD3Demo):
         model.learn(self.bc_steps, log_interval=None)
         self.policy.bc.load_state_dict(model.policy.state_dict())
 
-    def _sample_action(self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1) -> Any:
+    def _sample_action(self, learning_starts: int, *args: Any, **options: Any) -> Any:
         self.policy.follows_bc = self.num_timesteps < learning_starts
-        chosen = super()._sample_action(0, action_noise, n_envs)
+        chosen = super()._sample_action(0, *args, **options)
         self.policy.follows_bc = False
         return chosen
 

@@ -12,6 +12,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs
 from sb3_actpc.baselines.bc import NormalizingPolicy, OfflineAlgorithm
 from sb3_actpc.demonstrations import Demonstrations, scaled_actions
 from sb3_actpc.utils.arguments import checked
+from sb3_actpc.utils.extras import import_extra
 
 
 class D3rlpyPolicy(NormalizingPolicy):
@@ -50,18 +51,8 @@ class D3rlpyAlgorithm(OfflineAlgorithm):
 
     @classmethod
     def check_installed(cls) -> Any:
-        """d3rlpy.
-
-        :raises ImportError: when it is not installed; the message names the commands that do it
-        """
-        try:
-            import d3rlpy
-        except ImportError as error:
-            raise ImportError(
-                f'{error}: pip install "sb3-actpc[d3rlpy]", then pip install --no-deps d3rlpy==2.8.1, which asks for an older '
-                "Gymnasium that it does not need"
-            ) from error
-        return d3rlpy
+        """d3rlpy; ImportError, which names the commands that install it, when it is not there."""
+        return import_extra("d3rlpy", "d3rlpy")
 
     def _new_policy(self) -> D3rlpyPolicy:
         d3rlpy = self.check_installed()
@@ -100,8 +91,7 @@ class D3rlpyAlgorithm(OfflineAlgorithm):
         for name in ("observations", "next_observations"):
             batch[name] = self.policy.normalized(batch[name]).cpu().numpy()
         unread = {"next_actions": np.zeros_like(batch["actions"]), "transitions": []}  # by either method
-        intervals = np.ones_like(batch["rewards"])
-        return self.policy.learner.update(TransitionMiniBatch(**batch, **unread, intervals=intervals))
+        return self.policy.learner.update(TransitionMiniBatch(**batch, **unread, intervals=np.ones_like(batch["rewards"])))
 
     def save(self, path: Any, exclude: Any = None, include: Any = None) -> None:
         """As SB3's."""

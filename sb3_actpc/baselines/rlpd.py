@@ -20,9 +20,7 @@ N_TARGET_CRITICS = 2  # drawn to bootstrap (REDQ, arXiv 2101.05982)
 class RLPDPolicy(SACPolicy):
     """SBX's SAC policy with layer-normalized critics, for observations normalized by the demonstrations.
 
-    :param args: as SBX's
     :param n_critics: number of critics, at least two
-    :param options: further keywords, as SBX's
     """
 
     def __init__(self, *args: Any, n_critics: int = 10, **options: Any) -> None:

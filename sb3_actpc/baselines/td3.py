@@ -65,7 +65,6 @@ class TD3Demo(DemonstratedAlgorithm, TD3):
 
     def _setup_model(self) -> None:
         super()._setup_model()
-        self._losses: dict[str, list[float]] = defaultdict(list)
         for network, given in self._networks():
             kind = OPTIMIZERS.get(given.get("optimizer", "adam"))
             if kind is None or not given.keys() <= NETWORK_KEYWORDS:
@@ -81,7 +80,7 @@ class TD3Demo(DemonstratedAlgorithm, TD3):
 
     def train(self, gradient_steps: int, batch_size: int = 100) -> None:
         """TD3's updates: so many of the critic; the actor and the targets follow every ``policy_delay``."""
-        assert self.replay_buffer is not None
+        self._losses: dict[str, list[float]] = defaultdict(list)
         self.policy.set_training_mode(True)
         self._update_learning_rate([self.actor.optimizer, self.critic.optimizer])
         for network, given in self._networks():
@@ -98,7 +97,6 @@ class TD3Demo(DemonstratedAlgorithm, TD3):
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         for name, values in self._losses.items():
             self.logger.record(f"train/{name}", np.mean(values))
-        self._losses.clear()
 
     def _step(self, name: str, network: BaseModel, loss: th.Tensor) -> None:
         self._losses[f"{name}_loss"].append(loss.item())
@@ -128,7 +126,7 @@ class TD3Demo(DemonstratedAlgorithm, TD3):
     def _actor_loss(self, batch: Any, actions: th.Tensor) -> th.Tensor:
         """Minus the mean action-value of the actor's actions, (B, A), and the cloning loss on the demonstrated rows."""
         values = self._actor_values(batch.observations, actions)
-        n_demonstrated = self.replay_buffer.n_demonstrated(len(actions))  # type: ignore[union-attr]
+        n_demonstrated = self.replay_buffer.n_demonstrated(len(actions))
         if not (n_demonstrated and self.cloning_weight):
             return -values.mean()
         last = slice(len(actions) - n_demonstrated, None)
@@ -158,7 +156,7 @@ class TD3Demo(DemonstratedAlgorithm, TD3):
 
     def _clone_actor(self) -> None:
         """Start the actor as behavior cloning does: least squares on the demonstrated actions, in [-1, 1]."""
-        demonstrated: Any = self.replay_buffer.demonstrated  # type: ignore[union-attr]
+        demonstrated: Any = self.replay_buffer.demonstrated
         optimizer = th.optim.Adam(self.actor.parameters(), lr=BC_LEARNING_RATE)
         self.actor.set_training_mode(True)
         for step in range(self.bc_steps):
@@ -181,9 +179,6 @@ class TD3Demo(DemonstratedAlgorithm, TD3):
         """Move a network's target towards it."""
         tau = getattr(self, f"{name}_kwargs").get("tau", self.tau)
         polyak_update(getattr(self, name).parameters(), getattr(self, f"{name}_target").parameters(), tau)
-
-    def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_losses"]
 
 
 class DDPGDemo(TD3Demo):

@@ -38,8 +38,8 @@ def _seal(path: Path) -> str:
 
 
 class Bundle:
-    """A checkpoint on the disk, by its folder. DamagedCheckpoint when the manifest is missing or not whole, ValueError when
-    another version of the format wrote it."""
+    """A whole checkpoint on the disk, by its folder. DamagedCheckpoint names the first file that is missing or not what was
+    written; ValueError when another version of the format wrote it."""
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path)
@@ -54,13 +54,9 @@ class Bundle:
                 f"{path} has format version {self.manifest['version']}, this sb3_actpc reads {VERSION}: begin the run again, "
                 "or go on with the version that wrote it"
             )
-
-    def verify(self) -> "Bundle":
-        """The checkpoint itself; DamagedCheckpoint names the first file that is missing or not what was written."""
         for name, digest in self.manifest["files"].items():
             if not (self.path / name).is_file() or file_hash(self.path / name) != digest:
                 raise DamagedCheckpoint(f"{self.path}: {name} is missing, or is not what was written; {_USE_ANOTHER}")
-        return self
 
 
 @contextmanager
@@ -85,8 +81,7 @@ def write_bundle(folder: Path, num_timesteps: int, keep: int, manifest: Mapping[
         yield write
         paths = sorted(bundle.iterdir())
         with ThreadPoolExecutor(max_workers=4) as workers:
-            digests = list(workers.map(_seal, paths))
-        files = {path.name: digest for path, digest in zip(paths, digests, strict=True)}
+            files = dict(zip([path.name for path in paths], workers.map(_seal, paths), strict=True))
         record = {"version": VERSION, "num_timesteps": num_timesteps, **manifest, "files": files}
         write(MANIFEST, json.dumps({**record, "sha256": manifest_hash(record)}).encode())
         _seal(bundle / MANIFEST)
@@ -109,11 +104,11 @@ def find_bundle(path: str | os.PathLike[str], report: Report = warnings.warn) ->
     bundles = list_bundles(path)
     if not bundles:
         if (path / MANIFEST).exists() or (_NAME.fullmatch(path.name) and path.is_dir()):
-            return Bundle(path).verify()
+            return Bundle(path)
         raise FileNotFoundError(f"no checkpoint in {path}")
     for candidate in reversed(bundles):
         try:
-            return Bundle(candidate).verify()
+            return Bundle(candidate)
         except DamagedCheckpoint as error:
             report(f"damaged checkpoint skipped: {error}")
     raise DamagedCheckpoint(f"{path}: all of its {len(bundles)} checkpoints are damaged; begin the run again")

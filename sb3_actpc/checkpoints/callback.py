@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
@@ -101,8 +100,7 @@ class CheckpointCallback(BaseCallback):
         step = self.num_timesteps
         check_finite("agent", "actions", np.asarray(self.locals["actions"]), step)
         seen = self.locals["new_obs"]
-        parts = seen.values() if isinstance(seen, dict) else [seen]
-        for observations in parts:
+        for observations in seen.values() if isinstance(seen, dict) else [seen]:
             check_finite("environment", "observations", observations, step)
         check_finite("environment", "rewards", self.locals["rewards"], step)
         return True
@@ -138,7 +136,6 @@ def load_checkpoint(
     algorithm: type[BaseAlgorithm],
     path: str | os.PathLike[str],
     env: GymEnv | str,
-    device: th.device | str = "auto",
     report: Report = warnings.warn,
     **overrides: Any,
 ) -> Restored:
@@ -147,7 +144,7 @@ def load_checkpoint(
     :param algorithm: the agent's class
     :param path: as in :func:`restore`, and ``report`` too
     :param env: an environment made as the stopped run's
-    :param overrides: constructor keywords: those that could not be stored by name, and what may differ (``verbose``, ...)
+    :param overrides: constructor keywords: those that could not be stored by name, and what may differ (``device``, ...)
     :return: as :func:`restore` does, and raises the same
     """
     bundle = find_bundle(path, report)
@@ -155,7 +152,7 @@ def load_checkpoint(
     if stored != algorithm.__name__:
         raise ValueError(f"{bundle.path} is a checkpoint of {stored}, not {algorithm.__name__}: load it with that class")
     keywords = read_settings(bundle.manifest["settings"], overrides)
-    return restore(algorithm(env=env, device=device, **keywords), bundle, report)
+    return restore(algorithm(env=env, **keywords), bundle, report)
 
 
 def continue_learning(restored: Restored, callback: MaybeCallback = None, **options: Any) -> BaseAlgorithm:

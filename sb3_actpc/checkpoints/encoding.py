@@ -211,8 +211,7 @@ class Encoder:
         node: Node = {"kind": type(value).__name__}
         if isinstance(value, dict):
             return {**node, "items": [[self.encode(key), self.encode(part)] for key, part in value.items()]}
-        maxlen = {"maxlen": value.maxlen} if isinstance(value, deque) else {}
-        return {**node, **maxlen, "items": [self.encode(part) for part in value]}
+        return {**node, "maxlen": getattr(value, "maxlen", None), "items": [self.encode(part) for part in value]}
 
     def _object(self, value: Any) -> Node:
         # statically: SB3's wrappers pass on attributes of what they wrap
@@ -317,7 +316,7 @@ class Decoder:
             existing = _NEW[name]()
         self._used.add(id(existing))
         self._made[number] = existing
-        put_back = _STATES[node["kind"]][2]
+        _, _, put_back = _STATES[node["kind"]]
         put_back(existing, self.decode(node["state"]))
         return existing
 

@@ -17,7 +17,7 @@ from stable_baselines3.common.type_aliases import TrainFreq
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_actpc.ngc.circuit import LARGEST_SIZE as LARGEST_LAYER
-from sb3_actpc.utils.checks import KINDS, LARGEST_SIZE, check_device, check_kind, nearest
+from sb3_actpc.utils.checks import KINDS, LARGEST_SIZE, check_kind, nearest
 from sb3_actpc.utils.constructors import constructors
 
 Parameters = ParamSpec("Parameters")
@@ -190,11 +190,6 @@ def check_nudge(name: str, nudge: Any) -> None:
         raise ValueError(f"{name}={nudge!r} must be above 0 and at most 1")
 
 
-def check_computes(name: str, device: Any) -> None:
-    """A device of this machine; the keyword is ``device``."""
-    check_device(device)
-
-
 def check_actions(space: gym.spaces.Box) -> None:
     """:raises ValueError: when a dimension of the actions has no finite extent, or they are whole numbers"""
     with np.errstate(over="ignore", invalid="ignore"):
@@ -233,26 +228,17 @@ OF_SB3: dict[str, Any] = {
 # ---------------------------------------------------------------------- of the policy
 
 
-def check_hidden(name: str, sizes: Any) -> None:
-    """Sizes of hidden layers, or None for the default."""
-    if sizes is None:
-        return
-    if not isinstance(sizes, (list, tuple)) or not all(_is_layer(size) for size in sizes):
-        raise ValueError(f"{name}={sizes!r} must be a list of layer sizes, whole numbers from 1 to {LARGEST_LAYER}")
-
-
-def _is_layer(size: Any) -> bool:
-    return isinstance(size, Integral) and 1 <= int(size) <= LARGEST_LAYER
-
-
 def check_net_arch(name: str, net_arch: Any) -> None:
-    """Sizes for all circuits, or for each."""
+    """Sizes of hidden layers for all circuits, or for each; None for the default."""
     parts = net_arch if isinstance(net_arch, dict) else {"pi": net_arch}
     unknown = sorted(set(parts) - {"pi", "qf", "generator", "prior"}, key=str)
     if unknown:
         raise ValueError(f"{name} has unknown keys {unknown}; choose from pi, qf, generator, prior")
     for sizes in parts.values():
-        check_hidden(name, sizes)
+        layers = [] if sizes is None else sizes
+        is_list = isinstance(layers, (list, tuple))
+        if not is_list or not all(isinstance(size, Integral) and 1 <= int(size) <= LARGEST_LAYER for size in layers):
+            raise ValueError(f"{name}={sizes!r} must be a list of layer sizes, whole numbers from 1 to {LARGEST_LAYER}")
 
 
 def check_circuit(name: str, settings: Any) -> None:

@@ -71,7 +71,7 @@ def named_in_errors(what: str, *passed_on: type[Exception]) -> Iterator[None]:
         raise ValueError(f"{what[:1000]}: {reason}") from error
 
 
-def check_device(device: Any) -> None:
+def check_device(name: str, device: Any) -> None:
     """ValueError when it is no torch device, or one that this machine cannot compute on. Warns where SB3 will silently take
     the CPU: for a CUDA device on a machine without one."""
     try:
@@ -82,10 +82,10 @@ def check_device(device: Any) -> None:
     except (RuntimeError, AssertionError, NotImplementedError, ImportError) as error:
         reason = (str(error).strip() or type(error).__name__).splitlines()[0][:150]
         raise ValueError(
-            f"device={device!r} must be 'auto' or a torch device of this machine, such as 'cpu' or 'cuda:0': {reason}"
+            f"{name}={device!r} must be 'auto' or a torch device of this machine, such as 'cpu' or 'cuda:0': {reason}"
         ) from error
     if device != "auto" and th.device(device).type != chosen.type:
-        warnings.warn(f"device={str(device)!r}: torch finds none here, the agent runs on the CPU", stacklevel=2)
+        warnings.warn(f"{name}={str(device)!r}: torch finds none here, the agent runs on the CPU", stacklevel=2)
 
 
 def check_finite(where: str, what: str, values: np.ndarray, step: int) -> None:

@@ -14,10 +14,12 @@ def import_extra(module: str, extra: str) -> Any:
     try:
         return importlib.import_module(module)
     except ImportError as error:
-        where = ""
+        more = ""
         if module == "robosuite" and sys.version_info[:2] > NUMPY_1_PYTHON:  # where the extra leaves it out
-            where = f" from Python 3.{NUMPY_1_PYTHON[1]} or older, which has wheels of the NumPy 1 that robosuite needs"
-        raise ImportError(f'{error}: install what is needed with pip install "sb3-actpc[{extra}]"{where}') from error
+            more = f" from Python 3.{NUMPY_1_PYTHON[1]} or older, which has wheels of the NumPy 1 that robosuite needs"
+        if module == "d3rlpy":  # the extra holds what it needs
+            more = ", then pip install --no-deps d3rlpy==2.8.1, which asks for an older Gymnasium that it does not need"
+        raise ImportError(f'{error}: install what is needed with pip install "sb3-actpc[{extra}]"{more}') from error
 
 
 def installed_version(package: str) -> str:

@@ -49,6 +49,7 @@ class StoresLastTransition(OffPolicyAlgorithm):
     - Observations are copied, since an environment may change the array that it has returned.
     """
 
+    replay_buffer: Any  # one of this package, with ``cut_running_episodes``
     _watched: WatchedVecEnv | None = None
 
     def _watch(self) -> WatchedVecEnv:
@@ -65,6 +66,7 @@ class StoresLastTransition(OffPolicyAlgorithm):
 
     def _cut_running_episodes(self) -> None:
         """The environments are reset in mid-episode: what the replay buffer holds of these episodes has ended."""
+        self.replay_buffer.cut_running_episodes()
 
     def _setup_learn(
         self,

@@ -99,7 +99,7 @@ class Run(Schema):
     keep: Literal["last", "best"] = "last"  # the agent of which evaluation (best: dense return) is kept as ``model.zip``
     target_return: Real | None = None  # the training ends at the first evaluation whose mean dense return reaches it
     output: str | None = None  # run folder; by default ``runs/<env>/<algo>_<preset>_seed<seed>``
-    device: Annotated[str, AfterValidator(lambda name: check_device(name) or name)] = "cpu"  # torch's
+    device: Annotated[str, AfterValidator(lambda name: check_device("device", name) or name)] = "cpu"  # torch's
     threads: Annotated[Count, Field(le=1024)] = 1  # that torch uses
     progress: bool = True  # show a progress bar
     continuable: bool = True  # keep the last checkpoint of a finished run, so that it can be given more steps
