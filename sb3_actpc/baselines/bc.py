@@ -62,8 +62,7 @@ class OfflineAlgorithm(LearnsFromDemonstrations):
     :param env: a task with Box observations and actions; for its spaces and for evaluations
     :param learning_rate: of the optimiser, or a schedule
     :param batch_size: B
-    :param options: further keywords, of :class:`~sb3_actpc.demonstrations.mixin.LearnsFromDemonstrations` and of SB3's
-        algorithms
+    :param options: keywords of :class:`~sb3_actpc.demonstrations.mixin.LearnsFromDemonstrations` and of SB3's algorithms
     :raises ValueError: for a keyword with a value that is not allowed, without demonstrations, for demonstrations that do not
         fit the environment, for other spaces, and for an environment that normalises observations
     """
@@ -283,24 +282,11 @@ class BC(OfflineAlgorithm):
         self._validation_rows = is_held_out.nonzero()[:, 0]
         self._training_rows = (~is_held_out).nonzero()[:, 0]
         self._smallest_error = np.inf
-<<<<<<< HEAD
-        self._networks = [self._copy() for _ in range(self.n_seeds)] if held_out.any() else [self.policy]
-
-    def _copy(self) -> BCPolicy:
-        """A network of its own with the policy's normalization; of an agent that was loaded, with all of the policy."""
-        network = self._new_policy()
-        kept = self.policy.state_dict()
-        if not self._n_updates:
-            kept = {name: kept[name] for name in ("mean", "spread")}
-        network.load_state_dict(kept, strict=False)
-        return network
-=======
         self._networks = [self._new_policy() for _ in range(self.n_seeds)] if held_out.any() else [self.policy]
         for network in self._networks:
             network.fit_normalization(demonstrations.observations)
             if self._n_updates:  # an agent that was loaded goes on from its policy
                 network.load_state_dict(self.policy.state_dict())
->>>>>>> part-s
 
     def _gradient_step(self) -> dict[str, th.Tensor]:
         losses = []

@@ -26,7 +26,7 @@ from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 from sb3_actpc.checkpoints.bundle import Bundle, Report, Write, find_bundle
 from sb3_actpc.checkpoints.encoding import Decoder, Encoder
 from sb3_actpc.utils.extras import installed_version
-from sb3_actpc.utils.noise import GaussianNoise
+from sb3_actpc.utils.noise import noise_with_state
 from sb3_actpc.utils.tasks import task_id
 from sb3_actpc.utils.weights import check_weights
 
@@ -85,12 +85,6 @@ class Restored:
             th.cuda.set_rng_state(generators["cuda"], model.device)
 
 
-def _noise_with_state(model: BaseAlgorithm) -> Any:
-    """The action noise, if it changes by being drawn; that of a standard deviation is a setting."""
-    noise = getattr(model, "action_noise", None)
-    return None if isinstance(getattr(noise, "base_noise", noise), GaussianNoise) else noise
-
-
 def capture_model(model: BaseAlgorithm, callbacks: Sequence[BaseCallback], write: Write) -> None:
     """Write everything that the rest of the training depends on, between two rollouts; ValueError when a weight is not finite,
     or the agent holds what cannot be stored."""
@@ -110,7 +104,7 @@ def capture_model(model: BaseAlgorithm, callbacks: Sequence[BaseCallback], write
             "cuda": th.cuda.get_rng_state(model.device) if model.device.type == "cuda" else None,
         },
         "spaces": [model.action_space, model.observation_space],
-        "noise": _noise_with_state(model),
+        "noise": noise_with_state(getattr(model, "action_noise", None)),
         "own": model.checkpoint_state() if hasattr(model, "checkpoint_state") else None,
         "buffer": None if buffer is None else _buffer_state(buffer, write),
     }

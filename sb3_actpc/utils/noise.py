@@ -29,3 +29,8 @@ def as_action_noise(noise: ActionNoise | float | None, shape: tuple[int, ...]) -
     if isinstance(noise, ActionNoise):
         return noise
     return GaussianNoise(noise, shape) if noise else None
+
+
+def noise_with_state(noise: ActionNoise | None) -> ActionNoise | None:
+    """The noise, if it changes by being drawn; None for that of a number (of several environments too), which is a setting."""
+    return None if isinstance(getattr(noise, "base_noise", noise), GaussianNoise) else noise
