@@ -50,8 +50,6 @@ def test_noise_of_several_environments_is_that_of_one_in_another_number_of_them(
 
 
 class WholeNumbers(CountingEnv):
-    """Observations are the whole numbers 0, 10, 20, ... of an episode."""
-
     def __init__(self):
         super().__init__()
         self.observation_space = gym.spaces.Box(0, 255, (2,), np.int32)
