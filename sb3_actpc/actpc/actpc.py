@@ -338,7 +338,11 @@ class ActPC(ActPCBase):
             coupled = settle_coupled(self.actor.circuit, self.critic, batch.features, batch.memory, self.policy.nudge)
             improvement = self.actor.circuit.hebbian_update(coupled.actor)
             self.diagnostics.coupled(coupled, improvement, batch.features, batch.memory)
-            improvement.scale_(share * self.critic_term_weight(coupled.action_values))
+            # By TD3+BC's rule the term does not depend on the scale of the action-values
+            weight: float | th.Tensor | None = self.critic_weight
+            if weight is None:
+                weight = TD3_BC_WEIGHT / coupled.action_values.abs().mean().clamp_min(SMALLEST_VALUE_SCALE)
+            improvement.scale_(share * weight)
             self.diagnostics.change_norms("critic_term", improvement)
             if not changes:
                 self.diagnostics.settled("actor", coupled.actor)
@@ -350,12 +354,6 @@ class ActPC(ActPCBase):
                 total.add_(other)
             self.actor.circuit.apply_changes(total)
             self.actor_guidance.after_update(self._context())
-
-    def critic_term_weight(self, action_values: th.Tensor) -> float | th.Tensor:
-        """``critic_weight``, or by TD3+BC's rule what makes the term independent of the scale of ``action_values``, (B, A)."""
-        if self.critic_weight is not None:
-            return self.critic_weight
-        return TD3_BC_WEIGHT / action_values.abs().mean().clamp_min(SMALLEST_VALUE_SCALE)
 
     def q_filter(self, features: th.Tensor, actions: th.Tensor, own: th.Tensor, weight: float = 0.0) -> th.Tensor:
         """Imitated actions, (B, A). Where all critics value the actor's ``own`` more, these, which have no error (without a

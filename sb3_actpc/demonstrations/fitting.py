@@ -14,7 +14,6 @@ from sb3_actpc.demonstrations.dataset import DATA_FOLDER, Demonstrations, base_n
 from sb3_actpc.demonstrations.recording import wrapper_names
 from sb3_actpc.demonstrations.rows import box_paths, join_observations, split_observations
 from sb3_actpc.envs import SPARSE_MUJOCO_IDS, dense_env_id, sparse_env_id
-from sb3_actpc.utils.arguments import check_limit
 
 if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecEnv
@@ -72,7 +71,6 @@ def fit_demonstrations(
     """
     has_goals = env is not None and env.has_attr("goal_demonstrations")
     demonstrations = resolve(source, None if has_goals else observation_space)  # they may be of the task without goals
-    check_limit("n_demonstrations", limit)
     number, unit = limit if isinstance(limit, (tuple, list)) else (limit, "episodes")
     try:
         demonstrations = demonstrations.select(**{f"n_{unit}": number})

@@ -10,7 +10,7 @@ from stable_baselines3.common.type_aliases import GymEnv
 
 from sb3_actpc.demonstrations.dataset import Demonstrations
 from sb3_actpc.demonstrations.fitting import fit_demonstrations
-from sb3_actpc.utils.arguments import DemonstrationLimit, check_actions, checked
+from sb3_actpc.utils.arguments import DemonstrationLimit, check_actions, check_limit, checked
 
 
 class LearnsFromDemonstrations(BaseAlgorithm):
@@ -50,6 +50,7 @@ class LearnsFromDemonstrations(BaseAlgorithm):
         :raises FileNotFoundError: when the file is missing
         """
         assert self.demonstrations is not None
+        check_limit("n_demonstrations", self.n_demonstrations)
         observed, acted = self.observation_space, self.action_space
         try:
             return fit_demonstrations(self.demonstrations, self.env, observed, acted, self.n_demonstrations)
