@@ -100,13 +100,11 @@ class PolicySelection:
         if is_busy or self.evaluation_steps > self.share * self.steps:
             return False
         n_incumbent = len(self.incumbent_returns)
-        is_due = n_incumbent >= self.n_needed or bool(self.support)
-        begins = actor_differs and not self.has_challenger and is_due
+        begins = actor_differs and not self.has_challenger and (n_incumbent >= self.n_needed or bool(self.support))
         if begins:
             self.has_challenger = True
             self.challenger_returns = []
             self.exploration_returns = []
-            self._cut("challenger")
         # steps that the incumbent does not need are saved for the challenger
         n_needed = self.budget if self.has_challenger else self.n_needed
         if self.has_challenger and (len(self.challenger_returns) <= n_incumbent or n_incumbent >= n_needed):
@@ -114,17 +112,6 @@ class PolicySelection:
         elif n_incumbent < n_needed:
             self.roles[env] = "incumbent"
         return begins
-
-    def _cut(self, *roles: Role) -> None:
-        """Running episodes of policies that are replaced count for nobody."""
-        for env, role in enumerate(self.roles):
-            if role in roles:
-                self.roles[env] = "average"
-                self.running[env] = math.nan
-
-    def _drop_challenger(self) -> None:
-        self.has_challenger = False
-        self.support = []
 
     def _exceed(self, ours: list[float]) -> bool:
         """Both get a pseudo-episode of the worst return: a policy with few episodes may not have failed yet."""
@@ -138,19 +125,19 @@ class PolicySelection:
             loss, error = compare(self.incumbent_returns, self.challenger_returns)
             # one evaluation episode is enough for a copy that exploration speaks for
             if loss < 0 and len(ours) >= self.min_episodes and self._exceed(ours):
-                self._cut("incumbent", "challenger")
                 self.n_needed = min(max(2 * n, self.min_episodes), self.budget)
                 self.previous_returns = self.incumbent_returns
                 self.incumbent_returns = self.challenger_returns
-                self.challenger_returns = []
                 self.exploration_returns = []
-                self._drop_challenger()
+                self.has_challenger = False
+                self.support = []
                 self.n_promoted += 1
                 return "promoted"
             is_enough = n >= self.min_episodes or bool(self.support)
             if (is_enough and loss > self.reject * error) or n >= self.budget:
                 self.n_needed = min(len(self.incumbent_returns) + 1, self.budget)
-                self._drop_challenger()
+                self.has_challenger = False
+                self.support = []
                 self.n_rejected += 1
                 return "rejected"
         if self.previous_returns and len(self.incumbent_returns) >= self.min_episodes:
@@ -158,8 +145,8 @@ class PolicySelection:
             if loss > self.reject * error:
                 self.incumbent_returns = self.previous_returns
                 self.previous_returns = []
-                self._drop_challenger()
-                self._cut("incumbent", "challenger")
+                self.has_challenger = False
+                self.support = []
                 self.n_rolled_back += 1
                 return "rolled back"
         return None

@@ -90,18 +90,6 @@ def test_a_part_of_an_episode_has_no_return():
     assert selection.exploration_returns == [1.0]
 
 
-def test_running_episodes_of_a_replaced_policy_count_for_nobody():
-    """Of two environments the second plays the incumbent when the first's challenger is promoted."""
-    selection = PolicySelection(2, incumbent_returns=[30.0, 31.0], challenger_returns=[90.0], has_challenger=True, worst=0.0)
-    selection.roles = ["challenger", "incumbent"]
-    selection.step(0, 91.0, True)
-    selection.step(1, -5.0, True)
-    assert selection.end_episode(0, True) == "promoted"
-    selection.step(1, 1.0, False)
-    assert selection.end_episode(1, True) is None
-    assert (selection.worst, selection.incumbent_returns, selection.exploration_returns) == (0.0, [90.0, 91.0], [])
-
-
 def test_evaluation_takes_a_quarter_of_the_steps_at_most():
     game = Game(0, noisy(100.0, 10.0), noisy(100.0, 10.0))
     game.play(20_000)
@@ -146,16 +134,6 @@ def test_the_comparison_has_a_pooled_standard_error():
     pooled = (ours.var(ddof=1) + theirs.var(ddof=1)) / 2
     assert gain == pytest.approx(ours.mean() - theirs.mean())
     assert error == pytest.approx(np.sqrt(pooled * 2 / 3))
-
-
-def test_a_rollback_ends_the_other_evaluation_episodes():
-    selection = PolicySelection(2, previous_returns=[10.0, 10.0, 10.0], incumbent_returns=[0.0])
-    selection.roles = ["incumbent", "incumbent"]
-    for env in range(2):
-        selection.step(env, 0.0, True)
-    assert selection.end_episode(0, True) == "rolled back"
-    assert selection.end_episode(1, True) is None
-    assert selection.incumbent_returns == [10.0, 10.0, 10.0]
 
 
 @pytest.mark.parametrize("n_envs", [1, 8])
