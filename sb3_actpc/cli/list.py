@@ -27,7 +27,7 @@ def _tasks() -> Iterator[tuple[str, str]]:
     yield from dict.fromkeys(envs.SPARSE_MUJOCO_IDS, "a MuJoCo task with a sparse reward").items()
     yield from dict.fromkeys(envs.GOAL_MUJOCO_IDS, "the same with a goal in the observation, for hindsight").items()
     yield from dict.fromkeys(envs.ROBOSUITE_IDS, "an arm of robosuite (extra robosuite)").items()
-    yield "any other Gymnasium id", "with --demonstrations FILE or none, and --gym-packages where a module registers it"
+    yield "any other Gymnasium id", "with --demonstrations FILE or none; MODULE:ID where a module registers it"
 
 
 def _algos() -> Iterator[tuple[str, str]]:

@@ -55,7 +55,7 @@ class LearnsFromDemonstrations(BaseAlgorithm):
         try:
             return fit_demonstrations(self.demonstrations, self.env, observed, acted, self.n_demonstrations)
         except FileNotFoundError as error:
-            raise FileNotFoundError(f"{error}; or pass demonstrations=, which load(path, env=env, ...) takes too") from error
+            raise FileNotFoundError(f"{error}; load(path, env=env, demonstrations=...) gives a loaded agent others") from error
 
 
 def _copied(settings: dict[str, Any]) -> dict[str, Any]:

@@ -51,7 +51,7 @@ def read_npz(path: str | os.PathLike[str]) -> dict[str, Any]:
     format."""
     source = str(path)
     if not os.path.exists(path):
-        raise FileNotFoundError(f"no demonstrations file at {source}")
+        raise FileNotFoundError(f"no demonstrations file at {source} (ids of Minari end in -v and a number)")
     try:
         content = Path(path).read_bytes()
         archive = zipfile.ZipFile(io.BytesIO(content))

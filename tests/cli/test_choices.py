@@ -126,7 +126,7 @@ def test_a_finished_run_is_given_more_steps(capsys: pytest.CaptureFixture[str]) 
     assert train(*straight) == 0
     assert train(*[{"60": "40", "straight": "more"}.get(word, word) for word in straight]) == 0
     assert main(["train", "--resume", "more", "--no-progress"]) == 2
-    assert "is finished: say with --steps how many more it shall have" in capsys.readouterr().err
+    assert "is finished: give it more steps with --steps N" in capsys.readouterr().err
     assert main(["train", "--resume", "more", "--steps", "many"]) == 2
     assert "steps='many' must be a number" in capsys.readouterr().err
     assert main(["train", "--resume", "more", "--steps", "2e1", "--no-progress"]) == 0

@@ -112,7 +112,7 @@ def test_a_finished_run_is_not_overwritten_and_an_unfinished_one_is(capsys: pyte
     assert train(*arguments) == 0
     before = (RUN / "result.json").read_bytes()
     assert train(*arguments) == 2
-    assert "already holds a finished run: choose another folder (--output)" in capsys.readouterr().err
+    assert "already holds a finished run: choose another folder (--output) or --seed" in capsys.readouterr().err
     assert (RUN / "result.json").read_bytes() == before
     (RUN / "result.json").unlink()
     assert train(*arguments) == 0

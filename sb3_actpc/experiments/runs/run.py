@@ -89,7 +89,7 @@ def _continued(folder: Path, more_steps: int, changes: Mapping[str, Any]) -> Run
     """The run in a folder as it goes on; see :func:`resume_run` for the errors."""
     run = read_run(folder)
     if is_finished(folder) and not more_steps:
-        raise ValueError(f"the run in {folder} is finished: say with --steps how many more it shall have")
+        raise ValueError(f"the run in {folder} is finished: give it more steps with --steps N")
     if not list_bundles(folder / CHECKPOINTS):
         without = why_no_checkpoints(load_algorithm(run.algo)) or "left none"
         raise ValueError(f"{folder} has no checkpoint to go on from ({run.algo} {without}): train again, in another folder")
@@ -250,7 +250,7 @@ def load_run(folder: Path) -> tuple[Run, Predictor]:
 def _check_free(folder: Path) -> None:
     """:raises ValueError: where a new run would overwrite a finished or a stopped one"""
     if is_finished(folder):
-        raise ValueError(f"{folder} already holds a finished run: choose another folder (--output)")
+        raise ValueError(f"{folder} already holds a finished run: choose another folder (--output) or --seed")
     if list_bundles(folder / CHECKPOINTS):
         raise ValueError(f"{folder} holds a stopped run: go on with --resume {folder}, or choose another folder (--output)")
 
