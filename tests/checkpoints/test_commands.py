@@ -67,7 +67,7 @@ def test_a_stopped_run_goes_on_as_if_it_never_was(
     assert seconds == sorted(seconds)
     assert len(list_bundles("stopped/checkpoints")) == 1  # of the end
     assert main(["train", "--resume", "stopped"]) == 2
-    assert "is finished: say with --steps how many more" in capsys.readouterr().err
+    assert "is finished: give it more steps with --steps N" in capsys.readouterr().err
 
 
 def test_a_second_signal_goes_to_the_old_handler(tmp_path: Path) -> None:
