@@ -252,11 +252,12 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
             self._go_on_without_demonstrations()
 
     def _go_on_without_demonstrations(self) -> None:
+        """Turn off what needs them, and warn of what was set and has no effect now."""
         self.demonstration_fraction = 0.0
         self.n_demonstrations = None
         if self.is_pretrained and self.refresh_weight:
             warnings.warn(
-                "the agent was taught by demonstrations and goes on without them: pass demonstrations=", stacklevel=6
+                "the agent learned from demonstrations and continues without them: pass demonstrations=", stacklevel=6
             )
         unused = (self.reward_weights or {}).get("instrumental")
         if unused:

@@ -186,6 +186,8 @@ def _convert(args: argparse.Namespace) -> None:
 
     output = args.output or args.file.with_suffix(".npz")
     _check_suffix(output)
+    if output.absolute() == args.file.absolute():
+        raise ValueError(f"--output {output} is the file that is read: choose another")
     if args.output is None and output.exists():
         raise FileExistsError(f"{output} is there already: give another --output, what it holds may be more")
     _save(read_hdf5(args.file, args.env, args.obs, args.filter_key), output)

@@ -41,7 +41,7 @@ def test_a_trained_agent_goes_on_without_demonstrations_where_that_is_asked(tmp_
     loaded = ActPC.load(tmp_path / "agent", env=CountingEnv(), demonstrations=None)
     observations = np.ones((4, 3), dtype=np.float32)
     assert np.array_equal(loaded.predict(observations)[0], model.predict(observations)[0])
-    with pytest.warns(UserWarning, match="goes on without"):
+    with pytest.warns(UserWarning, match="continues without"):
         loaded.learn(10)
     with pytest.raises(ValueError, match="give demonstrations="):
         ActPC("MlpPolicy", CountingEnv(), demonstration_fraction=0.5)

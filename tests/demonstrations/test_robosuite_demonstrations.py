@@ -237,7 +237,10 @@ def test_convert_writes_npz_and_overwrites_nothing(
     read = Demonstrations.load("lift.npz")
     assert_equal(read, made_up(LIFT), atol=2e-6)
     assert read.env_id == LIFT
+    Path("named.npz").write_bytes(Path("lift.hdf5").read_bytes())
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    assert main(["demos", "convert", "named.npz", "--env", LIFT, "--output", "named.npz"]) == 2
+    assert "--output named.npz is the file that is read" in capsys.readouterr().err
     for options, named in (
         ([], "lift.npz is there already: give another --output"),
         (["--output", "lift.hdf5"], "--output lift.hdf5 must end in .npz"),
