@@ -282,6 +282,8 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
                 n_updates = self.signals.prior_updates - int(self.policy.n_prior_updates)
             batch_size = self.policy.batch_sizes(self.batch_size)["prior"]
             self.policy.set_learning_rate(self.lr_schedule(1.0))
+            if self.verbose and n_updates > 0:
+                print(f"prior: {n_updates} updates before the first step (signal_kwargs: prior_updates)", flush=True)
             for _ in range(n_updates):
                 rows = expert.draw(batch_size)
                 self.instrumental.update(expert.batch(rows, self.actor, env, self.used_weights, self.gamma))

@@ -75,8 +75,8 @@ def checked(init: Callable[Parameters, None]) -> Callable[Parameters, None]:
     def checking(*args: Parameters.args, **kwargs: Parameters.kwargs) -> None:
         for name in kwargs:
             if not is_open and name not in known:
-                expected = f": expected some of {', '.join(known)}" if len(known) < 10 else ""
-                raise TypeError(f"{type(args[0]).__name__} has no keyword {name!r}{nearest(name, known)}{expected}")
+                hint = nearest(name, known) or f"; choose from {', '.join(known)}"
+                raise TypeError(f"{type(args[0]).__name__} has no keyword {name!r}{hint}")
         given = signature.bind(*args, **kwargs)
         given.apply_defaults()
         for name, value in given.arguments.items():

@@ -736,6 +736,7 @@ def test_vec_normalize_relabels_the_task_reward_alone():
         ({"guidance_kwargs": {"gat": True}}, "guidance_kwargs=.*'gat'"),
         ({"guidance": "best"}, "guidance='best' must be None, 'default', 'none' or an ActorGuidance"),
         ({"learning_rat": 0.1}, "ActPC has no keyword 'learning_rat' .did you mean 'learning_rate'"),  # a TypeError
+        ({"alpha_ep": 1.0}, "ActPC has no keyword 'alpha_ep'; choose from .*reward_weights"),
     ],
 )
 def test_a_wrong_keyword_is_named(keywords, named):
