@@ -13,9 +13,13 @@ from matplotlib.figure import Figure
 from sb3_actpc.experiments.report import statistics
 from sb3_actpc.experiments.report.results import MEASURES, Results, load_results, reference_score, write_results
 from sb3_actpc.experiments.report.statistics import Scores
+from sb3_actpc.experiments.runs.evaluation import OF_ACTOR
 from sb3_actpc.utils.files import atomic_write, folder_name
 
 CHOSEN_STEPS = (10_000, 25_000, 50_000)
+# column of the deployed policy and of the actor's moving average -> what is added to the variant's name
+RETURNS = {"return": "", OF_ACTOR["return"]: ", moving average"}
+SUCCESSES = {"success": "", OF_ACTOR["success"]: ", moving average"}
 UNDEFINED = "n/a"
 # Okabe and Ito's color-blind safe palette; markers tell curves apart without color
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
@@ -105,8 +109,12 @@ def improvement_table(results: Results, steps: Sequence[int]) -> pd.DataFrame:
     runs = results.finished
     rows = []
     for step in sorted({step for step in steps if step <= runs["steps"].max()}):
-        ended = runs["return"].where(runs["steps"] < step)
-        scores = _on_every_task(runs.assign(at_step=results.at_step(runs, "return", step).fillna(ended)), "at_step")
+        parts = []
+        for measure, policy in RETURNS.items():
+            ended = runs[measure].where(runs["steps"] < step)
+            at_step = results.at_step(runs, measure, step).fillna(ended)
+            parts.append(runs.assign(at_step=at_step, label=runs["label"] + policy))
+        scores = _on_every_task(pd.concat(parts), "at_step")
         for name, other in combinations(scores, 2):
             value, low, high = statistics.probability_of_improvement(scores[name], scores[other])
             rows.append([f"{name} over {other}", f"{step:,}", f"{value:.2f}", interval(low, high, ".2f")])
@@ -147,17 +155,29 @@ def markdown(table: pd.DataFrame) -> str:
 
 
 def draw_curves(results: Results, task: str, path: Path) -> None:
-    """Draw means and 95 % intervals over environment steps, at the steps that all seeds of a variant have."""
+    """Draw mean returns (on robosuite tasks successes) and 95 % intervals over environment steps, at the steps that all seeds
+    of a variant have: deployed policies solid, moving averages dashed, variants with a single evaluation dotted."""
     figure = Figure(figsize=(8.0, 4.2), layout="constrained")
     axes = figure.subplots()
     reference = reference_score(results.runs.loc[results.runs["task"] == task, "env"].iloc[0])
-    measure = "dense_return" if reference is None else reference.measure
+    is_success = reference is not None and reference.measure == "success"
+    shown = SUCCESSES if is_success else RETURNS
+    values: list[float] = []
     for index, (label, runs) in enumerate(results.groups(task).items()):
         rows = results.curves[results.curves["run"].isin(runs.index)]
-        table = rows.pivot(index="timesteps", columns="run", values=measure).dropna()
-        if len(table):
-            _band(axes, table.index.to_numpy(), statistics.mean_interval(table.to_numpy().T), label, index)
-    axes.set(title=task, xlabel="environment steps", ylabel=measure.replace("_", " "))
+        for measure, policy in shown.items():
+            curves = rows.reindex(columns=["run", "timesteps", measure])
+            table = curves.pivot(index="timesteps", columns="run", values=measure).dropna()
+            values.extend(table.to_numpy().ravel())
+            if len(table) == 1:
+                axes.axhline(table.to_numpy().mean(), label=label + policy, color=COLORS[index % len(COLORS)], linestyle=":")
+            elif len(table):
+                band = statistics.mean_interval(table.to_numpy().T)
+                _band(axes, table.index.to_numpy(), band, label + policy, index, "--" if policy else "-")
+    if values:  # intervals of few seeds reach far beyond all runs
+        margin = 0.05 * (max(values) - min(values)) or 1.0
+        axes.set_ylim(min(values) - margin, max(values) + margin)
+    axes.set(title=task, xlabel="environment steps", ylabel="success" if is_success else "return")
     figure.legend(fontsize="small", loc="outside right upper")
     _save(figure, path)
 
@@ -180,11 +200,11 @@ def draw_summary(scores: Mapping[str, Scores], path: Path) -> None:
     _save(figure, path)
 
 
-def _band(axes: Any, x: np.ndarray, values: Any, label: str, index: int) -> None:
+def _band(axes: Any, x: np.ndarray, values: Any, label: str, index: int, line: str = "-") -> None:
     """A line, and the band between two others around it: (3, n)."""
     color = COLORS[index % len(COLORS)]
     marker = MARKERS[index % len(MARKERS)]
-    axes.plot(x, values[0], label=label, color=color, marker=marker, markevery=max(1, len(x) // 8))
+    axes.plot(x, values[0], label=label, color=color, marker=marker, markevery=max(1, len(x) // 8), linestyle=line)
     axes.fill_between(x, values[1], values[2], color=color, alpha=0.15, linewidth=0)
 
 

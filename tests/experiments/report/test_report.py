@@ -60,6 +60,18 @@ def test_the_probability_of_improvement_is_of_returns_at_each_step(tmp_path: Pat
     ]
 
 
+def test_moving_averages_are_compared_too(tmp_path: Path) -> None:
+    for seed in range(2):
+        write_run(tmp_path, variant="actpc", seed=seed, returns=(0.0, 3.0, 3.0), averages=(0.0, 2.0, 5.0))
+        write_run(tmp_path, variant="bc", seed=seed, returns=(0.0, 4.0, 4.0))
+    table = improvement_table(load_results(tmp_path), (10_000,)).set_index("pair")["probability"]
+    assert table.to_dict() == {
+        "actpc over actpc, moving average": "0.00",
+        "actpc over bc": "0.00",
+        "actpc, moving average over bc": "1.00",
+    }
+
+
 def test_settings_of_one_name_are_told_apart(tmp_path: Path) -> None:
     write_run(tmp_path, seed=0, gamma=0.9)
     write_run(tmp_path, seed=1, gamma=0.8)
