@@ -100,7 +100,7 @@ class ActPC(ActPCBase):
     :param target_update_interval: the targets move after every update (1), or every so many environment steps
     :param observation_normalization: "none" (the paper), "demonstrations" (their mean and standard deviation) or "bounds"
         (those of the observation space become -1 and 1)
-    :param guidance: "none" (the paper's agent), "default" or an :class:`~sb3_actpc.guidance.base.ActorGuidance`
+    :param guidance: "none" (as in the paper), "default" or an :class:`~sb3_actpc.guidance.base.ActorGuidance`
     :param guidance_kwargs: keywords of :class:`~sb3_actpc.guidance.guidance.GuidanceConfig`
     :param policy_kwargs: keywords of :class:`~sb3_actpc.actpc.policies.ActPCPolicy`
     :param tensorboard_log: as in SB3, and so are ``verbose``, ``device`` and ``seed``

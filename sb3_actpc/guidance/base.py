@@ -1,4 +1,4 @@
-"""The hooks through which guidance takes part in learning. All of them do nothing: that is the paper's agent."""
+"""The hooks through which guidance takes part in learning. All of them do nothing, as the paper has no guidance."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -86,7 +86,7 @@ class ActorGuidance:
 
     def describe(self) -> str:
         """One line for ``ActPC.describe``."""
-        return "guidance: none (the paper's agent)"
+        return "guidance: none"
 
     def state_dict(self) -> dict[str, Any]:
         """What a checkpoint keeps beside circuits: plain values."""
