@@ -36,6 +36,7 @@ from sb3_actpc.utils.weights import load_weights, save_weights
 
 SelfBase = TypeVar("SelfBase", bound="ActPCBase")
 RESCORING_INTERVAL = 1000  # updates between two evaluations of the demonstrations' signals
+MOST_MINIBATCHES = 64  # sampled at once
 NEED_DEMONSTRATIONS = ("demonstration_fraction", "n_demonstrations")
 _OF_POLICY = ("actor", "critic", "generator", "prior", "actor_target", "critic_target")
 _DERIVED = ("expert", "diagnostics", "epistemic", "instrumental", "actor_guidance", "_used_demonstrations", "_described")
@@ -64,6 +65,7 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
     policy_delay: int
     demonstration_fraction: float
     observation_normalization: str
+    bc_residual: float | None = None  # what guidance measured in pre-training, for a saved agent
     only_acts = False  # a bundled agent, whose critic is not trained
     expert: DemonstrationReplay | None = None  # the demonstrations, fitted to the environment
     was_made_without_demonstrations: bool
@@ -194,10 +196,11 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         """As in SB3. Returns of another environment are dropped; the next ``learn`` fits the demonstrations to it."""
+        is_first = self.env is None
         super().set_env(env, force_reset)
         self.actor_guidance.forget_returns()
         self.expert = None
-        if self.replay_buffer is not None:
+        if self.replay_buffer is not None and not is_first:
             self.replay_buffer.forget_own_episodes()
         if isinstance(self.replay_buffer, HerReplayBuffer):
             assert self.env is not None
@@ -247,7 +250,10 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
         self.replay_buffer.set_returns(self.n_steps, self.gamma)
         memory = self.replay_buffer.self_imitation
         if memory is not None:
-            memory.takes_all = self.actor_guidance.stores == "positive" and self.expert is not None
+            # With negative returns steps are drawn uniformly, and mediocre episodes would outnumber the demonstrations
+            expert = self.expert
+            has_negative = expert is None or bool(expert.episodes.returns.min() < 0.0)
+            memory.takes_all = self.actor_guidance.stores == "positive" and not has_negative
         if self.demonstrations is None:
             self._go_on_without_demonstrations()
 
@@ -276,22 +282,29 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
                     expert.show_to(env)
                     if self._last_original_obs is not None:
                         self._last_obs = env.normalize_obs(self._last_original_obs)
-            # without a weight the prior has no role
-            n_updates = 0
-            if self.used_weights.instrumental:
-                n_updates = self.signals.prior_updates - int(self.policy.n_prior_updates)
-            batch_size = self.policy.batch_sizes(self.batch_size)["prior"]
-            self.policy.set_learning_rate(self.lr_schedule(1.0))
-            if self.verbose and n_updates > 0:
-                print(f"prior: {n_updates} updates before the first step (signal_kwargs: prior_updates)", flush=True)
-            for _ in range(n_updates):
-                rows = expert.draw(batch_size)
-                self.instrumental.update(expert.batch(rows, self.actor, env, self.used_weights, self.gamma))
-                self.policy.n_prior_updates.add_(1)
+            self._train_prior(expert)
         # BC is of demonstrations: an agent without does not imitate its own episodes first
+        if self.actor_guidance.bc_residual is None:  # of a loaded agent
+            self.actor_guidance.bc_residual = self.bc_residual
         self.actor_guidance.on_training_start(self._context(), self.is_pretrained or expert is None)
+        self.bc_residual = self.actor_guidance.bc_residual
         if expert is not None:
             self.policy.has_imitated.fill_(1.0)
+
+    def _train_prior(self, expert: DemonstrationReplay) -> None:
+        """The updates that the prior has not had yet; without a weight it has no role."""
+        n_updates = 0
+        if self.used_weights.instrumental:
+            n_updates = self.signals.prior_updates - int(self.policy.n_prior_updates)
+        batch_size = self.policy.batch_sizes(self.batch_size)["prior"]
+        self.policy.set_learning_rate(self.lr_schedule(1.0))
+        if self.verbose and n_updates > 0:
+            print(f"prior: {n_updates} updates before the first step (signal_kwargs: prior_updates)", flush=True)
+        for _ in range(n_updates):
+            rows = expert.draw(batch_size)
+            batch = expert.batch(rows, self.actor, self._vec_normalize_env, self.used_weights, self.gamma)
+            self.instrumental.update(batch)
+            self.policy.n_prior_updates.add_(1)
 
     # ------------------------------------------------------------------ learn
 
@@ -399,8 +412,12 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
 
     def sample_batches(self, n_batches: int, batch_size: int) -> Iterator[Batch]:
         """Minibatches of replayed transitions, the newest in each, then the share that comes from the demonstrations."""
+        if n_batches > MOST_MINIBATCHES:  # after a whole episode: drawn in parts, for the memory
+            for start in range(0, n_batches, MOST_MINIBATCHES):
+                yield from self.sample_batches(min(MOST_MINIBATCHES, n_batches - start), batch_size)
+            return
         if n_batches < 1:
-            return iter(())
+            return
         expert = self.expert
         actor = self.actor
         env = self._vec_normalize_env
@@ -408,7 +425,9 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
         normalizers = self.signals.replayed if weights.has_signals else None
         # Now and then the signals of demonstrated transitions are computed anew, by the present generator
         if expert is not None and self.demonstration_fraction and normalizers is not None:
-            if self._n_updates % RESCORING_INTERVAL == 1 or not expert.has_signals:
+            last = self._n_updates - 1
+            is_due = last // RESCORING_INTERVAL > (last - n_batches) // RESCORING_INTERVAL
+            if is_due or not expert.has_signals:
                 expert.rescore(self.raw_signals, self.signals.rescored, actor, env)
         # Replayed transitions of all minibatches at once
         sizes = self.policy.batch_sizes(batch_size)
@@ -431,7 +450,7 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
             demonstrated = expert.batch(rows, actor, env, weights, self.gamma, self.n_steps, normalizers)
         # circuits with a smaller batch take its first rows: the newest, then a fair mixture of the rest
         is_shuffled = min(sizes.values()) < largest
-        return minibatches(replayed, demonstrated, n_batches, n_newest, is_shuffled)
+        yield from minibatches(replayed, demonstrated, n_batches, n_newest, is_shuffled)
 
     # ------------------------------------------------------------------ what is said and logged
 

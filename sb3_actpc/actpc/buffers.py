@@ -329,7 +329,9 @@ class CombinedHerReplayBuffer(SignalReplay, HerReplayBuffer):  # type: ignore[mi
     def _relabel(
         self, batch: SignalReplaySamples, rows: np.ndarray, envs: np.ndarray, n_newest: int, env: VecNormalize | None
     ) -> SignalReplaySamples:
-        relabelled = np.arange(n_newest, n_newest + int(self.her_ratio * (len(rows) - n_newest)))
+        # anywhere among the rows, which are cut into minibatches later
+        n_drawn = len(rows) - n_newest
+        relabelled = n_newest + np.random.permutation(n_drawn)[: int(self.her_ratio * n_drawn)]
         if not len(relabelled):
             return batch
         assert isinstance(batch.observations, dict) and isinstance(batch.next_observations, dict)

@@ -87,7 +87,7 @@ class SelfImitationMemory:
     An episode enters when its sparse return is positive and at least the best return now stored; the oldest leave when the
     capacity is passed. A task with negative rewards alone never gets one in: the memory warns of it, once.
 
-    With ``takes_all`` every episode with a positive return enters; its return then says how often it is imitated.
+    With ``takes_all`` every episode with a positive return enters.
 
     :param capacity: most transitions kept (an episode longer than that is not stored)
     """

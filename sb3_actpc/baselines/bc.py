@@ -1,7 +1,7 @@
 """Behavior cloning, with and without a memory, as Stable-Baselines3 algorithms, and what all offline baselines share."""
 
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 import numpy as np
@@ -251,6 +251,7 @@ class BC(OfflineAlgorithm):
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": BCPolicy}
     policy: BCPolicy
+    _networks: Sequence[BCPolicy] = ()  # one for each seed, once there are demonstrations
 
     @checked
     def __init__(
@@ -285,8 +286,20 @@ class BC(OfflineAlgorithm):
         self._networks = [self._new_policy() for _ in range(self.n_seeds)] if held_out.any() else [self.policy]
         for network in self._networks:
             network.fit_normalization(demonstrations.observations)
-            if self._n_updates:  # an agent that was loaded goes on from its policy
-                network.load_state_dict(self.policy.state_dict())
+        if self._n_updates:  # an agent that was loaded
+            self._go_on_from_policy()
+
+    def set_parameters(self, *args: Any, **options: Any) -> None:
+        """As in SB3; every network goes on from them."""
+        super().set_parameters(*args, **options)
+        if self._networks:
+            self._go_on_from_policy()
+
+    def _go_on_from_policy(self) -> None:
+        for network in self._networks:
+            network.load_state_dict(self.policy.state_dict())
+        self._smallest_error = np.inf
+        self._validate()
 
     def _gradient_step(self) -> dict[str, th.Tensor]:
         losses = []
@@ -301,6 +314,8 @@ class BC(OfflineAlgorithm):
             losses.append(loss.detach())
         if (self._n_updates + 1) % VALIDATION_INTERVAL == 0:
             self._validate()
+            if len(self._validation_rows):
+                self.logger.record("train/held_out_error", self._smallest_error)
         return {"loss": th.stack(losses).mean()}
 
     def _validate(self) -> None:
@@ -313,7 +328,6 @@ class BC(OfflineAlgorithm):
             if error < self._smallest_error:
                 self._smallest_error = error
                 self.policy.load_state_dict(network.state_dict())
-        self.logger.record("train/held_out_error", self._smallest_error)
 
     def _loss(self, network: BCPolicy, rows: th.Tensor, noise: float = 0.0) -> th.Tensor:
         """Mean squared error of a network's actions in (B,) demonstrated rows."""

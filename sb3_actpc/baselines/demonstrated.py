@@ -156,7 +156,7 @@ class DemonstratedAlgorithm(LearnsFromDemonstrations, StoresLastTransition):
         kind, is_played = self._replay_class(), self.env is None
         kwargs = dict(self.replay_buffer_kwargs)
         if issubclass(kind, NStepReplayBuffer):
-            kwargs = {"n_steps": self.n_steps, "gamma": self.gamma, **kwargs}
+            kwargs |= {"n_steps": self.n_steps, "gamma": self.gamma}  # SB3 adds those of an agent that is loaded
         if issubclass(kind, HerReplayBuffer):
             kwargs["env"] = self.env
         return kind(

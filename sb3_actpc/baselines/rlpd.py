@@ -52,7 +52,7 @@ class RLPD(DemonstratedAlgorithm, SAC):
 
     Differences from RLPD's code (github.com/ikostrikov/rlpd):
 
-    1. Observations are normalized by the demonstrations' mean and standard deviation.
+    1. Observations are normalized by the demonstrations' mean and standard deviation, or else by VecNormalize.
     2. The target has no entropy term for any task; there the task decides.
     3. Returns can be n-step (``n_steps``).
 
@@ -75,7 +75,8 @@ class RLPD(DemonstratedAlgorithm, SAC):
         self.device = get_device("cpu")  # of the replay buffer: SBX takes its batches as NumPy arrays
         is_new = getattr(self, "policy", None) is None
         super()._setup_model()
-        if is_new and self.env is not None and self.demonstrations is not None:
+        is_normalized = self._vec_normalize_env is not None and self._vec_normalize_env.norm_obs
+        if is_new and self.env is not None and self.demonstrations is not None and not is_normalized:
             self.policy.fit_normalization(self._fitted_demonstrations().observations)
 
     def _train(self, tau: float, target_entropy: Any, gradient_steps: int, data: Any, *states: Any) -> Any:

@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 
 from sb3_actpc.cli import count
+from sb3_actpc.envs import UNSEEN_SEED
 
 
 def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
@@ -13,7 +14,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
     add("folder", type=Path, metavar="RUN", help="folder of a finished run, as written by sb3-actpc train")
     add("--output", type=Path, metavar="DIR", help="folder to write (default: RUN/card)")
     add("--episodes", type=count, default=10, metavar="N", help="evaluation episodes (default: %(default)s)")
-    add("--seed", type=int, default=0, help="seed of the first (default: %(default)s)")
+    add("--seed", type=int, default=UNSEEN_SEED, help="seed of the first (default: %(default)s)")
     add("--no-video", action="store_true", help="no replay.mp4")
 
 

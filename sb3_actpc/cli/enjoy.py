@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 from sb3_actpc.cli import count
+from sb3_actpc.envs import UNSEEN_SEED
 
 
 def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
@@ -14,7 +15,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
     add = parser.add_argument
     add("--env", required=True, help="Gymnasium id, such as SparseReacher-v5")
     add("--episodes", type=count, default=3, metavar="N", help="episodes to play (default: %(default)s)")
-    add("--seed", type=int, default=0, help="seed of the first episode (default: %(default)s)")
+    add("--seed", type=int, default=UNSEEN_SEED, help="seed of the first episode (default: %(default)s)")
     add("--video", type=Path, metavar="FILE", help="video of the first episode, .mp4 or .gif, instead of a window")
 
 

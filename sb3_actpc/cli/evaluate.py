@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 
 from sb3_actpc.cli import count
+from sb3_actpc.envs import UNSEEN_SEED
 
 
 def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
@@ -12,8 +13,8 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
     add = parser.add_argument
     add("folder", type=Path, metavar="RUN", help="run folder, as written by sb3-actpc train")
     add("--episodes", type=count, default=10, metavar="N", help="episodes to play (default: %(default)s)")
-    about = "seed of the first episode (default: %(default)s); the evaluations of the run had other start states"
-    add("--seed", type=int, default=0, help=about)
+    about = "seed of the first episode (default: %(default)s, whose start states neither the run nor demonstrations had)"
+    add("--seed", type=int, default=UNSEEN_SEED, help=about)
     add("--video", metavar="FILE", help="video of the first episode, .mp4 or .gif (default: RUN/video.mp4)")
     add("--no-video", action="store_true", help="no video")
 

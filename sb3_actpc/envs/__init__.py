@@ -13,6 +13,8 @@ GOAL_MUJOCO_IDS: tuple[str, ...] = tuple(env_id.replace("Sparse", "Goal", 1) for
 ROBOSUITE_IDS: tuple[str, ...] = tuple(ROBOSUITE_TASKS)
 SPARSE_IDS: tuple[str, ...] = SPARSE_MUJOCO_IDS + ROBOSUITE_IDS
 
+UNSEEN_SEED = 2_000_000  # starts episodes that no training, evaluation or demonstrator has seen
+
 
 def register_envs() -> None:
     """Register the sparse tasks with Gymnasium; ids that are registered already are left alone.
@@ -56,6 +58,7 @@ __all__ = [
     "ROBOSUITE_IDS",
     "SPARSE_IDS",
     "SPARSE_MUJOCO_IDS",
+    "UNSEEN_SEED",
     "dense_env_id",
     "register_envs",
     "sparse_env_id",

@@ -13,6 +13,7 @@ import yaml
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_actpc.actpc import ActPC
+from sb3_actpc.envs import UNSEEN_SEED
 from sb3_actpc.experiments.runs.evaluation import NormalizedPredictor
 from sb3_actpc.experiments.runs.presets import preset_entry
 from sb3_actpc.experiments.runs.record import CONFIG, read_result, write_json
@@ -27,7 +28,7 @@ PRESET, VIDEO = "preset.yml", "replay.mp4"
 RESULT_KEYS = ("return", "return_std", "dense_return", "dense_return_std", "success", "eval_episodes", "timesteps", "seed")
 
 
-def write_card(folder: Path, target: Path, n_episodes: int = 10, seed: int = 0, video: bool = True) -> list[str]:
+def write_card(folder: Path, target: Path, n_episodes: int = 10, seed: int = UNSEEN_SEED, video: bool = True) -> list[str]:
     """Write a model repository of a finished run. Its ``model.zip`` is unpickled: open only runs that you trust.
 
     ``results.json`` is of ``n_episodes`` evaluation episodes, the first from ``seed``, which ``replay.mp4`` shows where asked

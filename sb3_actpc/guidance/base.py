@@ -40,6 +40,7 @@ class ActorGuidance:
     weighting: Literal["returns", "uniform"] = "uniform"  # how imitated steps are drawn
     stores: Literal["positive", "best"] = "best"  # which episodes enter the self-imitation memory
     has_gate = False
+    bc_residual: float | None = None  # error of BC, as a share of the actions' variance; an agent saves it
 
     def on_training_start(self, context: GuidanceContext, is_pretrained: bool) -> None:
         """Before the first environment step of a ``learn``; ``is_pretrained`` where the actor has imitated already."""

@@ -64,7 +64,7 @@ class BehaviorGuidance(ActorGuidance):
         self.has_gate = config.gate
         self.selection: PolicySelection | None = None
         self.copied_at = config.critic_warmup  # update of the last copy of the average
-        self.bc_residual: float | None = None  # error of BC, as a share of the actions' variance; None without BC
+        self.bc_residual = None
 
     def on_training_start(self, context: GuidanceContext, is_pretrained: bool) -> None:
         """BC pre-training, once."""

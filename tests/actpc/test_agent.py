@@ -14,6 +14,7 @@ from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_actpc import ActPC, Demonstrations, MlpPolicy
 from sb3_actpc.actpc import actpc as actpc_module
+from sb3_actpc.actpc import base as base_module
 from sb3_actpc.actpc.batches import Batch
 from sb3_actpc.actpc.reward_signals import RewardWeights
 from sb3_actpc.ngc import settle_coupled
@@ -122,6 +123,24 @@ def test_demonstrated_transitions_are_normalised_when_they_are_sampled_as_replay
         np.random.seed(1)
         paid.append(next(model.sample_batches(1, 32)).rewards[:, 0])
     assert (paid[0] > 0.0).all() and th.allclose(paid[1], paid[0] / 2.0)
+
+
+@pytest.mark.parametrize("gradient_steps", [1, 4])
+def test_demonstrated_transitions_are_scored_anew_as_the_generator_learns(gradient_steps, monkeypatch):
+    monkeypatch.setattr(base_module, "RESCORING_INTERVAL", 30)
+    model = make(demonstrations=demonstrations(), demonstration_fraction=0.5, gradient_steps=gradient_steps)
+    scores = []
+    for _ in range(3):
+        model.learn(40, reset_num_timesteps=False)
+        scores.append(model.expert.epistemic.copy())
+    assert (scores[0] != scores[1]).any() and (scores[1] != scores[2]).any()
+
+
+def test_the_minibatches_of_a_long_episode_are_drawn_in_parts():
+    model = make()
+    model.learn(40)
+    batches = list(model.sample_batches(150, 16))
+    assert len(batches) == 150 and {len(batch.features) for batch in batches} == {16}
 
 
 def test_replayed_and_demonstrated_returns_have_one_discount_and_one_length():
@@ -628,6 +647,17 @@ def test_hindsight_relabels_goals_and_rewards_of_drawn_transitions_but_neither_s
     assert th.equal(batch.epistemic, raw.epistemic)
     achieved = (batch.next_observations["achieved_goal"] == batch.next_observations["desired_goal"]).all(dim=1)
     assert th.equal(batch.rewards.squeeze(1), achieved.float() - 1.0)  # BitFlipping: 0 at the goal, else -1
+
+
+def test_hindsight_relabels_the_same_share_of_every_minibatch():
+    env = BitFlippingEnv(n_bits=6, continuous=True)
+    model = ActPC("MultiInputPolicy", env, **plain(replay_buffer_class=HerReplayBuffer, learning_starts=40))
+    model.learn(120)
+    for stored in (model.replay_buffer.observations, model.replay_buffer.next_observations):
+        stored["desired_goal"][:] = 2.0  # a goal that is never achieved
+    for batch in model.sample_batches(4, 200):
+        keeps_goal = (batch.features == 2.0).any(dim=1).float().mean()
+        assert 0.1 < keeps_goal < 0.35
 
 
 def test_hindsight_learns_from_the_first_episode_that_has_ended():

@@ -47,6 +47,27 @@ def test_a_trained_agent_goes_on_without_demonstrations_where_that_is_asked(tmp_
         ActPC("MlpPolicy", CountingEnv(), demonstration_fraction=0.5)
 
 
+def test_a_loaded_agent_weighs_filtered_steps_as_before(tmp_path):
+    model = imitating()
+    model.learn(20)
+    model.save(tmp_path / "agent")
+    loaded = ActPC.load(tmp_path / "agent", env=CountingEnv(), demonstrations=demonstrations())
+    loaded.learn(10, reset_num_timesteps=False)
+    weight = loaded.actor_guidance.filtered_weight(1000)
+    assert 0.0 < weight == model.actor_guidance.filtered_weight(1000)
+
+
+def test_a_buffer_loaded_before_there_is_an_environment_keeps_its_episodes(tmp_path):
+    model = imitating()
+    model.learn(40)
+    model.save(tmp_path / "agent")
+    model.save_replay_buffer(tmp_path / "buffer")
+    loaded = ActPC.load(tmp_path / "agent")
+    loaded.load_replay_buffer(tmp_path / "buffer")
+    loaded.set_env(DummyVecEnv([CountingEnv]))
+    assert len(loaded.replay_buffer.self_imitation) == len(model.replay_buffer.self_imitation) > 0
+
+
 def test_a_circuits_own_learning_rate_outlasts_another_of_the_agent(tmp_path):
     make(policy_kwargs={"actor_kwargs": {"learning_rate": 1e-4}}, learning_rate=4e-4).save(tmp_path / "agent")
     loaded = ActPC.load(tmp_path / "agent", env=CountingEnv(), learning_rate=1e-3)

@@ -116,7 +116,7 @@ def test_what_lies_behind_an_episodes_end_is_not_learned_from() -> None:
 def test_it_plays_the_same_after_loading_and_goes_on_learning(kind: type[BC], tmp_path: Path) -> None:
     shown = tmp_path / "shown.npz"
     record(ENV).save(shown)
-    model = make(kind, demonstrations=shown).learn(20)
+    model = make(kind, demonstrations=shown, held_out_fraction=0.0).learn(20)
     model.save(tmp_path / "model.zip")
     loaded = kind.load(tmp_path / "model.zip", device="cpu")
     rows = record(ENV).observations[:3]
@@ -126,6 +126,20 @@ def test_it_plays_the_same_after_loading_and_goes_on_learning(kind: type[BC], tm
     assert not np.array_equal(model.predict(rows)[0], loaded.predict(rows)[0])
     with pytest.raises(ValueError, match="cannot be saved without its agent"):
         model.policy.save(str(tmp_path / "policy.pth"))
+
+
+@pytest.mark.parametrize("kind", [BC, BCRNN])
+def test_a_loaded_agent_goes_on_from_its_policy(kind: type[BC], tmp_path: Path) -> None:
+    shown = demonstrated(np.tile([[-1.0], [1.0]], (30, 1)), np.tile([[-1.0] * 3, [1.0] * 3], (30, 1)), list(range(0, 60, 6)))
+
+    def error(model: BC) -> float:
+        return float(np.square(model.predict(shown.observations[:1])[0] - shown.actions[0]).mean())
+
+    model = make(kind, demonstrations=shown, learning_rate=0.01).learn(200)
+    model.save(tmp_path / "model.zip")
+    loaded = kind.load(tmp_path / "model.zip", env=gym.make(ENV), demonstrations=shown, learning_rate=1e-5)
+    loaded.learn(100, reset_num_timesteps=False)
+    assert error(loaded) < 0.02 and error(make(kind, demonstrations=shown)) > 0.1
 
 
 def test_a_saved_agent_names_its_demonstrations_as_they_were_given(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

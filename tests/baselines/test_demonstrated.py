@@ -97,6 +97,15 @@ def test_an_agent_loaded_to_play_has_no_buffer_until_it_has_an_environment(tmp_p
     assert loaded.replay_buffer.demonstrated.buffer_size == 24
 
 
+def test_a_loaded_agent_takes_another_length_of_returns(tmp_path) -> None:
+    shown = record("Pendulum-v1")
+    model = TD3Demo("MlpPolicy", "Pendulum-v1", demonstrations=shown, policy_kwargs={"net_arch": [8]}, n_steps=3)
+    model.save(tmp_path / "model.zip")
+    loaded = TD3Demo.load(tmp_path / "model.zip", env=model.env, demonstrations=shown, n_steps=5, gamma=0.9)
+    for buffer in (loaded.replay_buffer, loaded.replay_buffer.demonstrated):
+        assert (buffer.n_steps, buffer.gamma) == (5, 0.9)
+
+
 class WithActions(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]):
     """Pendulum with another action space."""
 

@@ -8,6 +8,9 @@ import pytest
 
 pytest.importorskip("sbx", reason="sbx is an extra")
 
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import VecNormalize
+
 from sb3_actpc.baselines import RLPD
 from tests.recordings import record
 
@@ -54,6 +57,14 @@ def test_actions_are_chosen_from_observations_in_units_of_the_demonstrations() -
     rows, _ = model.policy.prepare_obs(shown)
     np.testing.assert_allclose(rows.mean(axis=0), 0, atol=1e-4)
     np.testing.assert_allclose(rows.std(axis=0), 1, atol=1e-4)
+
+
+def test_observations_are_normalized_once() -> None:
+    env = VecNormalize(make_vec_env(ENV))
+    model = RLPD("MlpPolicy", env, demonstrations=record(ENV), policy_kwargs={"net_arch": [8]}, **SMALL)
+    rows = np.array([[0.5, -2.0, 1.0]], dtype=np.float32)  # VecNormalize's
+    np.testing.assert_array_equal(model.policy.prepare_obs(rows)[0], rows)
+    model.learn(12)
 
 
 def test_it_plays_the_same_after_loading_and_goes_on_learning(tmp_path: Path) -> None:

@@ -5,7 +5,9 @@ import pytest
 import torch as th
 from stable_baselines3 import DDPG, TD3
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.utils import LinearSchedule
+from stable_baselines3.common.vec_env import VecNormalize
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_actpc.baselines import DDPGDemo, TD3Demo
@@ -108,6 +110,13 @@ def test_the_number_of_demonstrations_can_be_limited() -> None:
     model = demonstrating(n_demonstrations=(7, "transitions"))
     assert model.replay_buffer.demonstrated.buffer_size == 7
     assert np.array_equal(model.replay_buffer.demonstrated.observations[:, 0], record("Pendulum-v1").observations[:7])
+
+
+def test_a_start_from_behavior_cloning_needs_observations_that_stay_as_they_are() -> None:
+    env = VecNormalize(make_vec_env("Pendulum-v1"))
+    model = TD3Demo("MlpPolicy", env, demonstrations=record("Pendulum-v1"), bc_steps=5, policy_kwargs={"net_arch": [8]})
+    with pytest.raises(ValueError, match="bc_steps=5 needs observations that stay as they are"):
+        model.learn(1)
 
 
 def test_a_start_from_behavior_cloning_acts_as_demonstrated() -> None:

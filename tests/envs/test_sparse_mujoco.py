@@ -13,6 +13,8 @@ from stable_baselines3.common.env_checker import check_env as sb3_check_env
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
+from sb3_actpc import Demonstrations, shipped_demonstrations
+from sb3_actpc.cli import build_parser
 from sb3_actpc.envs import SPARSE_MUJOCO_IDS, dense_env_id, sparse_env_id
 from tests.recordings import record
 
@@ -259,4 +261,15 @@ def test_demonstrations_whose_rewards_cannot_be_told_keep_them(env_id: str, chan
     recorded = dataclasses.replace(record(env_id, 1), rewards=np.full(12, 0.5), **change)
     env = make_vec_env(env_id, **options)
     assert np.array_equal(recorded.rewarded_by(env).rewards, recorded.rewards)
+    env.close()
+
+
+@pytest.mark.parametrize("command", [["evaluate", "RUN"], ["enjoy", "--env", "SparseHopper-v5"], ["card", "RUN"]])
+def test_agents_are_shown_from_starts_that_no_demonstration_has(command: list[str]) -> None:
+    seed = build_parser().parse_args(command).seed
+    shown = Demonstrations.load(shipped_demonstrations("SparseHopper-v5"))
+    starts = shown.observations[shown.episode_starts]
+    env = gym.make("SparseHopper-v5")
+    reset = np.array([env.reset(seed=seed + number)[0] for number in range(10)])
+    assert np.abs(starts[:, None] - reset).max(axis=-1).min() > 1e-5
     env.close()

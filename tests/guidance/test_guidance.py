@@ -92,6 +92,17 @@ def test_filtered_steps_count_by_the_precision_of_their_actions(residual, expect
     assert plain.filtered_weight(11) == 0.0
 
 
+@pytest.mark.parametrize(("worst", "stored"), [(0.0, [1.0, 3.0, 1.0]), (-1.0, [1.0, 3.0])])
+def test_with_negative_demonstrated_returns_only_the_best_own_episodes_are_imitated(worst, stored):
+    """Steps are then drawn uniformly, and mediocre episodes would outnumber the demonstrations."""
+    data = demonstrations()
+    rewards = np.where(np.arange(60) == 19, worst, data.rewards)
+    env = DummyVecEnv([lambda: CountingEnv(lengths=(5,), returns=(1.0, 3.0, 1.0, 0.0))])
+    model = imitating(env, demonstrations=dataclasses.replace(data, rewards=rewards), guidance_kwargs={"bc_updates": 5})
+    model.learn(20)
+    assert model.replay_buffer.self_imitation.returns == stored
+
+
 @pytest.mark.parametrize("noise", [0.0, 0.3])
 @pytest.mark.parametrize("scale", [1.0, 0.1])
 def test_bc_measures_how_much_of_the_demonstrated_actions_it_leaves_unexplained(noise, scale):

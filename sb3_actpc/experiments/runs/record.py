@@ -88,7 +88,7 @@ def write_result(run: Run) -> dict[str, Any]:
     rows = rows.astype({"timesteps": int, "updates": int}).astype(object).replace({math.nan: None})
     evaluations: Any = rows.to_dict("records")
     last = evaluations[-1]
-    kept = last if run.keep == "last" else max(evaluations, key=lambda row: row["dense_return"])
+    kept = last if run.keep == "last" else max(reversed(evaluations), key=lambda row: row["dense_return"])
     seconds = last["seconds"]
     evaluation_seconds = last["evaluation_seconds"]
     names = ("env", "algo", "seed", "eval_episodes", "demonstrators_return", "versions", "git_commit", "dirty")

@@ -17,6 +17,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_actpc.checkpoints import CheckpointCallback, list_bundles, restore, why_no_checkpoints
 from sb3_actpc.demonstrations import resolve as resolve_demonstrations
 from sb3_actpc.demonstrations.recording import Report, silent
+from sb3_actpc.envs import UNSEEN_SEED
 from sb3_actpc.experiments.runs import evaluation, presets, record
 from sb3_actpc.experiments.runs.algorithms import load_algorithm
 from sb3_actpc.experiments.runs.environments import check_env_id, make_eval_envs, make_train_env
@@ -218,7 +219,7 @@ def _logger(model: BaseAlgorithm, folder: Path) -> Logger:
     return Logger(str(folder), formats)
 
 
-def evaluate_run(folder: Path, n_episodes: int = 10, seed: int = 0) -> dict[str, Any]:
+def evaluate_run(folder: Path, n_episodes: int = 10, seed: int = UNSEEN_SEED) -> dict[str, Any]:
     """Play episodes with the policy of a run, the first from ``seed``: means and standard deviations over the episodes, where
     those without success ended, and what identifies the run. Its ``model.zip`` is unpickled: open only runs that you trust.
     FileNotFoundError when the folder is not that of a run, ValueError when its files are damaged, gymnasium.error.Error when
