@@ -1,6 +1,7 @@
-"""What docs/paper.md names exists, and docs/metrics.md names all that is logged."""
+"""What docs/paper.md names exists, docs/metrics.md names all that is logged, docs/results.md has the tables of its data."""
 
 import ast
+import importlib.util
 import re
 from pathlib import Path
 
@@ -73,3 +74,14 @@ def test_every_logged_key_is_in_the_table_of_metrics(settling: str) -> None:
     unseen = [name for name, one in zip(named, patterns, strict=True) if not any(re.fullmatch(one, k) for k in keys.logged)]
     optional = ("eval/", "rollout/success_rate", "train/deployed_return")  # of runs on the command line, and longer ones
     assert [name for name in unseen if not name.startswith(optional)] == []
+
+
+def test_the_tables_of_the_results_are_those_of_the_data() -> None:
+    spec = importlib.util.spec_from_file_location("result_tables", ROOT / "docs" / "result_tables.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    texts = {name: (ROOT / name).read_text(encoding="utf-8") for name in ("README.md", "docs/results.md")}
+    tables = module.tables()
+    assert len(tables) > 10
+    for title, lines in tables.items():
+        assert "\n".join(lines) in texts["README.md" if title == "summary" else "docs/results.md"], title
