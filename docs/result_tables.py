@@ -1,0 +1,158 @@
+"""Tables and figures of docs/results.md, from the evaluations in docs/results_data: ``python docs/result_tables.py``."""
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from sb3_actpc.experiments.report.results import Results, load_results
+from sb3_actpc.experiments.report.statistics import probability_of_improvement
+from sb3_actpc.experiments.report.tables import draw_curves
+
+FOLDER = Path(__file__).with_name("results_data")
+# name of a policy -> its variant and the column of its return
+POLICIES = {
+    "ActPC, moving average": ("actpc", "actor_return"),
+    "ActPC, deployed policy": ("actpc", "return"),
+    "RLPD": ("rlpd", "return"),
+}
+SHORT = (0, 2_500, 5_000, 7_500, 10_000)
+LONG = (0, 10_000, 20_000, 30_000, 40_000, 50_000)
+# folder -> task -> the steps of its table
+STEPS: dict[str, dict[str, Sequence[int]]] = {
+    "steps_10000": {
+        "Hopper-suboptimal": SHORT,
+        "Walker2d-suboptimal": SHORT,
+        "Swimmer-suboptimal": SHORT,
+        "Walker2d": SHORT,
+        "SparseReacher-v5": (0, 2_000, 4_000, 6_000, 8_000),
+    },
+    "steps_50000": {"Hopper-suboptimal": LONG, "Walker2d-suboptimal": LONG},
+}
+NAMES = {
+    "Hopper-suboptimal": "Hopper",
+    "Walker2d-suboptimal": "Walker2d",
+    "Swimmer-suboptimal": "Swimmer",
+    "Walker2d": "Walker2d, good demonstrations",
+    "SparseReacher-v5": "Reacher, good demonstrations",
+}
+REPORTED = ("Hopper-suboptimal", "Walker2d-suboptimal", "Swimmer-suboptimal", "Walker2d")  # no settings were chosen on them
+
+
+def spread(values: pd.Series) -> str:
+    """The mean, with the smallest and the largest in brackets."""
+    return f"{values.mean():.0f} ({values.min():.0f} to {values.max():.0f})"
+
+
+def table(results: Results, task: str, steps: Sequence[int]) -> list[str]:
+    """Lines of the table of a task: returns at the steps, over seeds; BC has a single evaluation."""
+    groups = results.groups(task)
+    lines = [f"| steps | {' | '.join(f'{step:,}' for step in steps)} |", f"| {' | '.join(['---'] * (len(steps) + 1))} |"]
+    for policy, (variant, measure) in POLICIES.items():
+        cells = [spread(results.at_step(groups[variant], measure, step)) for step in steps]
+        lines.append(f"| {policy} | {' | '.join(cells)} |")
+    if "bc" in groups:
+        lines.append(f"| plain BC | {spread(groups['bc']['return'])} |{' |' * (len(steps) - 1)}")
+    return lines
+
+
+def improvement(results: Results, policy: str, step: int, tasks: Sequence[str]) -> str:
+    """Probability that a policy has a higher return than RLPD, and its 95 % interval."""
+    variant, measure = POLICIES[policy]
+    own = [results.at_step(results.groups(task)[variant], measure, step).to_numpy() for task in tasks]
+    theirs = [results.at_step(results.groups(task)["rlpd"], "return", step).to_numpy() for task in tasks]
+    value, low, high = probability_of_improvement(own, theirs)
+    return f"{value:.2f} ({low:.2f} to {high:.2f})"
+
+
+def improvement_table(results: Results, steps: Sequence[int], tasks: Sequence[str]) -> list[str]:
+    """Lines of the table of probabilities that ActPC has a higher return than RLPD."""
+    lines = [
+        f"| over RLPD after | {' | '.join(f'{step:,}' for step in steps)} |",
+        f"| {' | '.join(['---'] * (len(steps) + 1))} |",
+    ]
+    for policy in list(POLICIES)[:2]:
+        lines.append(f"| {policy} | {' | '.join(improvement(results, policy, step, tasks) for step in steps)} |")
+    return lines
+
+
+def first_times(results: Results, tasks: Iterable[str]) -> list[str]:
+    """Lines of a table: environment steps after which a policy first has 90 % of the best return that any of them reached on
+    the task, and its share of the time in which RLPD has trained until then. Medians over seeds; one that never does counts as
+    infinity."""
+    lines = [f"| 90 % of the best return | {' | '.join(POLICIES)} |", f"| {' | '.join(['---'] * (len(POLICIES) + 1))} |"]
+    for task in tasks:
+        groups = results.groups(task)
+        curves = {}
+        for policy, (variant, measure) in POLICIES.items():
+            own = results.curves[results.curves["run"].isin(groups[variant].index)]
+            curves[policy] = own.assign(value=own[measure], time=own["seconds"] - own["evaluation_seconds"])
+        threshold = 0.9 * max(rows["value"].max() for rows in curves.values())
+        medians = {}
+        for policy, rows in curves.items():
+            first = rows[rows["value"] >= threshold].groupby("run")[["timesteps", "time"]].min()
+            runs = groups[POLICIES[policy][0]].index
+            medians[policy] = first.astype(float).reindex(runs, fill_value=np.inf).median()
+        cells = []
+        for steps, seconds in medians.values():
+            cell = f"{steps:,.0f}" if np.isfinite(steps) else "-"
+            if np.isfinite(seconds) and np.isfinite(medians["RLPD"]["time"]):
+                cell += f" ({seconds / medians['RLPD']['time']:.1f})"
+            cells.append(cell)
+        lines.append(f"| {NAMES[task]}: {threshold:.0f} | {' | '.join(cells)} |")
+    return lines
+
+
+def steadiness(results: Results, tasks: Iterable[str], first: int, threshold: float) -> list[str]:
+    """Lines of a table: how many evaluations of all seeds from a step on have a return below the threshold, and the lowest."""
+    lines = [f"| from {first:,} steps on | {' | '.join(POLICIES)} |", f"| {' | '.join(['---'] * (len(POLICIES) + 1))} |"]
+    for task in tasks:
+        cells = []
+        for variant, measure in POLICIES.values():
+            runs = results.groups(task)[variant].index
+            rows = results.curves[results.curves["run"].isin(runs) & (results.curves["timesteps"] >= first)]
+            returns = rows[measure]
+            cells.append(f"{(returns < threshold).sum()} of {len(returns)} (lowest {returns.min():.0f})")
+        lines.append(f"| {NAMES[task]}: below {threshold:.0f} | {' | '.join(cells)} |")
+    return lines
+
+
+def summary(short: Results, long: Results) -> list[str]:
+    """Lines of README's table: every task at its last step."""
+    lines = [f"| | steps | plain BC | RLPD | {' | '.join(list(POLICIES)[:2])} |", "| --- | --- | --- | --- | --- | --- |"]
+    for results, tasks in ((short, STEPS["steps_10000"]), (long, STEPS["steps_50000"])):
+        for task, steps in tasks.items():
+            groups = results.groups(task)
+            policies = {
+                name: spread(results.at_step(groups[variant], column, steps[-1]))
+                for name, (variant, column) in POLICIES.items()
+            }
+            cells = [f"{steps[-1]:,}", spread(short.groups(task)["bc"]["return"]), policies.pop("RLPD"), *policies.values()]
+            lines.append(f"| {NAMES[task]} | {' | '.join(cells)} |")
+    return lines
+
+
+def tables() -> dict[str, list[str]]:
+    """What it shows -> the lines of every table of the page."""
+    found = {}
+    for folder, tasks in STEPS.items():
+        results = load_results(FOLDER / folder)
+        for task, steps in tasks.items():
+            found[f"{folder}: {task}"] = table(results, task, steps)
+        found[f"{folder}: 90 % of the best return"] = first_times(results, tasks)
+        reported = [task for task in REPORTED if task in tasks]
+        steps = [step for step in tasks[reported[0]] if step]
+        found[f"{folder}: probability of improvement"] = improvement_table(results, steps, reported)
+    long_runs = load_results(FOLDER / "steps_50000")
+    found["steps_50000: steadiness"] = steadiness(long_runs, STEPS["steps_50000"], 15_000, 700)
+    found["summary"] = summary(*(load_results(FOLDER / folder) for folder in STEPS))
+    return found
+
+
+if __name__ == "__main__":
+    for title, lines in tables().items():
+        print(f"{title}\n\n" + "\n".join(lines) + "\n")
+    long_runs = load_results(FOLDER / "steps_50000")
+    for task in STEPS["steps_50000"]:
+        draw_curves(long_runs, task, FOLDER.with_name("_static") / f"{task}.png")
