@@ -190,6 +190,7 @@ def _train(
     plot_learning_curve(run)
     if saver is not None and run.continuable:
         saver.save()
+    model.logger.close()
     # one of the finished run, so that it can be given more steps; or none
     for bundle in list_bundles(checkpoints)[: -1 if run.continuable else None]:
         shutil.rmtree(bundle)
