@@ -221,7 +221,7 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
                 self._fitted_demonstrations(), self.observation_space, self.action_space, self.policy.memory_history
             )
         # An actor that has imitated keeps the statistics of its demonstrations
-        is_normalised = self._vec_normalize_env is not None and bool(self._vec_normalize_env.norm_obs)
+        is_normalised = self.has_normalized_observations
         parts: Iterable[Any]
         if self.observation_normalization == "bounds":
             parts = [finite_bounds(self.observation_space, is_normalised)]

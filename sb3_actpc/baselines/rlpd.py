@@ -75,8 +75,8 @@ class RLPD(DemonstratedAlgorithm, SAC):
         self.device = get_device("cpu")  # of the replay buffer: SBX takes its batches as NumPy arrays
         is_new = getattr(self, "policy", None) is None
         super()._setup_model()
-        is_normalized = self._vec_normalize_env is not None and self._vec_normalize_env.norm_obs
-        if is_new and self.env is not None and self.demonstrations is not None and not is_normalized:
+        has_data = self.env is not None and self.demonstrations is not None
+        if is_new and has_data and not self.has_normalized_observations:
             self.policy.fit_normalization(self._fitted_demonstrations().observations)
 
     def _train(self, tau: float, target_entropy: Any, gradient_steps: int, data: Any, *states: Any) -> Any:

@@ -151,7 +151,7 @@ class TD3Demo(DemonstratedAlgorithm, TD3):
         """As SB3's; the first call begins with ``bc_steps`` steps of behavior cloning."""
         is_new = not self.num_timesteps and not self._n_updates
         if self.bc_steps and is_new and self.demonstrations is not None:
-            if self._vec_normalize_env is not None and self._vec_normalize_env.norm_obs:
+            if self.has_normalized_observations:
                 raise ValueError(
                     f"bc_steps={self.bc_steps} needs observations that stay as they are: use VecNormalize(norm_obs=False)"
                 )

@@ -122,12 +122,13 @@ def _compare_lengths(demonstrations: Demonstrations, env: "VecEnv") -> None:
 
 def _check_wrappers(demonstrations: Demonstrations, env: "VecEnv") -> None:
     """Compare the names of the wrappers that may change units with those that the demonstrations were recorded behind."""
+    from sb3_actpc.utils.tasks import written_as  # heavy: demonstrations do without
+
     # sb3-actpc demos collect makes the environment by its id
     is_collected = str(demonstrations.metadata.get("command", "")).startswith("sb3-actpc demos collect")
     recorded = demonstrations.metadata.get("wrappers", [] if is_collected else None)
-    try:
-        written = str(env.env_method("__str__", indices=[0])[0])
-    except (AttributeError, NotImplementedError):  # not every kind of vectorised environment can be asked
+    written = written_as(env)
+    if written is None:
         warnings.warn(
             f"{type(env.unwrapped).__name__} does not name its wrappers (env_method): make sure that the demonstrations were "
             "recorded behind the same ones, in the units of the agent",

@@ -38,6 +38,11 @@ class LearnsFromDemonstrations(BaseAlgorithm):
         self.n_demonstrations = n_demonstrations
         super().__init__(policy, env, **_copied(options))
 
+    @property
+    def has_normalized_observations(self) -> bool:
+        """Whether VecNormalize changes the observations."""
+        return self._vec_normalize_env is not None and bool(self._vec_normalize_env.norm_obs)
+
     def _check_actions(self) -> None:
         """:raises ValueError: for actions that cannot be scaled to [-1, 1], or that are whole numbers"""
         if isinstance(self.action_space, spaces.Box):

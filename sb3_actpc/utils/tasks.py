@@ -8,13 +8,18 @@ from stable_baselines3.common.vec_env import VecEnv
 _WRITTEN_ID = re.compile(r"<([^<>\s]+)>+$")
 
 
+def written_as(env: VecEnv) -> str | None:
+    """How Gymnasium writes the first environment with its wrappers; None where the environment cannot be asked, as not every
+    kind of vectorised environment can."""
+    try:
+        return str(env.env_method("__str__", indices=0)[0])
+    except (AttributeError, NotImplementedError):
+        return None
+
+
 def task_id(env: VecEnv) -> str | None:
     """The Gymnasium id of its first environment; None where it has none. It is asked for what it is written as: a spec holds
     the keywords that the environment was made with, and not all of these can be sent from another process (a function without
     a name, say)."""
-    try:
-        written = str(env.env_method("__str__", indices=0)[0])
-    except (AttributeError, NotImplementedError):  # not every kind of vectorised environment can be asked
-        return None
-    found = _WRITTEN_ID.search(written)
+    found = _WRITTEN_ID.search(written_as(env) or "")
     return found.group(1) if found else None
