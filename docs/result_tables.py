@@ -8,7 +8,7 @@ import pandas as pd
 
 from sb3_actpc.experiments.report.results import Results, load_results
 from sb3_actpc.experiments.report.statistics import probability_of_improvement
-from sb3_actpc.experiments.report.tables import draw_curves
+from sb3_actpc.experiments.report.tables import draw_curves, markdown
 
 FOLDER = Path(__file__).with_name("results_data")
 # name of a policy -> its variant and the column of its return
@@ -45,16 +45,20 @@ def spread(values: pd.Series) -> str:
     return f"{values.mean():.0f} ({values.min():.0f} to {values.max():.0f})"
 
 
+def lines_of(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """Lines of a table in Markdown."""
+    return markdown(pd.DataFrame(rows, columns=columns)).splitlines()
+
+
 def table(results: Results, task: str, steps: Sequence[int]) -> list[str]:
     """Lines of the table of a task: returns at the steps, over seeds; BC has a single evaluation."""
     groups = results.groups(task)
-    lines = [f"| steps | {' | '.join(f'{step:,}' for step in steps)} |", f"| {' | '.join(['---'] * (len(steps) + 1))} |"]
-    for policy, (variant, measure) in POLICIES.items():
-        cells = [spread(results.at_step(groups[variant], measure, step)) for step in steps]
-        lines.append(f"| {policy} | {' | '.join(cells)} |")
-    if "bc" in groups:
-        lines.append(f"| plain BC | {spread(groups['bc']['return'])} |{' |' * (len(steps) - 1)}")
-    return lines
+    rows = [
+        [policy, *(spread(results.at_step(groups[variant], measure, step)) for step in steps)]
+        for policy, (variant, measure) in POLICIES.items()
+    ]
+    rows.append(["plain BC", spread(groups["bc"]["return"]), *[""] * (len(steps) - 1)])
+    return lines_of(["steps", *(f"{step:,}" for step in steps)], rows)
 
 
 def improvement(results: Results, policy: str, step: int, tasks: Sequence[str]) -> str:
@@ -68,20 +72,15 @@ def improvement(results: Results, policy: str, step: int, tasks: Sequence[str]) 
 
 def improvement_table(results: Results, steps: Sequence[int], tasks: Sequence[str]) -> list[str]:
     """Lines of the table of probabilities that ActPC has a higher return than RLPD."""
-    lines = [
-        f"| over RLPD after | {' | '.join(f'{step:,}' for step in steps)} |",
-        f"| {' | '.join(['---'] * (len(steps) + 1))} |",
-    ]
-    for policy in list(POLICIES)[:2]:
-        lines.append(f"| {policy} | {' | '.join(improvement(results, policy, step, tasks) for step in steps)} |")
-    return lines
+    rows = [[policy, *(improvement(results, policy, step, tasks) for step in steps)] for policy in list(POLICIES)[:2]]
+    return lines_of(["over RLPD after", *(f"{step:,}" for step in steps)], rows)
 
 
 def first_times(results: Results, tasks: Iterable[str]) -> list[str]:
     """Lines of a table: environment steps after which a policy first has 90 % of the best return that any of them reached on
     the task, and its share of the time in which RLPD has trained until then. Medians over seeds; one that never does counts as
     infinity."""
-    lines = [f"| 90 % of the best return | {' | '.join(POLICIES)} |", f"| {' | '.join(['---'] * (len(POLICIES) + 1))} |"]
+    table_rows = []
     for task in tasks:
         groups = results.groups(task)
         curves = {}
@@ -100,13 +99,13 @@ def first_times(results: Results, tasks: Iterable[str]) -> list[str]:
             if np.isfinite(seconds) and np.isfinite(medians["RLPD"]["time"]):
                 cell += f" ({seconds / medians['RLPD']['time']:.1f})"
             cells.append(cell)
-        lines.append(f"| {NAMES[task]}: {threshold:.0f} | {' | '.join(cells)} |")
-    return lines
+        table_rows.append([f"{NAMES[task]}: {threshold:.0f}", *cells])
+    return lines_of(["90 % of the best return", *POLICIES], table_rows)
 
 
 def steadiness(results: Results, tasks: Iterable[str], first: int, threshold: float) -> list[str]:
     """Lines of a table: how many evaluations of all seeds from a step on have a return below the threshold, and the lowest."""
-    lines = [f"| from {first:,} steps on | {' | '.join(POLICIES)} |", f"| {' | '.join(['---'] * (len(POLICIES) + 1))} |"]
+    table_rows = []
     for task in tasks:
         cells = []
         for variant, measure in POLICIES.values():
@@ -114,13 +113,13 @@ def steadiness(results: Results, tasks: Iterable[str], first: int, threshold: fl
             rows = results.curves[results.curves["run"].isin(runs) & (results.curves["timesteps"] >= first)]
             returns = rows[measure]
             cells.append(f"{(returns < threshold).sum()} of {len(returns)} (lowest {returns.min():.0f})")
-        lines.append(f"| {NAMES[task]}: below {threshold:.0f} | {' | '.join(cells)} |")
-    return lines
+        table_rows.append([f"{NAMES[task]}: below {threshold:.0f}", *cells])
+    return lines_of([f"from {first:,} steps on", *POLICIES], table_rows)
 
 
 def summary(short: Results, long: Results) -> list[str]:
     """Lines of README's table: every task at its last step."""
-    lines = [f"| | steps | plain BC | RLPD | {' | '.join(list(POLICIES)[:2])} |", "| --- | --- | --- | --- | --- | --- |"]
+    rows = []
     for results, tasks in ((short, STEPS["steps_10000"]), (long, STEPS["steps_50000"])):
         for task, steps in tasks.items():
             groups = results.groups(task)
@@ -129,8 +128,8 @@ def summary(short: Results, long: Results) -> list[str]:
                 for name, (variant, column) in POLICIES.items()
             }
             cells = [f"{steps[-1]:,}", spread(short.groups(task)["bc"]["return"]), policies.pop("RLPD"), *policies.values()]
-            lines.append(f"| {NAMES[task]} | {' | '.join(cells)} |")
-    return lines
+            rows.append([NAMES[task], *cells])
+    return lines_of(["task", "steps", "plain BC", "RLPD", *list(POLICIES)[:2]], rows)
 
 
 def tables() -> dict[str, list[str]]:
