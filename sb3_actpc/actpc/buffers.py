@@ -85,7 +85,7 @@ class SignalReplay(ReplayBuffer):
         if self.self_imitation is None or length > self.buffer_size - int(self.optimize_memory_usage):
             return
         rows = (self.newest + 1 + np.arange(-length, 0)) % self.buffer_size
-        episode_return = float(sum(self.rewards[rows, env].tolist()))
+        episode_return = float(sum((self.rewards[rows, env] - self.self_imitation.failure_reward).tolist()))
         if self.self_imitation.takes(length, episode_return):
             observations = map_observations(lambda ring: ring[rows, env], self.observations)
             self.self_imitation.store(observations, self.actions[rows, env].astype(np.float32), episode_return)

@@ -11,7 +11,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from sb3_actpc.actpc.batches import Batch, Observations, SignalReplaySamples, normalized, to_device
 from sb3_actpc.actpc.policies import ActPCActor
 from sb3_actpc.actpc.reward_signals import STORED, Normalize, RewardWeights
-from sb3_actpc.actpc.self_imitation import Episodes
+from sb3_actpc.actpc.self_imitation import Episodes, failure_reward
 from sb3_actpc.demonstrations import Demonstrations, scaled_actions
 from sb3_actpc.demonstrations.rows import split_observations
 from sb3_actpc.utils.nested import map_observations
@@ -36,11 +36,13 @@ class DemonstrationReplay:
         bounds = demonstrations.episode_bounds
         lengths = bounds[:, 1] - bounds[:, 0]
         self.ends = np.repeat(bounds[:, 1], lengths)
+        self.failure_reward = failure_reward(demonstrations.rewards)
+        returns = np.add.reduceat(demonstrations.rewards.astype(np.float64) - self.failure_reward, bounds[:, 0])
         self.episodes = Episodes(
             observations=split_observations(observation_space, demonstrations.observations),
             actions=scaled_actions(demonstrations, action_space),
             starts=np.repeat(bounds[:, 0], lengths),
-            returns=np.repeat(demonstrations.episode_returns, lengths),
+            returns=np.repeat(returns, lengths),
         )
         self.next_observations = split_observations(observation_space, demonstrations.next_observations)
         self.epistemic = np.zeros(len(demonstrations), dtype=np.float32)

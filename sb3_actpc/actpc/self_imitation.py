@@ -87,7 +87,7 @@ class SelfImitationMemory:
     An episode enters when its sparse return is positive and at least the best return now stored; the oldest leave when the
     capacity is passed. A task with negative rewards alone never gets one in: the memory warns of it, once.
 
-    With ``takes_all`` every episode with a positive return enters.
+    With ``takes_all`` every episode with a positive return enters. Rewards count from ``failure_reward`` on.
 
     :param capacity: most transitions kept (an episode longer than that is not stored)
     """
@@ -95,6 +95,7 @@ class SelfImitationMemory:
     def __init__(self, capacity: int = 100_000) -> None:
         self.capacity = capacity
         self.takes_all = False
+        self.failure_reward = 0.0
         self.returns: list[float] = []
         self.lengths: list[int] = []
         self.episodes: Episodes | None = None
@@ -142,6 +143,13 @@ class SelfImitationMemory:
         """:param state: what :meth:`checkpoint_state` returned"""
         episodes = None if state["episodes"] is None else Episodes(**state["episodes"])
         vars(self).update({**state, "episodes": episodes})
+
+
+def failure_reward(rewards: np.ndarray) -> float:
+    """What a step without success pays: of two demonstrated rewards the smaller, if it is negative (-1 and 0, -0.1 and 10);
+    else 0. Counted from it, the returns of a sparse task are not negative."""
+    paid = np.unique(rewards)
+    return min(float(paid[0]), 0.0) if len(paid) == 2 else 0.0
 
 
 def is_by_return(parts: list[Episodes], weighting: Weighting) -> bool:

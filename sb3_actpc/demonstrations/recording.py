@@ -13,6 +13,7 @@ from gymnasium import spaces
 
 from sb3_actpc.demonstrations.rows import box_paths, join_observations, outside_bounds
 from sb3_actpc.utils.extras import installed_version
+from sb3_actpc.utils.tasks import success_of
 
 Columns = dict[str, Any]
 Report = Callable[[str], None]
@@ -179,9 +180,9 @@ def _play(act: Callable[[Any, bool], np.ndarray], env: gym.Env[Any, Any], seed: 
 
 
 def _is_kept(info: Mapping[str, Any], only_successes: bool | None) -> bool:
-    success = info.get("is_success", info.get("success"))
+    success = success_of(info)
     if success is None and only_successes:
         raise ValueError(
-            "only_successes=True needs an environment whose info has is_success: give False to keep every episode"
+            "only_successes=True needs an environment whose info has is_success or success: give False to keep every episode"
         )
     return only_successes is False or success is None or bool(success)

@@ -1,6 +1,8 @@
-"""Which task a vectorised environment is of."""
+"""Which task a vectorised environment is of, and whether an episode succeeded."""
 
 import re
+from collections.abc import Mapping
+from typing import Any
 
 from stable_baselines3.common.vec_env import VecEnv
 
@@ -23,3 +25,9 @@ def task_id(env: VecEnv) -> str | None:
     a name, say)."""
     found = _WRITTEN_ID.search(written_as(env) or "")
     return found.group(1) if found else None
+
+
+def success_of(info: Mapping[str, Any]) -> float | None:
+    """1 or 0, of SB3's ``is_success`` or, as in Gymnasium-Robotics' Adroit tasks and Meta-World, ``success``; None without."""
+    success = info.get("is_success", info.get("success"))
+    return None if success is None else float(success)

@@ -178,6 +178,26 @@ def test_episodes_are_played_once_each_with_the_recurrent_state_carried() -> Non
     assert [*policy.calls[0][0][:, 0], *policy.calls[10][0][:, 0]] == drawn
 
 
+class Renamed(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]):
+    """Gives ``is_success`` another name."""
+
+    def __init__(self, env: gym.Env[np.ndarray, np.ndarray], name: str) -> None:
+        super().__init__(env)
+        self.name = name
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, Any, bool, bool, dict[str, Any]]:
+        *result, info = super().step(action)
+        info[self.name] = info.pop("is_success")
+        return (*result, info)  # type: ignore[return-value]
+
+
+@pytest.mark.parametrize(("name", "expected"), [("is_success", 1.0), ("success", 1.0), ("another", None)])
+def test_success_is_read_by_both_of_its_usual_names(name: str, expected: float | None) -> None:
+    """``success`` is Adroit's and Meta-World's."""
+    episodes = play_episodes(StatefulPolicy(), [Renamed(gym.make(ENV_ID), name)], n_episodes=2, seed=0)
+    assert episodes.summary()["success"] == expected
+
+
 def test_failed_episodes_are_counted_by_their_farthest_stage() -> None:
     rewards = np.zeros(5)
     successes = np.array([0.0, 1.0, 0.0, 0.0, 1.0])

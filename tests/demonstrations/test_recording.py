@@ -203,7 +203,10 @@ def test_observations_that_are_no_boxes_are_refused(space: spaces.Space[Any]) ->
         ({"demonstrator": []}, r"\[\] must have SB3's predict"),
         ({"env": "CartPole-v1"}, "Box action space, found Discrete"),
         ({"env": Corridor(), "n_episodes": 2, "max_tries": 3}, "only 1 of 3 episodes succeeded in Corridor, 2 are needed"),
-        ({"env": Corridor(reports=False), "only_successes": True}, "needs an environment whose info has is_success"),
+        (
+            {"env": Corridor(reports=False), "only_successes": True},
+            "needs an environment whose info has is_success or success",
+        ),
         ({"env": 3}, "env must be a Gymnasium environment or the id of one, found 3"),
     ],
 )

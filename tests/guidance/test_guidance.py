@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
@@ -101,6 +102,32 @@ def test_with_negative_demonstrated_returns_only_the_best_own_episodes_are_imita
     model = imitating(env, demonstrations=dataclasses.replace(data, rewards=rewards), guidance_kwargs={"bc_updates": 5})
     model.learn(20)
     assert model.replay_buffer.self_imitation.returns == stored
+
+
+@pytest.mark.parametrize(("failure", "success"), [(0.0, 1.0), (-1.0, 0.0), (-0.1, 10.0)])
+def test_the_rewards_of_failure_and_success_do_not_change_what_is_imitated(failure, success):
+    """The first demonstrated episode succeeds in twelve of its steps, the second in four, the last never."""
+    data = demonstrations()
+    paid = np.isin(np.arange(60), [*range(8, 20), *range(36, 40)])
+    rewards = np.where(paid, success, failure)
+
+    def pay(reward):
+        return failure + (success - failure) * reward
+
+    def own():
+        return gym.wrappers.TransformReward(CountingEnv(lengths=(5,), returns=(1.0, 0.0)), pay)
+
+    model = imitating(
+        DummyVecEnv([own]), demonstrations=dataclasses.replace(data, rewards=rewards), guidance_kwargs={"bc_updates": 5}
+    )
+    model.learn(20)
+    memory = model.replay_buffer.self_imitation
+    assert memory.lengths == [5, 5] and memory.returns == pytest.approx([success - failure] * 2)
+    weights = np.repeat([12.0**4, 4.0**4, 0.0, 1.0], [20, 20, 20, 10])
+    drawn = model.sample_imitated(20_000)[1].numpy()
+    rows = np.concatenate([data.actions / 2, memory.episodes.actions])
+    counts = (np.abs(drawn[:, None] - rows) < 1e-6).all(2).sum(0)
+    assert counts / 20_000 == pytest.approx(weights / weights.sum(), abs=0.01)
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.3])

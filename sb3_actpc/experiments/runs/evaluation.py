@@ -20,6 +20,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_actpc.experiments.runs.schema import Run
 from sb3_actpc.utils.files import atomic_write
+from sb3_actpc.utils.tasks import success_of
 
 UNTRAINED_EPISODES = 5
 EVALUATION_SEED_OFFSET = 1_000_000  # the episodes start from other states than the training's
@@ -80,7 +81,7 @@ class EpisodeStatistics:
 
     dense_returns: np.ndarray  # sums of ``info["dense_reward"]`` (of the reward, where the environment does not report it)
     returns: np.ndarray  # sums of the reward
-    successes: np.ndarray  # 1 where ``info["is_success"]`` was true at the end, NaN where the environment does not report it
+    successes: np.ndarray  # 1 where the last ``info`` reports it, 0 where it reports none, NaN where it reports neither
     lengths: np.ndarray  # steps
     stages: list[str]  # ``info["stage"]`` at the end of each, "" where the environment does not report it
 
@@ -131,7 +132,8 @@ def _play_side_by_side(
             observations[i], reward, terminated, truncated, info = envs[i].step(actions[i])
             played.dense_returns[first + i] += dense_reward(info, reward)
             played.returns[first + i] += float(reward)
-            played.successes[first + i] = info.get("is_success", np.nan)
+            success = success_of(info)
+            played.successes[first + i] = np.nan if success is None else success
             played.lengths[first + i] += 1
             played.stages[first + i] = info.get("stage", "")
             playing[i] = not (terminated or truncated)
@@ -192,10 +194,10 @@ class EpisodeLog(CsvCallback):
     """Appends a row to ``episodes.csv`` when a training episode ends, exploration noise and all.
 
     ``return`` is the sum of the environment's rewards, ``dense_return`` that of ``info["dense_reward"]`` (the
-    same again where the environment does not report it), ``success`` is ``info["is_success"]`` at the end (empty where it is
-    not reported), ``timesteps`` and ``seconds`` are those of the training until then. ``actions_crc32`` is the CRC-32 of all
-    actions of the training so far: two runs that have the same number have taken the same actions. ``clock`` gives the seconds
-    that the training has taken so far.
+    same again where the environment does not report it), ``success`` is ``info["is_success"]`` or ``info["success"]`` at the
+    end (empty where neither is reported), ``timesteps`` and ``seconds`` are those of the training until then.
+    ``actions_crc32`` is the CRC-32 of all actions of the training so far: two runs that have the same number have taken the
+    same actions. ``clock`` gives the seconds that the training has taken so far.
     """
 
     columns = ("episode", "timesteps", "seconds", "length", "return", "dense_return", "success", "actions_crc32")
@@ -225,7 +227,6 @@ class EpisodeLog(CsvCallback):
 
     def _end(self, info: dict[str, Any], dense_return: float) -> None:
         self.n_episodes += 1
-        success = info.get("is_success")
         row = {
             "episode": self.n_episodes,
             "timesteps": self.num_timesteps,
@@ -233,7 +234,7 @@ class EpisodeLog(CsvCallback):
             "length": info["episode"]["l"],  # of SB3's Monitor, as the next: before any normalisation
             "return": round(info["episode"]["r"], 6),
             "dense_return": round(dense_return, 6),
-            "success": None if success is None else float(success),
+            "success": success_of(info),
             "actions_crc32": self.actions,
         }
         self.append(row)
