@@ -13,12 +13,11 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, PyTorch
 from torch import nn
 from typing_extensions import Self
 
+from sb3_actpc.baselines.normalization import NormalizedObservations
 from sb3_actpc.demonstrations import Demonstrations, scaled_actions
 from sb3_actpc.demonstrations.mixin import LearnsFromDemonstrations
 from sb3_actpc.utils.arguments import Positive, Share, Weight, checked
 
-SMALLEST_SPREAD = 1e-3  # an entry that hardly varies in the demonstrations is not blown up
-LARGEST_INPUT = 10.0  # as in SB3's VecNormalize
 VALIDATION_INTERVAL = 100  # steps; ``learn`` ends with one too
 
 
@@ -26,25 +25,14 @@ class NormalizingPolicy(BasePolicy):
     """A policy that normalizes observations by the demonstrations' mean and standard deviation, and acts in [-1, 1], which is
     scaled to the environment's units."""
 
-    mean: th.Tensor
-    spread: th.Tensor
-
     def __init__(self, observation_space: spaces.Space, action_space: spaces.Box) -> None:
         super().__init__(observation_space, action_space, normalize_images=False, squash_output=True)
         self.n_inputs, self.n_outputs = (int(np.prod(space.shape or ())) for space in (observation_space, action_space))
-        self.register_buffer("mean", th.zeros(self.n_inputs))
-        self.register_buffer("spread", th.ones(self.n_inputs))
-
-    def fit_normalization(self, observations: np.ndarray) -> None:
-        """Entries of these observations, (N, obs_dim), shall get mean 0 and standard deviation 1."""
-        rows = th.as_tensor(observations, device=self.device)
-        self.mean.copy_(rows.mean(dim=0))
-        self.spread.copy_(rows.std(dim=0, correction=0).clamp(min=SMALLEST_SPREAD))
+        self.normalization = NormalizedObservations(observation_space)
 
     def normalized(self, observations: np.ndarray | PyTorchObs) -> th.Tensor:
         """Normalized observations (B, obs_dim), of any shape (B, *shape)."""
-        rows = th.as_tensor(observations, dtype=th.float32, device=self.device).flatten(1)
-        return ((rows - self.mean) / self.spread).clamp(-LARGEST_INPUT, LARGEST_INPUT)
+        return self.normalization(th.as_tensor(observations, dtype=th.float32, device=self.device))
 
     def save(self, path: str) -> None:
         """:raises ValueError: always, since the agent knows what its policy is made of"""
@@ -269,7 +257,7 @@ class BC(OfflineAlgorithm):
 
     def _take(self, demonstrations: Demonstrations) -> None:
         assert isinstance(self.action_space, spaces.Box)
-        self.policy.fit_normalization(demonstrations.observations)
+        self.policy.normalization.fit(demonstrations.observations)
         self._observations = self.policy.normalized(demonstrations.observations)
         self._actions = th.as_tensor(scaled_actions(demonstrations, self.action_space), device=self.device)
         bounds = demonstrations.episode_bounds
@@ -285,7 +273,7 @@ class BC(OfflineAlgorithm):
         self._smallest_error = np.inf
         self._networks = [self._new_policy() for _ in range(self.n_seeds)] if held_out.any() else [self.policy]
         for network in self._networks:
-            network.fit_normalization(demonstrations.observations)
+            network.normalization.fit(demonstrations.observations)
         if self._n_updates:  # an agent that was loaded
             self._go_on_from_policy()
 

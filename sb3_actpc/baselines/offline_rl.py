@@ -72,7 +72,7 @@ class D3rlpyAlgorithm(OfflineAlgorithm):
 
     def _take(self, demonstrations: Demonstrations) -> None:
         if not self.trained:  # a loaded agent keeps the normalization that its networks learned with
-            self.policy.fit_normalization(demonstrations.observations)
+            self.policy.normalization.fit(demonstrations.observations)
         # one that goes on does not draw the same batches again
         self._random = np.random.default_rng(None if self.seed is None else self.seed + self._n_updates)
         self._transitions = {

@@ -1,16 +1,18 @@
 """TD3 and DDPG with demonstrations; actor and critic have rates, optimisers and target rates of their own, as in the paper."""
 
 from collections import defaultdict
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch as th
+from gymnasium import spaces
 from stable_baselines3 import TD3
 from stable_baselines3.common.policies import BaseModel
 from stable_baselines3.common.utils import polyak_update
 from typing_extensions import Self
 
 from sb3_actpc.baselines.demonstrated import DemonstratedAlgorithm
+from sb3_actpc.baselines.normalization import NormalizedObservations
 from sb3_actpc.utils.arguments import Count, Weight, checked
 from sb3_actpc.utils.nested import map_observations
 
@@ -37,6 +39,8 @@ class TD3Demo(DemonstratedAlgorithm, TD3):
     :param normalize_values: divide ``policy_gradient_weight`` by the batch's mean absolute action-value. TD3+BC (Fujimoto
         and Gu, arXiv 2106.06860) with ``policy_gradient_weight=2.5, cloning_weight=1.0``
     :param bc_steps: steps of behavior cloning on the demonstrations, before the first ``learn`` begins
+    :param observation_normalization: "demonstrations" normalizes observations by their mean and standard deviation (as TD3+BC
+        does by its data), "none" leaves them as they are
     :param options: keywords of :class:`~sb3_actpc.baselines.demonstrated.DemonstratedAlgorithm` and of SB3's TD3
     :raises ValueError: for a keyword with a value that is not allowed, for demonstrations that do not fit the environment
     """
@@ -52,6 +56,7 @@ class TD3Demo(DemonstratedAlgorithm, TD3):
         q_filter: bool = False,
         normalize_values: bool = False,
         bc_steps: Count = 0,
+        observation_normalization: Literal["none", "demonstrations"] = "none",
         **options: Any,
     ) -> None:
         self.actor_kwargs = actor_kwargs or {}
@@ -61,9 +66,18 @@ class TD3Demo(DemonstratedAlgorithm, TD3):
         self.q_filter = q_filter
         self.normalize_values = normalize_values
         self.bc_steps = bc_steps
+        self.observation_normalization = observation_normalization
+        if observation_normalization == "demonstrations":
+            extractor = {"features_extractor_class": NormalizedObservations}
+            options["policy_kwargs"] = {**(options.get("policy_kwargs") or {}), **extractor}
         super().__init__(*args, **options)
 
     def _setup_model(self) -> None:
+        if self.observation_normalization != "none" and not isinstance(self.observation_space, spaces.Box):
+            raise ValueError(
+                f"observation_normalization={self.observation_normalization!r} needs Box observations, found "
+                f"{type(self.observation_space).__name__}: use 'none'"
+            )
         super()._setup_model()
         for network, given in self._networks():
             kind = OPTIMIZERS.get(given.get("optimizer", "adam"))
@@ -148,14 +162,18 @@ class TD3Demo(DemonstratedAlgorithm, TD3):
         return self.critic.q1_forward(observations, actions)
 
     def learn(self, total_timesteps: int, *args: Any, **options: Any) -> Self:
-        """As SB3's; the first call begins with ``bc_steps`` steps of behavior cloning."""
+        """As SB3's; the first call fits the normalization and begins with ``bc_steps`` steps of behavior cloning."""
         is_new = not self.num_timesteps and not self._n_updates
-        if self.bc_steps and is_new and self.demonstrations is not None:
+        normalizes = self.observation_normalization == "demonstrations"
+        if (self.bc_steps or normalizes) and is_new and self.demonstrations is not None:
             if self.has_normalized_observations:
-                raise ValueError(
-                    f"bc_steps={self.bc_steps} needs observations that stay as they are: use VecNormalize(norm_obs=False)"
-                )
-            self._clone_actor()
+                needs = "observation_normalization='demonstrations'" if normalizes else f"bc_steps={self.bc_steps}"
+                raise ValueError(f"{needs} needs observations that stay as they are: use VecNormalize(norm_obs=False)")
+            for part in self.policy.modules():
+                if isinstance(part, NormalizedObservations):
+                    part.fit(self._fitted_demonstrations().observations)
+            if self.bc_steps:
+                self._clone_actor()
         return super().learn(total_timesteps, *args, **options)
 
     def _clone_actor(self) -> None:

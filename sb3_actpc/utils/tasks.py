@@ -1,10 +1,13 @@
 """Which task a vectorised environment is of, and whether an episode succeeded."""
 
+from __future__ import annotations
+
 import re
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from stable_baselines3.common.vec_env import VecEnv
+if TYPE_CHECKING:
+    from stable_baselines3.common.vec_env import VecEnv
 
 # as Gymnasium writes an environment: <TimeLimit<OrderEnforcing<HopperEnv<Hopper-v5>>>>
 _WRITTEN_ID = re.compile(r"<([^<>\s]+)>+$")

@@ -1,5 +1,7 @@
 """TD3 and DDPG with demonstrations: SB3's own without them, and what the paper's tables and Nair et al. add."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch as th
@@ -10,7 +12,7 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecNormalize
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
-from sb3_actpc.baselines import DDPGDemo, TD3Demo
+from sb3_actpc.baselines import HER, DDPGDemo, TD3Demo
 from tests.recordings import record
 
 SMALL = {"policy_kwargs": {"net_arch": [16]}, "learning_starts": 10, "batch_size": 16, "seed": 1}
@@ -117,6 +119,23 @@ def test_a_start_from_behavior_cloning_needs_observations_that_stay_as_they_are(
     model = TD3Demo("MlpPolicy", env, demonstrations=record("Pendulum-v1"), bc_steps=5, policy_kwargs={"net_arch": [8]})
     with pytest.raises(ValueError, match="bc_steps=5 needs observations that stay as they are"):
         model.learn(1)
+
+
+def test_all_networks_see_observations_normalized_by_the_demonstrations(tmp_path: Path) -> None:
+    shown = record("Pendulum-v1")
+    model = demonstrating(demonstrations=shown, observation_normalization="demonstrations")
+    for network in (model.actor, model.actor_target, model.critic, model.critic_target):
+        features = network.extract_features(th.as_tensor(shown.observations), network.features_extractor)
+        th.testing.assert_close(features.mean(dim=0), th.zeros(3), atol=1e-4, rtol=0)
+        th.testing.assert_close(features.std(dim=0, correction=0), th.ones(3), atol=1e-3, rtol=0)
+    model.save(tmp_path / "normalized")
+    played = DDPGDemo.load(tmp_path / "normalized")
+    assert np.array_equal(played.predict(shown.observations)[0], model.predict(shown.observations)[0])
+
+
+def test_normalization_by_the_demonstrations_needs_a_box() -> None:
+    with pytest.raises(ValueError, match=r"observation_normalization='demonstrations' needs Box observations, found Dict"):
+        HER("MultiInputPolicy", "GoalReacher-v5", observation_normalization="demonstrations")
 
 
 def test_a_start_from_behavior_cloning_acts_as_demonstrated() -> None:

@@ -1,0 +1,34 @@
+"""Observations normalized by the demonstrations, as a features extractor of SB3."""
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.torch_layers import FlattenExtractor
+
+SMALLEST_SPREAD = 1e-3  # an entry that hardly varies in the demonstrations is not scaled up
+LARGEST_INPUT = 10.0  # as in SB3's VecNormalize
+
+
+class NormalizedObservations(FlattenExtractor):
+    """Flat observations with the demonstrations' mean and standard deviation taken out; as they are until :meth:`fit`.
+
+    :param observation_space: a Box
+    """
+
+    mean: th.Tensor
+    spread: th.Tensor
+
+    def __init__(self, observation_space: spaces.Space) -> None:
+        super().__init__(observation_space)
+        self.register_buffer("mean", th.zeros(self.features_dim))
+        self.register_buffer("spread", th.ones(self.features_dim))
+
+    def fit(self, observations: np.ndarray) -> None:
+        """Give these observations, (N, obs_dim), mean 0 and standard deviation 1."""
+        rows = th.as_tensor(observations, device=self.mean.device)
+        self.mean.copy_(rows.mean(dim=0))
+        self.spread.copy_(rows.std(dim=0, correction=0).clamp(min=SMALLEST_SPREAD))
+
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        """(B, obs_dim) from (B, *shape)."""
+        return ((super().forward(observations) - self.mean) / self.spread).clamp(-LARGEST_INPUT, LARGEST_INPUT)
