@@ -34,8 +34,8 @@ NAMES = {
     "Hopper-suboptimal": "Hopper",
     "Walker2d-suboptimal": "Walker2d",
     "Swimmer-suboptimal": "Swimmer",
-    "Walker2d": "Walker2d, good demonstrations",
-    "SparseReacher-v5": "Reacher, good demonstrations",
+    "Walker2d": "Walker2d, shipped demonstrations",
+    "SparseReacher-v5": "Reacher, shipped demonstrations",
 }
 REPORTED = ("Hopper-suboptimal", "Walker2d-suboptimal", "Swimmer-suboptimal", "Walker2d")  # no settings were chosen on them
 
