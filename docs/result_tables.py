@@ -37,6 +37,16 @@ NAMES = {
     "Walker2d": "Walker2d, shipped demonstrations",
     "SparseReacher-v5": "Reacher, shipped demonstrations",
 }
+# the other baselines: name -> variant, in a folder of their own, with fewer seeds
+OTHERS = {
+    "ActPC without the gate": "no_gate",
+    "imitation only": "imitation_only",
+    "IBRL": "ibrl",
+    "TD3+BC": "td3_bc",
+    "DDPG-Demo": "ddpg_demo",
+    "LOGO": "logo",
+    "BC-RNN": "bc_rnn",
+}
 REPORTED = ("Hopper-suboptimal", "Walker2d-suboptimal", "Swimmer-suboptimal", "Walker2d")  # no settings were chosen on them
 
 
@@ -59,6 +69,27 @@ def table(results: Results, task: str, steps: Sequence[int]) -> list[str]:
     ]
     rows.append(["plain BC", spread(groups["bc"]["return"]), *[""] * (len(steps) - 1)])
     return lines_of(["steps", *(f"{step:,}" for step in steps)], rows)
+
+
+def others_table(others: Results, short: Results, task: str) -> list[str]:
+    """Lines of the table of the other baselines, and of ActPC, RLPD and BC with the same seeds."""
+    groups = others.groups(task)
+    seeds = set(groups["no_gate"]["seed"])
+    rows = []
+    for policy, (variant, measure) in POLICIES.items():
+        runs = short.groups(task)[variant]
+        runs = runs[runs["seed"].isin(seeds)]
+        rows.append([policy, str(len(runs)), *(spread(short.at_step(runs, measure, step)) for step in SHORT)])
+    for policy, variant in OTHERS.items():
+        if variant == "bc_rnn":
+            cells = [spread(groups[variant]["return"]), *[""] * (len(SHORT) - 1)]
+        else:
+            cells = [spread(others.at_step(groups[variant], "return", step)) for step in SHORT]
+        rows.append([policy, str(len(groups[variant])), *cells])
+    cloned = short.groups(task)["bc"]
+    cloned = cloned[cloned["seed"].isin(seeds)]
+    rows.append(["plain BC", str(len(cloned)), spread(cloned["return"]), *[""] * (len(SHORT) - 1)])
+    return lines_of(["steps", "seeds", *(f"{step:,}" for step in SHORT)], rows)
 
 
 def improvement(results: Results, policy: str, step: int, tasks: Sequence[str]) -> str:
@@ -143,6 +174,9 @@ def tables() -> dict[str, list[str]]:
         reported = [task for task in REPORTED if task in tasks]
         steps = [step for step in tasks[reported[0]] if step]
         found[f"{folder}: probability of improvement"] = improvement_table(results, steps, reported)
+    others, short = load_results(FOLDER / "baselines_10000"), load_results(FOLDER / "steps_10000")
+    for task in ("Hopper-suboptimal", "Walker2d-suboptimal"):
+        found[f"baselines_10000: {task}"] = others_table(others, short, task)
     long_runs = load_results(FOLDER / "steps_50000")
     found["steps_50000: steadiness"] = steadiness(long_runs, STEPS["steps_50000"], 15_000, 700)
     found["summary"] = summary(*(load_results(FOLDER / folder) for folder in STEPS))
