@@ -27,12 +27,14 @@ class NormalizingPolicy(BasePolicy):
 
     def __init__(self, observation_space: spaces.Space, action_space: spaces.Box) -> None:
         super().__init__(observation_space, action_space, normalize_images=False, squash_output=True)
-        self.n_inputs, self.n_outputs = (int(np.prod(space.shape or ())) for space in (observation_space, action_space))
         self.normalization = NormalizedObservations(observation_space)
+        self.n_inputs, self.n_outputs = self.normalization.features_dim, int(np.prod(action_space.shape or ()))
 
     def normalized(self, observations: np.ndarray | PyTorchObs) -> th.Tensor:
-        """Normalized observations (B, obs_dim), of any shape (B, *shape)."""
-        return self.normalization(th.as_tensor(observations, dtype=th.float32, device=self.device))
+        """Normalized observations (B, obs_dim), of any shape (B, *shape) or a dict of such."""
+        if not isinstance(observations, dict):
+            observations = th.as_tensor(observations, dtype=th.float32, device=self.device)
+        return self.normalization(observations)
 
     def save(self, path: str) -> None:
         """:raises ValueError: always, since the agent knows what its policy is made of"""
@@ -46,8 +48,8 @@ class OfflineAlgorithm(LearnsFromDemonstrations):
     spaces and the demonstrations' task. Callbacks are called after each, so that evaluations at intervals work as for any
     other algorithm. Nothing is kept to resume from: a training is short enough to be run again.
 
-    :param policy: "MlpPolicy"
-    :param env: a task with Box observations and actions; for its spaces and for evaluations
+    :param policy: "MlpPolicy"; BC and BC-RNN take "MultiInputPolicy" too
+    :param env: a task with Box observations, or a Dict of these, and Box actions; for its spaces and for evaluations
     :param learning_rate: of the optimiser, or a schedule
     :param batch_size: B
     :param options: keywords of :class:`~sb3_actpc.demonstrations.mixin.LearnsFromDemonstrations` and of SB3's algorithms
@@ -204,7 +206,8 @@ class BCRNNPolicy(BCPolicy):
         """
         self.set_training_mode(False)
         rows, is_batch = self.obs_to_tensor(observation)
-        n = len(rows)
+        inputs = self.normalized(rows)
+        n = len(inputs)
         if state is None:
             state = np.zeros((n, self.hidden_size)), np.zeros(n, dtype=np.int64)
         hidden, steps = state
@@ -213,7 +216,7 @@ class BCRNNPolicy(BCPolicy):
             begins = begins | np.ravel(episode_start).astype(bool)
         kept = th.as_tensor(np.where(begins[:, None], 0.0, hidden), dtype=th.float32, device=self.device)
         with th.no_grad():
-            outputs, after = self.memory(self.normalized(rows)[:, None], kept[None])
+            outputs, after = self.memory(inputs[:, None], kept[None])
             scaled = self.head(outputs)[:, 0].clamp(-1, 1).cpu().numpy().reshape(-1, *(self.action_space.shape or ()))
         actions = np.asarray(self.unscale_action(scaled))
         return actions if is_batch else actions[0], (after[0].cpu().numpy(), np.where(begins, 0, steps) + 1)
@@ -237,7 +240,7 @@ class BC(OfflineAlgorithm):
     :param options: further keywords as there; ``policy_kwargs`` are those of :class:`BCPolicy`
     """
 
-    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": BCPolicy}
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": BCPolicy, "MultiInputPolicy": BCPolicy}
     policy: BCPolicy
     _networks: Sequence[BCPolicy] = ()  # one for each seed, once there are demonstrations
 
@@ -350,7 +353,7 @@ class BCRNN(BC):
     :param options: further keywords of :class:`BC`; ``policy_kwargs`` are those of :class:`BCRNNPolicy`
     """
 
-    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": BCRNNPolicy}
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": BCRNNPolicy, "MultiInputPolicy": BCRNNPolicy}
 
     @checked
     def __init__(

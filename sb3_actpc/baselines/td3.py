@@ -5,7 +5,6 @@ from typing import Any, Literal
 
 import numpy as np
 import torch as th
-from gymnasium import spaces
 from stable_baselines3 import TD3
 from stable_baselines3.common.policies import BaseModel
 from stable_baselines3.common.utils import polyak_update
@@ -73,11 +72,6 @@ class TD3Demo(DemonstratedAlgorithm, TD3):
         super().__init__(*args, **options)
 
     def _setup_model(self) -> None:
-        if self.observation_normalization != "none" and not isinstance(self.observation_space, spaces.Box):
-            raise ValueError(
-                f"observation_normalization={self.observation_normalization!r} needs Box observations, found "
-                f"{type(self.observation_space).__name__}: use 'none'"
-            )
         super()._setup_model()
         for network, given in self._networks():
             kind = OPTIMIZERS.get(given.get("optimizer", "adam"))
@@ -88,6 +82,11 @@ class TD3Demo(DemonstratedAlgorithm, TD3):
             if given.keys() - {"tau"}:
                 rate = given.get("learning_rate", self.lr_schedule(1.0))
                 network.optimizer = kind(network.parameters(), lr=rate)  # type: ignore[call-arg]
+
+    @property
+    def imitates_first(self) -> bool:
+        """Whether the first ``learn`` begins with behavior cloning."""
+        return bool(self.bc_steps)
 
     def _networks(self) -> list[tuple[BaseModel, dict[str, Any]]]:
         return [(self.actor, self.actor_kwargs), (self.critic, self.critic_kwargs)]

@@ -27,7 +27,9 @@ SMALL_RNN = {"hidden_size": 6}
 
 def make(kind: type[BC] = BC, **options: Any) -> BC:
     small = {"policy_kwargs": SMALL_RNN if kind is BCRNN else SMALL, "batch_size": 8, "seed": 0}
-    return kind("MlpPolicy", ENV, device="cpu", **{"demonstrations": record(ENV), **small, **options})
+    env = options.pop("env", ENV)
+    policy = "MlpPolicy" if env is ENV else "MultiInputPolicy"
+    return kind(policy, env, device="cpu", **{"demonstrations": record(ENV), **small, **options})
 
 
 def demonstrated(actions: np.ndarray, observations: np.ndarray, starts: list[int]) -> Demonstrations:
@@ -188,6 +190,7 @@ def test_an_offline_method_is_evaluated_at_every_interval_and_others_before_thei
         "bc": ("bc", {}),
         "untrained": ("actpc", {"guidance": "none"}),
         "cloned": ("actpc", {"guidance_kwargs": {"bc_updates": 2}}),
+        "td3": ("td3", {"bc_steps": 2}),
     }
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("sb3_actpc.experiments.runs.evaluation.play_episodes", counted)
@@ -198,5 +201,27 @@ def test_an_offline_method_is_evaluated_at_every_interval_and_others_before_thei
             train_run(Run(env="SparseReacher-v5", algo=algo, output=output, settings=settings, **few))
             with open(tmp_path / name / "progress.csv", encoding="utf-8") as file:
                 steps[name] = [int(row["timesteps"]) for row in csv.DictReader(file)]
-    assert steps == {"bc": [10, 20, 30], "untrained": [0, 10, 20, 30], "cloned": [0, 10, 20, 30]}
-    assert episodes == {"bc": [6] * 3, "untrained": [5, 6, 6, 6], "cloned": [6] * 8}  # deployed policy, then actor
+    assert steps == {"bc": [10, 20, 30], "untrained": [0, 10, 20, 30], "cloned": [0, 10, 20, 30], "td3": [0, 10, 20, 30]}
+    assert episodes == {
+        "bc": [6] * 3,
+        "untrained": [5, 6, 6, 6],
+        "cloned": [6] * 8,
+        "td3": [6] * 4,
+    }  # deployed policy, then actor
+
+
+@pytest.mark.parametrize("kind", [BC, BCRNN])
+def test_a_dict_of_observations_is_joined_in_the_order_of_its_space(kind: type[BC], tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    env = gym.make("GoalReacher-v5")
+    shown = Demonstrations.record(lambda _: rng.uniform(-0.1, 0.1, 2), env, 3, only_successes=False)
+    model = make(kind, env=env, demonstrations=shown).learn(20)
+    observation, _ = env.reset(seed=1)
+    joined = np.concatenate([observation[key].ravel() for key in env.observation_space])
+    model.save(tmp_path / "model")
+    played = kind.load(tmp_path / "model")
+    shuffled = dict(reversed(observation.items()))
+    action, _ = played.predict(shuffled, deterministic=True)
+    inputs = model.policy.normalized(joined[None])
+    expected = model.policy(inputs[:, None] if kind is BCRNN else inputs).detach().numpy().reshape(-1)
+    assert action == pytest.approx(model.policy.unscale_action(expected.clip(-1, 1)), abs=1e-6)

@@ -12,7 +12,7 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecNormalize
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
-from sb3_actpc.baselines import HER, DDPGDemo, TD3Demo
+from sb3_actpc.baselines import DDPGDemo, TD3Demo
 from tests.recordings import record
 
 SMALL = {"policy_kwargs": {"net_arch": [16]}, "learning_starts": 10, "batch_size": 16, "seed": 1}
@@ -131,11 +131,6 @@ def test_all_networks_see_observations_normalized_by_the_demonstrations(tmp_path
     model.save(tmp_path / "normalized")
     played = DDPGDemo.load(tmp_path / "normalized")
     assert np.array_equal(played.predict(shown.observations)[0], model.predict(shown.observations)[0])
-
-
-def test_normalization_by_the_demonstrations_needs_a_box() -> None:
-    with pytest.raises(ValueError, match=r"observation_normalization='demonstrations' needs Box observations, found Dict"):
-        HER("MultiInputPolicy", "GoalReacher-v5", observation_normalization="demonstrations")
 
 
 def test_a_start_from_behavior_cloning_acts_as_demonstrated() -> None:
