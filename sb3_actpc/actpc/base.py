@@ -254,7 +254,7 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
             expert = self.expert
             has_negative = expert is None or bool(expert.episodes.returns.min() < 0.0)
             memory.takes_all = self.actor_guidance.stores == "positive" and not has_negative
-            memory.failure_reward = 0.0 if expert is None else expert.failure_reward
+            memory.count_from(0.0 if expert is None else expert.failure_reward)
         if self.demonstrations is None:
             self._go_on_without_demonstrations()
 

@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any, Literal, NamedTuple
 
@@ -85,9 +85,9 @@ class SelfImitationMemory:
     """The actor's memory of its own goal-reaching episodes (paper: M^actor, Algorithm 1, line 29), laid end to end.
 
     An episode enters when its sparse return is positive and at least the best return now stored; the oldest leave when the
-    capacity is passed. A task with negative rewards alone never gets one in: the memory warns of it, once.
+    capacity is passed. A task with negative returns alone never gets one in: the memory warns of it, once.
 
-    With ``takes_all`` every episode with a positive return enters. Rewards count from ``failure_reward`` on.
+    With ``takes_all`` every episode with a positive return enters. Returns count from ``failure_reward`` (:meth:`count_from`).
 
     :param capacity: most transitions kept (an episode longer than that is not stored)
     """
@@ -123,6 +123,14 @@ class SelfImitationMemory:
         is_good = self.takes_all or episode_return >= self.best_return
         return episode_return > 0.0 and is_good and length <= self.capacity
 
+    def count_from(self, failure_reward: float) -> None:
+        """Rewards count from this one from now on, those of the stored episodes too."""
+        shift = self.failure_reward - failure_reward
+        self.failure_reward = failure_reward
+        if shift and self.episodes is not None:
+            self.returns = [value + shift * length for value, length in zip(self.returns, self.lengths, strict=True)]
+            self.episodes = replace(self.episodes, returns=np.repeat(self.returns, self.lengths))
+
     def store(self, observations: Observations, actions: np.ndarray, episode_return: float) -> None:
         """One whole episode: observations (T, *obs_shape) or a dict of such, actions (T, A), and its sparse return."""
         n_new = len(actions)
@@ -145,11 +153,12 @@ class SelfImitationMemory:
         vars(self).update({**state, "episodes": episodes})
 
 
-def failure_reward(rewards: np.ndarray) -> float:
-    """What a step without success pays: of two demonstrated rewards the smaller, if it is negative (-1 and 0, -0.1 and 10);
-    else 0. Counted from it, the returns of a sparse task are not negative."""
+def failure_reward(rewards: np.ndarray, terminations: np.ndarray) -> float:
+    """What a step without success pays: of two demonstrated rewards the smaller, if it is negative (-1 and 0, -0.1 and 10)
+    and no penalty at the end of an episode alone; else 0. Counted from it, the returns of a sparse task are not negative."""
     paid = np.unique(rewards)
-    return min(float(paid[0]), 0.0) if len(paid) == 2 else 0.0
+    is_sparse = len(paid) == 2 and not terminations[rewards == paid[0]].all()
+    return min(float(paid[0]), 0.0) if is_sparse else 0.0
 
 
 def is_by_return(parts: list[Episodes], weighting: Weighting) -> bool:

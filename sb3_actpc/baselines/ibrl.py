@@ -23,10 +23,12 @@ class IBRLPolicy(TD3Policy):
     :param exploration_noise: standard deviation of Gaussian noise on the actor's proposal, in units of [-1, 1], while learning
     """
 
+    follows_bc: th.Tensor
+
     def __init__(self, *args: Any, n_critics: int = 5, exploration_noise: float = 0.1, **options: Any) -> None:
         self.exploration_noise = exploration_noise
-        self.follows_bc = False  # the actor proposes nothing yet
         super().__init__(*args, **{**options, "n_critics": n_critics})
+        self.register_buffer("follows_bc", th.tensor(False))  # the actor proposes nothing yet
         self.bc = BCPolicy(self.observation_space, self.action_space).requires_grad_(False)
 
     def make_critic(self, features_extractor: Any = None) -> ContinuousCritic:
@@ -67,7 +69,8 @@ class IBRL(TD3Demo):
 
     Differences from the authors' code (github.com/hengyuan-hu/ibrl, its settings for state observations):
 
-    1. Half of every batch is demonstrated; there the replay buffer starts with the demonstrations.
+    1. Half of every batch is demonstrated; there the replay buffer starts with the demonstrations. ``hyperparams/ibrl.yml``
+       normalizes observations by them.
     2. The actor has no dropout (there 0.5). Layers, rates and target steps are ``hyperparams/ibrl.yml``'s; there three hidden
        layers of 1024, 1e-4 and 0.01.
     3. The better of two actions is taken; there one is drawn with probabilities softmax(10 Q).
@@ -101,12 +104,11 @@ class IBRL(TD3Demo):
         model = BC("MlpPolicy", self.env, learning_rate=lambda left: 1e-3 * left, batch_size=64, **same)
         model.learn(self.bc_steps, log_interval=None)
         self.policy.bc.load_state_dict(model.policy.state_dict())
+        self.policy.follows_bc.fill_(True)
 
     def _sample_action(self, learning_starts: int, *args: Any, **options: Any) -> Any:
-        self.policy.follows_bc = self.num_timesteps < learning_starts
-        chosen = super()._sample_action(0, *args, **options)
-        self.policy.follows_bc = False
-        return chosen
+        self.policy.follows_bc.fill_(self.num_timesteps < learning_starts)
+        return super()._sample_action(0, *args, **options)
 
     def _next_values(self, batch: Any, next_actions: th.Tensor) -> th.Tensor:
         """Of the actor's and the BC policy's actions the better one's, by the smaller value of two critics, (B, 1)."""

@@ -67,8 +67,14 @@ class TD3Demo(DemonstratedAlgorithm, TD3):
         self.bc_steps = bc_steps
         self.observation_normalization = observation_normalization
         if observation_normalization == "demonstrations":
-            extractor = {"features_extractor_class": NormalizedObservations}
-            options["policy_kwargs"] = {**(options.get("policy_kwargs") or {}), **extractor}
+            policy_kwargs = options.get("policy_kwargs") or {}
+            if "features_extractor_class" in policy_kwargs:
+                raise ValueError(
+                    "observation_normalization='demonstrations' is a features extractor itself: use 'none', or leave "
+                    "features_extractor_class out of policy_kwargs"
+                )
+            extractor = {"features_extractor_class": NormalizedObservations, "normalize_images": False}
+            options["policy_kwargs"] = {**policy_kwargs, **extractor}
         super().__init__(*args, **options)
 
     def _setup_model(self) -> None:
@@ -86,7 +92,7 @@ class TD3Demo(DemonstratedAlgorithm, TD3):
     @property
     def imitates_first(self) -> bool:
         """Whether the first ``learn`` begins with behavior cloning."""
-        return bool(self.bc_steps)
+        return bool(self.bc_steps) and self.demonstrations is not None
 
     def _networks(self) -> list[tuple[BaseModel, dict[str, Any]]]:
         return [(self.actor, self.actor_kwargs), (self.critic, self.critic_kwargs)]
@@ -164,16 +170,25 @@ class TD3Demo(DemonstratedAlgorithm, TD3):
         """As SB3's; the first call fits the normalization and begins with ``bc_steps`` steps of behavior cloning."""
         is_new = not self.num_timesteps and not self._n_updates
         normalizes = self.observation_normalization == "demonstrations"
-        if (self.bc_steps or normalizes) and is_new and self.demonstrations is not None:
-            if self.has_normalized_observations:
-                needs = "observation_normalization='demonstrations'" if normalizes else f"bc_steps={self.bc_steps}"
-                raise ValueError(f"{needs} needs observations that stay as they are: use VecNormalize(norm_obs=False)")
-            for part in self.policy.modules():
-                if isinstance(part, NormalizedObservations):
-                    part.fit(self._fitted_demonstrations().observations)
-            if self.bc_steps:
-                self._clone_actor()
+        if is_new and (normalizes or self.imitates_first) and self.has_normalized_observations:
+            needs = "observation_normalization='demonstrations'" if normalizes else f"bc_steps={self.bc_steps}"
+            raise ValueError(f"{needs} needs observations that stay as they are: use VecNormalize(norm_obs=False)")
+        if is_new and normalizes:
+            self._fit_normalization()
+        if is_new and self.imitates_first:
+            self._clone_actor()
         return super().learn(total_timesteps, *args, **options)
+
+    def _fit_normalization(self) -> None:
+        parts = [part for part in self.policy.modules() if isinstance(part, NormalizedObservations)]
+        if self.demonstrations is None or not parts:
+            raise ValueError(
+                "observation_normalization='demonstrations' needs demonstrations=, and to be given to the constructor: "
+                "use 'none' without them"
+            )
+        observations = self._fitted_demonstrations().observations
+        for part in parts:
+            part.fit(observations)
 
     def _clone_actor(self) -> None:
         """Start the actor as behavior cloning does: least squares on the demonstrated actions, in [-1, 1]."""

@@ -9,7 +9,7 @@ from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 
 from sb3_actpc.actpc.buffers import CombinedReplayBuffer
 from sb3_actpc.actpc.self_imitation import RETURN_EXPONENT as K
-from sb3_actpc.actpc.self_imitation import Episodes, SelfImitationMemory, sample_union
+from sb3_actpc.actpc.self_imitation import Episodes, SelfImitationMemory, failure_reward, sample_union
 
 SPACES = (spaces.Box(-1, 1, (2,), np.float64), spaces.Box(-1, 1, (1,), np.float32))
 
@@ -186,6 +186,31 @@ def test_a_task_that_pays_negative_rewards_alone_is_warned_of_once():
         warnings.simplefilter("error")
         sparse = SelfImitationMemory(100)
         assert not any(sparse.takes(5, 0.0) for _ in range(60))
+
+
+@pytest.mark.parametrize(
+    ("rewards", "ends", "expected"),
+    [
+        ([0.0, 1.0, 0.0], [0, 0, 0], 0.0),
+        ([-1.0, -1.0, 0.0], [0, 0, 0], -1.0),
+        ([-1.0, -1.0, 0.0], [0, 0, 1], -1.0),
+        ([0.0, 0.0, -1.0], [0, 0, 1], 0.0),  # a penalty where an episode ends is none of success
+        ([-1.0, -1.0, -1.0], [0, 0, 0], 0.0),
+        ([-2.0, -1.0, 0.0], [0, 0, 0], 0.0),
+    ],
+)
+def test_the_reward_of_failure_is_the_smaller_of_two(rewards, ends, expected):
+    assert failure_reward(np.array(rewards, dtype=np.float32), np.array(ends, dtype=bool)) == expected
+
+
+def test_stored_returns_count_from_the_reward_of_failure_that_is_told_later():
+    memory = SelfImitationMemory(100)
+    for length, value in ((3, 1.0), (2, 4.0)):
+        memory.store(np.zeros((length, 1)), np.zeros((length, 1)), value)
+    memory.count_from(-0.5)
+    assert memory.returns == [2.5, 5.0] and memory.best_return == 5.0
+    assert memory.episodes.returns.tolist() == [2.5] * 3 + [5.0] * 2
+    assert memory.episodes.cumulative_weights == pytest.approx(np.cumsum([2.5**4] * 3 + [5.0**4] * 2))
 
 
 def episodes_of(*given: tuple[int, float]) -> Episodes:

@@ -7,7 +7,7 @@ import torch as th
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_actpc import ActPC
-from sb3_actpc.actpc.policies import ObservationNormalizer
+from sb3_actpc.utils.normalization import ObservationNormalizer
 from tests.actpc.agents import QUICK, imitating, make
 from tests.actpc.envs import CountingEnv, demonstrations
 

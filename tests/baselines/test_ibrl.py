@@ -43,6 +43,16 @@ def test_it_takes_the_proposal_that_the_critics_value_more() -> None:
     np.testing.assert_allclose(chosen, 2.0 * th.where(is_proposed, proposed, own).numpy(), rtol=1e-6)
 
 
+def test_until_learning_starts_it_acts_as_the_bc_policy(tmp_path: Path) -> None:
+    model, rows = make(learning_starts=50).learn(8), record(ENV).observations
+    model.save(tmp_path / "model.zip")
+    cloned = 2.0 * model.policy.bc_actions(th.as_tensor(rows)).numpy()
+    for one in (model, IBRL.load(tmp_path / "model.zip")):
+        np.testing.assert_allclose(one.predict(rows, deterministic=True)[0], cloned, rtol=1e-5)
+    model.learn(60, reset_num_timesteps=False)
+    assert not np.allclose(model.predict(rows, deterministic=True)[0], cloned, rtol=1e-5)
+
+
 def test_critics_are_layer_normalized() -> None:
     assert sum(isinstance(module, th.nn.LayerNorm) for module in make().policy.critic.modules()) == 3
 

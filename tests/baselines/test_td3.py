@@ -1,5 +1,6 @@
 """TD3 and DDPG with demonstrations: SB3's own without them, and what the paper's tables and Nair et al. add."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,7 @@ import torch as th
 from stable_baselines3 import DDPG, TD3
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecNormalize
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
@@ -131,6 +133,30 @@ def test_all_networks_see_observations_normalized_by_the_demonstrations(tmp_path
     model.save(tmp_path / "normalized")
     played = DDPGDemo.load(tmp_path / "normalized")
     assert np.array_equal(played.predict(shown.observations)[0], model.predict(shown.observations)[0])
+
+
+def test_an_observation_that_does_not_vary_in_the_demonstrations_keeps_its_scale() -> None:
+    """Such as a goal that is the same in all of them: others are relabelled."""
+    shown = record("Pendulum-v1")
+    still = np.array([[1.0, 1.0, 0.0]], dtype=np.float32)
+    columns = {name: getattr(shown, name) * still + 0.5 for name in ("observations", "next_observations")}
+    model = demonstrating(demonstrations=replace(shown, **columns), observation_normalization="demonstrations")
+    rows = th.tensor([[0.0, 0.0, 0.5], [0.0, 0.0, 1.5], [0.0, 0.0, 2.0]])
+    features = model.actor.extract_features(rows, model.actor.features_extractor)
+    th.testing.assert_close(features[:, 2], th.tensor([0.0, 1.0, 1.5]))
+
+
+def test_normalization_by_the_demonstrations_needs_them_and_the_features() -> None:
+    with pytest.raises(ValueError, match="observation_normalization='demonstrations' needs demonstrations="):
+        TD3Demo("MlpPolicy", "Pendulum-v1", **SMALL, observation_normalization="demonstrations").learn(1)
+    own = {"policy_kwargs": {"net_arch": [8], "features_extractor_class": FlattenExtractor}}
+    with pytest.raises(ValueError, match="features extractor itself: use 'none', or leave features_extractor_class"):
+        TD3Demo("MlpPolicy", "Pendulum-v1", **{**SMALL, **own}, observation_normalization="demonstrations")
+    env = VecNormalize(make_vec_env("Pendulum-v1"))
+    with pytest.raises(ValueError, match="observation_normalization='demonstrations' needs observations that stay"):
+        TD3Demo(
+            "MlpPolicy", env, **SMALL, demonstrations=record("Pendulum-v1"), observation_normalization="demonstrations"
+        ).learn(1)
 
 
 def test_a_start_from_behavior_cloning_acts_as_demonstrated() -> None:

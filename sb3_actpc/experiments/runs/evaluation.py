@@ -81,7 +81,7 @@ class EpisodeStatistics:
 
     dense_returns: np.ndarray  # sums of ``info["dense_reward"]`` (of the reward, where the environment does not report it)
     returns: np.ndarray  # sums of the reward
-    successes: np.ndarray  # 1 where the last ``info`` reports it, 0 where it reports none, NaN where it reports neither
+    successes: np.ndarray  # 1 or 0 as the last ``info`` reports it, NaN where it does not
     lengths: np.ndarray  # steps
     stages: list[str]  # ``info["stage"]`` at the end of each, "" where the environment does not report it
 
