@@ -47,6 +47,7 @@ OTHERS = {
     "LOGO": "logo",
     "BC-RNN": "bc_rnn",
 }
+CLONE_FIRST = ("ibrl", "td3_bc", "ddpg_demo")  # evaluated at step 0 before their BC, with the version that was measured
 REPORTED = ("Hopper-suboptimal", "Walker2d-suboptimal", "Swimmer-suboptimal", "Walker2d")  # no settings were chosen on them
 
 
@@ -85,6 +86,7 @@ def others_table(others: Results, short: Results, task: str) -> list[str]:
             cells = [spread(groups[variant]["return"]), *[""] * (len(SHORT) - 1)]
         else:
             cells = [spread(others.at_step(groups[variant], "return", step)) for step in SHORT]
+            cells[0] = "" if variant in CLONE_FIRST else cells[0]
         rows.append([policy, str(len(groups[variant])), *cells])
     cloned = short.groups(task)["bc"]
     cloned = cloned[cloned["seed"].isin(seeds)]
