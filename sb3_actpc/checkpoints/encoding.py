@@ -48,6 +48,11 @@ def _class_name(value: Any) -> str:
     return type(value.bit_generator if isinstance(value, np.random.Generator) else value).__qualname__
 
 
+def _module_of(thing: Any) -> str:
+    """Types of C libraries, such as Box2D's, may have none."""
+    return getattr(thing, "__module__", None) or "builtins"
+
+
 def _name_of(thing: Any) -> str:
     """What a function, a class or a module goes by, and others by their class."""
     thing = thing.func if isinstance(thing, functools.partial) else thing
@@ -55,14 +60,14 @@ def _name_of(thing: Any) -> str:
         return thing.__name__
     thing = thing if hasattr(thing, "__qualname__") else type(thing)
     line = f":{thing.__code__.co_firstlineno}" if isinstance(thing, types.FunctionType) else ""
-    return f"{thing.__module__}.{thing.__qualname__}{line}"
+    return f"{_module_of(thing)}.{thing.__qualname__}{line}"
 
 
 def _is_plain(value: Any) -> bool:
     """Whether an object holds nothing but its attributes, by what Python's ``copy`` would do. Those of Python's own library
     may stand for processes or files."""
     kind = type(value)
-    is_of_python = kind.__module__.partition(".")[0] in sys.stdlib_module_names
+    is_of_python = _module_of(kind).partition(".")[0] in sys.stdlib_module_names
     copies_itself = any(getattr(kind, name, None) is not getattr(object, name, None) for name in _COPIED_BY)
     if is_of_python or copies_itself or not hasattr(value, "__dict__"):
         return False

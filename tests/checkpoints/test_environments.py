@@ -49,6 +49,18 @@ class Scale:
         return float(reward) + 0.01 * self.calls
 
 
+class WithoutModule(type):
+    """The type of a class that says not where it is from, as those of SWIG's libraries (Box2D)."""
+
+    @property
+    def __module__(cls) -> str:  # type: ignore[override]
+        raise AttributeError("__module__")
+
+
+class Pointer(metaclass=WithoutModule):
+    __slots__ = ()
+
+
 class StagedEnv(CountingEnv):
     """Its behaviour is one of its methods, and a function."""
 
@@ -91,10 +103,11 @@ def test_values_come_back_with_their_types_and_are_shared_as_they_were() -> None
     assert inner.two.random() == np.random.RandomState(3).random()
 
 
-LOST = [lambda reward: 2.0 * reward, abs, Scale, Scale(), iter([1]), np.array(["a"]), CountingEnv()]
+LOST = [lambda reward: 2.0 * reward, abs, Scale, Scale(), iter([1]), np.array(["a"]), CountingEnv(), Pointer()]
+KINDS = ["function", "builtin", "class", "object", "iterator", "texts", "environment", "pointer"]
 
 
-@pytest.mark.parametrize("held", LOST, ids=["function", "builtin", "class", "object", "iterator", "texts", "environment"])
+@pytest.mark.parametrize("held", LOST, ids=KINDS)
 def test_what_calls_for_code_is_lost_unless_the_new_environment_has_the_same(held: Any) -> None:
     for score in (held, [held]):
         assert "StagedEnv.score: " in go_on(StagedEnv, lambda env: setattr(env, "score", score))[1]  # noqa: B023
