@@ -22,6 +22,7 @@ from sb3_actpc.actpc.validation import check_step
 from sb3_actpc.demonstrations.dataset import Demonstrations
 from sb3_actpc.demonstrations.recording import ENDLESS
 from sb3_actpc.guidance import ActorGuidance
+from sb3_actpc.guidance.behavior_cloning import add_noise
 from sb3_actpc.ngc import HebbianChanges, settle_coupled
 from sb3_actpc.utils.arguments import (
     MAX_SEED,
@@ -323,7 +324,7 @@ class ActPC(ActPCBase):
         imitation_weight = self.refresh_weight * self.actor_guidance.imitation_weight(self._n_updates)
         if imitation_weight and self.imitated_episodes():
             features, actions, memory = self.sample_imitated(len(batch.features))
-            chain = self.actor.circuit.chain(features, memory)
+            chain = self.actor.circuit.chain(add_noise(features, self.actor_guidance.input_noise), memory)
             filtered_weight = self.actor_guidance.filtered_weight(self._n_updates)
             if self.has_critic_term and filtered_weight < 1.0:
                 actions = self.q_filter(features, actions, chain.output, filtered_weight)

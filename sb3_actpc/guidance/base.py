@@ -39,6 +39,7 @@ class ActorGuidance:
 
     weighting: Literal["returns", "uniform"] = "uniform"  # how imitated steps are drawn
     stores: Literal["positive", "best"] = "best"  # which episodes enter the self-imitation memory
+    input_noise = 0.0  # standard deviation of noise on the features of imitated steps
     has_gate = False
     bc_residual: float | None = None  # error of BC, as a share of the actions' variance; an agent saves it
 

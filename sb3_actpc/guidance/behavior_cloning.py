@@ -2,6 +2,8 @@
 
 from collections.abc import Callable
 
+import torch as th
+
 from sb3_actpc.guidance.base import ImitationBatch
 from sb3_actpc.ngc import NGCCircuit
 
@@ -11,13 +13,27 @@ SMALLEST_VARIANCE = 1e-12
 LEARNING_RATES = (1e-3, 5e-5)  # first and last; the rate falls geometrically
 
 
-def clone_behavior(actor: NGCCircuit, sample: Callable[[int], ImitationBatch], n_updates: int) -> float:
+def add_noise(features: th.Tensor, standard_deviation: float) -> th.Tensor:
+    """Imitation at points around the demonstrated ones: training with noisy inputs penalizes steep policies (Bishop, Neural
+    Computation 1995).
+
+    :param features: (B, n_features), normalized
+    :param standard_deviation: of the Gaussian noise; 0 for none
+    :return: (B, n_features)
+    """
+    return features + standard_deviation * th.randn_like(features) if standard_deviation else features
+
+
+def clone_behavior(
+    actor: NGCCircuit, sample: Callable[[int], ImitationBatch], n_updates: int, input_noise: float = 0.0
+) -> float:
     """
     Train ``actor`` on imitated steps with a falling learning rate. Its optimizer's moments are dropped afterwards.
 
     :param actor: changed in place; has an optimizer
     :param sample: draws a batch of so many steps
     :param n_updates: updates
+    :param input_noise: standard deviation of Gaussian noise on the features
     :return: mean squared error of the trained actor's actions, as a share of the variance of the imitated ones
     """
     first, last = LEARNING_RATES
@@ -27,7 +43,8 @@ def clone_behavior(actor: NGCCircuit, sample: Callable[[int], ImitationBatch], n
         for group, own in zip(actor.optimizer.param_groups, actor.parameter_groups(rate), strict=True):
             group["lr"] = own["lr"]
         features, actions, memory = sample(BATCH_SIZE)
-        actor.apply_changes(actor.hebbian_update(actor.settle(features, actions, memory)))
+        state = actor.settle(add_noise(features, input_noise), actions, memory)
+        actor.apply_changes(actor.hebbian_update(state))
     for group, rate in zip(actor.optimizer.param_groups, rates, strict=True):
         group["lr"] = rate
     actor.optimizer.state.clear()

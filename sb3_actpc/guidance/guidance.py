@@ -10,7 +10,7 @@ from sb3_actpc.guidance.base import ActorGuidance, GuidanceContext
 from sb3_actpc.guidance.behavior_cloning import clone_behavior
 from sb3_actpc.guidance.policy_selection import PolicySelection
 from sb3_actpc.ngc import NGCCircuit
-from sb3_actpc.utils.arguments import Count, Share, check_value
+from sb3_actpc.utils.arguments import Count, Share, Weight, check_value
 from sb3_actpc.utils.checks import Settings
 
 
@@ -20,6 +20,8 @@ class GuidanceConfig:
     Every constant of the default guidance; ``guidance_kwargs`` sets them.
 
     :param bc_updates: BC updates of the actor before learning
+    :param input_noise: standard deviation of Gaussian noise on the normalized observations of imitated steps, in BC and later.
+        For few demonstrations of slow tasks (robosuite: 0.3); fast unstable ones, such as the Hopper, need 0
     :param critic_warmup: updates before the critic term reaches the actor: the critic first learns from the BC policy's own
         episodes (WSRL, arXiv 2412.07762, warms up on 5,000 such steps)
     :param q_filter: after the warm-up, imitate less where the critics value the actor's own action more (Nair et al., arXiv
@@ -37,6 +39,7 @@ class GuidanceConfig:
     """
 
     bc_updates: Count = 3000
+    input_noise: Weight = 0.0
     critic_warmup: Count = 6000
     q_filter: bool = True
     filter_residual: Share = 0.01
@@ -61,6 +64,7 @@ class BehaviorGuidance(ActorGuidance):
     def __init__(self, config: GuidanceConfig) -> None:
         self.config = config
         self.weighting = config.weighting
+        self.input_noise = config.input_noise
         self.has_gate = config.gate
         self.selection: PolicySelection | None = None
         self.copied_at = config.critic_warmup  # update of the last copy of the average
@@ -74,7 +78,7 @@ class BehaviorGuidance(ActorGuidance):
             self.selection = PolicySelection(context.n_envs, self.config.evaluation_share)
         if not imitates or context.sample is None:
             return
-        self.bc_residual = clone_behavior(context.actor, context.sample, self.config.bc_updates)
+        self.bc_residual = clone_behavior(context.actor, context.sample, self.config.bc_updates, self.input_noise)
         copies = [*context.targets, *(context.selection_circuits or {}).values()]
         for circuit in copies:
             circuit.move_towards(context.actor, 1.0)

@@ -146,6 +146,24 @@ def test_bc_measures_how_much_of_the_demonstrated_actions_it_leaves_unexplained(
     assert guidance.bc_residual == pytest.approx(expected, rel=0.3, abs=0.1)
 
 
+@pytest.mark.parametrize("noise", [0.0, 1.0])
+@pytest.mark.parametrize("settings", [{"bc_updates": 1000}, {"bc_updates": 0}], ids=["BC", "imitation while learning"])
+def test_noise_on_the_inputs_flattens_the_policy_as_theory_says(noise, settings):
+    """Of standard normal x, seen with Gaussian noise, the best prediction of c x is c (x + noise) / (1 + its variance)."""
+    rng = np.random.default_rng(0)
+    data = demonstrations(n_episodes=40)
+    observations = rng.normal(size=data.observations.shape).astype(np.float32)
+    demonstrated = dataclasses.replace(data, observations=observations, actions=0.4 * observations[:, :2])
+    guidance_kwargs = {**settings, "input_noise": noise}
+    model = imitating(demonstrations=demonstrated, guidance_kwargs=guidance_kwargs, critic_weight=0.0, learning_rate=1e-3)
+    model.learn(1)
+    if not settings["bc_updates"]:
+        model.train(2000, 64)
+    actions = model.actor.circuit.project(model.actor.features(th.as_tensor(observations))).numpy()
+    slope = (actions * observations[:, :2]).sum() / np.square(observations[:, :2]).sum()  # of actions in [-1, 1], not [-2, 2]
+    assert slope == pytest.approx(0.2 / (1 + noise**2), rel=0.15)
+
+
 def test_a_filter_of_some_weight_pulls_part_of_the_way():
     model = imitating()
     model.learn(10)
