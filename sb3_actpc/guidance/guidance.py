@@ -21,7 +21,8 @@ class GuidanceConfig:
 
     :param bc_updates: BC updates of the actor before learning
     :param input_noise: standard deviation of Gaussian noise on the normalized observations of imitated steps, in BC and later.
-        For few demonstrations of slow tasks (robosuite: 0.3); fast unstable ones, such as the Hopper, need 0
+        It helps where observations are redundant (robosuite: 0.3) and harms where actions depend on small differences
+        (Hopper, insertion)
     :param critic_warmup: updates before the critic term reaches the actor: the critic first learns from the BC policy's own
         episodes (WSRL, arXiv 2412.07762, warms up on 5,000 such steps)
     :param q_filter: after the warm-up, imitate less where the critics value the actor's own action more (Nair et al., arXiv
