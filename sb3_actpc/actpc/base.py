@@ -469,6 +469,8 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
         has changed."""
         weights = self.used_weights
         demonstrations = "none" if self.expert is None else repr(self.expert.demonstrations)
+        if self.expert is not None and self.expert.failure_reward:
+            demonstrations += f", returns counted from {self.expert.failure_reward:g} per step (failure)"
         return (
             f"reward: {weights.task:g} x task + {weights.epistemic:g} x epistemic + {weights.instrumental:g} x instrumental "
             "signal (reward_weights)\n"

@@ -167,7 +167,8 @@ class BehaviorGuidance(ActorGuidance):
         """One line."""
         gate = "deployment gate on" if self.has_gate else "no deployment gate"
         config = self.config
-        return f"guidance: {config.bc_updates} BC updates, {config.critic_warmup} updates of critic warm-up, {gate}"
+        noise = f" with input noise of {config.input_noise:g}" if config.input_noise else ""
+        return f"guidance: {config.bc_updates} BC updates{noise}, {config.critic_warmup} updates of critic warm-up, {gate}"
 
     def state_dict(self) -> dict[str, Any]:
         """The gate's fields, and the residual of BC."""

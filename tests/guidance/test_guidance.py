@@ -121,6 +121,7 @@ def test_the_rewards_of_failure_and_success_do_not_change_what_is_imitated(failu
         DummyVecEnv([own]), demonstrations=dataclasses.replace(data, rewards=rewards), guidance_kwargs={"bc_updates": 5}
     )
     model.learn(20)
+    assert (f"returns counted from {failure:g} per step" in model.describe()) == (failure < 0.0)
     memory = model.replay_buffer.self_imitation
     assert memory.lengths == [5, 5] and memory.returns == pytest.approx([success - failure] * 2)
     weights = np.repeat([12.0**4, 4.0**4, 0.0, 1.0], [20, 20, 20, 10])
@@ -160,6 +161,7 @@ def test_noise_on_the_inputs_flattens_the_policy_as_theory_says(noise, settings)
     if not settings["bc_updates"]:
         model.train(2000, 64)
     actions = model.actor.circuit.project(model.actor.features(th.as_tensor(observations))).numpy()
+    assert ("input noise of 1," in model.describe()) == (noise == 1.0)
     slope = (actions * observations[:, :2]).sum() / np.square(observations[:, :2]).sum()  # of actions in [-1, 1], not [-2, 2]
     assert slope == pytest.approx(0.2 / (1 + noise**2), rel=0.15)
 
