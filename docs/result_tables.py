@@ -75,7 +75,7 @@ def table(results: Results, task: str, steps: Sequence[int]) -> list[str]:
 def others_table(others: Results, short: Results, task: str) -> list[str]:
     """Lines of the table of the other baselines, and of ActPC, RLPD and BC with the same seeds."""
     groups = others.groups(task)
-    seeds = set(groups["no_gate"]["seed"])
+    seeds = set(groups["ibrl"]["seed"])
     rows = []
     for policy, (variant, measure) in POLICIES.items():
         runs = short.groups(task)[variant]
