@@ -27,7 +27,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except Exception as error:
         import gymnasium as gym
 
-        if args.debug or not isinstance(error, (ValueError, OSError, ImportError, NotImplementedError, gym.error.Error)):
+        if args.debug or not isinstance(error, (ValueError, OSError, ImportError, gym.error.Error)):
             raise
         print(f"sb3-actpc: error: {' '.join(str(error).split()) or type(error).__name__}", file=sys.stderr)
         return 2

@@ -24,9 +24,7 @@ def add_noise(features: th.Tensor, standard_deviation: float) -> th.Tensor:
     return features + standard_deviation * th.randn_like(features) if standard_deviation else features
 
 
-def clone_behavior(
-    actor: NGCCircuit, sample: Callable[[int], ImitationBatch], n_updates: int, input_noise: float = 0.0
-) -> float:
+def clone_behavior(actor: NGCCircuit, sample: Callable[[int], ImitationBatch], n_updates: int, input_noise: float) -> float:
     """
     Train ``actor`` on imitated steps with a falling learning rate. Its optimizer's moments are dropped afterwards.
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import gymnasium as gym
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.preprocessing import check_for_nested_spaces
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_actpc.envs import register_envs
@@ -18,13 +19,20 @@ MAX_EVALUATION_ENVS = 10
 
 
 def make_env(env_id: str, env_kwargs: Mapping[str, Any], render_mode: str | None = None) -> gym.Env[Any, Any]:
-    """Make an environment, this package's tasks included; ValueError when it does not take the keywords."""
+    """Make an environment, this package's tasks included; ValueError when it does not take the keywords, or SB3 not its
+    observations."""
     register_tasks(env_id)
     options = dict(env_kwargs) if render_mode is None else {**env_kwargs, "render_mode": render_mode}
     try:
-        return gym.make(env_id, **options)
+        env = gym.make(env_id, **options)
     except TypeError as error:
         raise ValueError(f"{env_id}: {error}") from error
+    try:
+        check_for_nested_spaces(env.observation_space)
+    except NotImplementedError as error:
+        env.close()
+        raise ValueError(f"{env_id}: {error} Register it with gymnasium.wrappers.FlattenObservation around it") from error
+    return env
 
 
 def make_eval_envs(env_id: str, env_kwargs: Mapping[str, Any], n_episodes: int) -> list[gym.Env[Any, Any]]:

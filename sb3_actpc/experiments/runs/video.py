@@ -96,13 +96,15 @@ def _rendering(env_id: str, env_kwargs: dict[str, Any]) -> Iterator[Any]:
         try:
             env = make_env(env_id, env_kwargs, render_mode="rgb_array")
         except ValueError as error:  # it takes no render_mode
-            raise NotImplementedError(str(error)) from error
+            raise RenderingUnavailable(str(error)) from error
         with contextlib.closing(env):
             if env.render_mode is None:
-                raise NotImplementedError(f"{env_id} takes render_mode and does not keep it")
+                raise RenderingUnavailable(f"{env_id} takes render_mode and does not keep it")
             if not CAMERA_KEYWORDS & env_kwargs.keys():
                 _follow_robot(env.unwrapped)
             yield env
+    except RenderingUnavailable:
+        raise
     except (FatalError, gym.error.Error, ImportError, OSError, RuntimeError, AttributeError) as error:
         raise RenderingUnavailable(f"{type(error).__name__}: {error}") from error
 
@@ -129,5 +131,5 @@ def _play(model: Any, env: Any, seed: int, n_frames: int) -> list[np.ndarray]:
     play_episodes(model, [collection], 1, seed)
     frames: list[Any] = collection.render()[:n_frames]
     if not all(isinstance(frame, np.ndarray) for frame in frames):
-        raise NotImplementedError(f"the environment renders {type(frames[0]).__name__}, not an image")
+        raise RenderingUnavailable(f"the environment renders {type(frames[0]).__name__}, not an image")
     return frames
