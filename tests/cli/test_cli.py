@@ -249,7 +249,7 @@ def test_evaluate_replays_a_run_and_writes_a_video(capsys: pytest.CaptureFixture
         ([*PLAIN, "--env-kwarg", "gain=.nan"], "environment: info['dense_reward'] is nan: check the environment"),
         (["train", "--env", "Own-v0", "--gym-packages", "no_such_task"], "No module named 'no_such_task'"),
         (["train", "--env", "CartPole-v1", "--algo", "td3", "--preset", "small.yml"], "only supports"),
-        (["train", "--env", "gymnasium_robotics:FrankaKitchen-v1"], "Nested observation spaces are not supported"),
+        (["train", "--env", "FrankaKitchen-v1"], "Nested observation spaces are not supported"),
         (["compare", "nowhere.yml"], "no comparison file at nowhere.yml"),
         (["evaluate", "nowhere"], "no run in nowhere: config.json is missing"),
         (["evaluate", "nowhere", "--video", "film.avi"], "must end in .mp4 or .gif"),
