@@ -40,9 +40,13 @@ def run(args: argparse.Namespace) -> int:
     ours, rest = parser.parse_known_args(args.arguments)
     module, _, name = SCRIPTS[args.zoo_command].partition(":")
     function = getattr(import_extra(f"rl_zoo3.{module}", "zoo"), name)
+    given = sys.argv
     with tempfile.TemporaryDirectory(prefix="sb3_actpc_zoo_") as folder:
         sys.argv = [f"sb3-actpc zoo {args.zoo_command}", *_arguments(args.zoo_command, ours, rest, Path(folder))]
-        function()
+        try:
+            function()
+        finally:
+            sys.argv = given
     if ours.output is not None:
         import_extra("matplotlib.pyplot", "experiments").savefig(ours.output)
         print(f"written to {ours.output}")

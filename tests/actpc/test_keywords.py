@@ -7,7 +7,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from sb3_actpc import ActPC
 from sb3_actpc.utils.settings import constructor_settings
 from tests.actpc.agents import SMALL, make
-from tests.actpc.envs import CountingEnv
+from tests.actpc.envs import CountingEnv, demonstrations
 
 
 def test_numpys_numbers_are_numbers():
@@ -41,3 +41,24 @@ def test_a_buffer_must_fit_the_observations(kind, dict_observations):
 def test_a_buffer_that_keeps_no_signals_is_named():
     with pytest.raises(ValueError, match=r"replay_buffer_class=.* must be None, one of .* or a subclass of ActPC's own"):
         make(replay_buffer_class=type("Mine", (ReplayBuffer,), {}))
+
+
+@pytest.mark.parametrize(
+    ("settings", "imitates"), [({}, False), ({"replay_buffer_kwargs": {"self_imitation_size": 50}}, True)]
+)
+def test_without_demonstrations_an_agent_imitates_its_own_episodes_only_if_told_to(settings, imitates):
+    learned = [
+        ActPC("MlpPolicy", CountingEnv(), learning_starts=4, batch_size=8, refresh_weight=weight, seed=0, **settings).learn(60)
+        for weight in (0.0, 1.0)
+    ]
+    actions = [model.predict(np.eye(3, dtype=np.float32))[0] for model in learned]
+    assert np.array_equal(*actions) != imitates
+
+
+def test_returns_have_three_steps_unless_something_needs_one():
+    assert (
+        ActPC("MlpPolicy", CountingEnv()).n_steps
+        == ActPC("MlpPolicy", CountingEnv(), demonstrations=demonstrations()).n_steps
+        == 3
+    )
+    assert ActPC("MlpPolicy", CountingEnv(), target_policy_noise=None).n_steps == 1

@@ -20,7 +20,8 @@ def assert_one_step_each(buffer):
 def test_a_callback_that_stops_at_the_end_of_an_episode_loses_nothing(is_truncated, normalizes):
     """The example of SB3 issue 2056: one ``learn`` per episode."""
     env = DummyVecEnv([lambda: CountingEnv(lengths=(7, 8), returns=(1.0,), cut=(is_truncated,))])
-    model = ActPC("MlpPolicy", VecNormalize(env) if normalizes else env, learning_starts=5, batch_size=8, seed=0)
+    settings = {"learning_starts": 5, "batch_size": 8, "replay_buffer_kwargs": {"self_imitation_size": 100}}
+    model = ActPC("MlpPolicy", VecNormalize(env) if normalizes else env, seed=0, **settings)
     for _ in range(6):
         model.learn(1000, callback=StopTrainingOnMaxEpisodes(1), reset_num_timesteps=False)
     buffer = model.replay_buffer
