@@ -48,6 +48,9 @@ OTHERS = {
     "BC-RNN": "bc_rnn",
 }
 CLONE_FIRST = ("ibrl", "td3_bc", "ddpg_demo")  # evaluated at step 0 before their BC, with the version that was measured
+# dense rewards without demonstrations: name of a row -> variant, and task -> the steps of its table
+DENSE = {"ActPC": "actpc", "TD3": "TD3", "SAC": "SAC"}
+DENSE_STEPS = {"HalfCheetah-v5": LONG, "Hopper-v5": LONG, "Pendulum-v1": (2_000, 4_000, 6_000, 8_000, 10_000)}
 REPORTED = ("Hopper-suboptimal", "Walker2d-suboptimal", "Swimmer-suboptimal", "Walker2d")  # no settings were chosen on them
 
 
@@ -92,6 +95,17 @@ def others_table(others: Results, short: Results, task: str) -> list[str]:
     cloned = cloned[cloned["seed"].isin(seeds)]
     rows.append(["plain BC", str(len(cloned)), spread(cloned["return"]), *[""] * (len(SHORT) - 1)])
     return lines_of(["steps", "seeds", *(f"{step:,}" for step in SHORT)], rows)
+
+
+def dense_table(results: Results, task: str) -> list[str]:
+    """Lines of the table of a task with dense rewards: returns at the steps, over seeds."""
+    groups = results.groups(task)
+    steps = DENSE_STEPS[task]
+    rows = [
+        [name, str(len(groups[variant])), *(spread(results.at_step(groups[variant], "return", step)) for step in steps)]
+        for name, variant in DENSE.items()
+    ]
+    return lines_of(["steps", "seeds", *(f"{step:,}" for step in steps)], rows)
 
 
 def improvement(results: Results, policy: str, step: int, tasks: Sequence[str]) -> str:
@@ -179,6 +193,9 @@ def tables() -> dict[str, list[str]]:
     others, short = load_results(FOLDER / "baselines_10000"), load_results(FOLDER / "steps_10000")
     for task in ("Hopper-suboptimal", "Walker2d-suboptimal"):
         found[f"baselines_10000: {task}"] = others_table(others, short, task)
+    dense = load_results(FOLDER / "dense_50000")
+    for task in DENSE_STEPS:
+        found[f"dense_50000: {task}"] = dense_table(dense, task)
     long_runs = load_results(FOLDER / "steps_50000")
     found["steps_50000: steadiness"] = steadiness(long_runs, STEPS["steps_50000"], 15_000, 700)
     found["summary"] = summary(*(load_results(FOLDER / folder) for folder in STEPS))
@@ -191,3 +208,4 @@ if __name__ == "__main__":
     long_runs = load_results(FOLDER / "steps_50000")
     for task in STEPS["steps_50000"]:
         draw_curves(long_runs, task, FOLDER.with_name("_static") / f"{task}.png")
+    draw_curves(load_results(FOLDER / "dense_50000"), "HalfCheetah-v5", FOLDER.with_name("_static") / "HalfCheetah-v5.png")

@@ -311,7 +311,8 @@ def test_demonstrations_that_come_later_warn_of_what_stays(is_loaded, tmp_path):
 
 
 def test_without_demonstrations_there_is_no_bc_of_own_episodes():
-    model = make(guidance="default", guidance_kwargs={"bc_updates": 500}, learning_starts=0)
+    settings = {"guidance_kwargs": {"bc_updates": 500}, "replay_buffer_kwargs": {"self_imitation_size": 100}}
+    model = make(guidance="default", learning_starts=0, **settings)
     model.learn(80)
     assert model.imitated_episodes()
     before = weights_of(model.actor.circuit)
