@@ -60,6 +60,7 @@ class ActPC(ActPCBase):
     keyword                                demonstrations without
     ====================================== ============== =======
     ``learning_starts``                    0              100
+    ``n_steps``                            3              1
     ``self_imitation_size`` (buffer's)     100,000        0
     ``demonstration_fraction``             0.5            0
     ``observation_normalization``          demonstrations none
@@ -80,7 +81,7 @@ class ActPC(ActPCBase):
     :param replay_buffer_class: None, or one of SB3's classes or its name (its ActPC counterpart is used)
     :param replay_buffer_kwargs: keywords of :class:`~sb3_actpc.actpc.buffers.SignalReplay` and of SB3's class
     :param optimize_memory_usage: as in SB3; not with an epistemic weight, as the generator learns where every step led
-    :param n_steps: length of n-step returns; by default 3, but 1 with hindsight, ``optimize_memory_usage`` or
+    :param n_steps: length of n-step returns; 1 by default with hindsight, ``optimize_memory_usage`` or
         ``target_policy_noise=None``
     :param settling: "scheduled" (one ordered sweep of the errors, Z-IL) or "iterative" (settle, then change; with
         ``circuit_kwargs=dict(dynamics="state")`` the paper's K steps of eq. 1)
@@ -159,7 +160,7 @@ class ActPC(ActPCBase):
         if learning_starts is None:
             learning_starts = 0 if has_demonstrations else 100
         if n_steps is None:
-            n_steps = 1 if is_one_step else 3
+            n_steps = 3 if has_demonstrations and not is_one_step else 1
         if demonstration_fraction is None:
             demonstration_fraction = 0.5 if has_demonstrations else 0.0
         if observation_normalization is None:

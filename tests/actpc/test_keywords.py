@@ -7,7 +7,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from sb3_actpc import ActPC
 from sb3_actpc.utils.settings import constructor_settings
 from tests.actpc.agents import SMALL, make
-from tests.actpc.envs import CountingEnv, demonstrations
+from tests.actpc.envs import CountingEnv
 
 
 def test_numpys_numbers_are_numbers():
@@ -53,12 +53,3 @@ def test_without_demonstrations_an_agent_imitates_its_own_episodes_only_if_told_
     ]
     actions = [model.predict(np.eye(3, dtype=np.float32))[0] for model in learned]
     assert np.array_equal(*actions) != imitates
-
-
-def test_returns_have_three_steps_unless_something_needs_one():
-    assert (
-        ActPC("MlpPolicy", CountingEnv()).n_steps
-        == ActPC("MlpPolicy", CountingEnv(), demonstrations=demonstrations()).n_steps
-        == 3
-    )
-    assert ActPC("MlpPolicy", CountingEnv(), target_policy_noise=None).n_steps == 1
