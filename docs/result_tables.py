@@ -208,4 +208,3 @@ if __name__ == "__main__":
     long_runs = load_results(FOLDER / "steps_50000")
     for task in STEPS["steps_50000"]:
         draw_curves(long_runs, task, FOLDER.with_name("_static") / f"{task}.png")
-    draw_curves(load_results(FOLDER / "dense_50000"), "HalfCheetah-v5", FOLDER.with_name("_static") / "HalfCheetah-v5.png")
