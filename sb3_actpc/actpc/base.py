@@ -239,8 +239,9 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
             self.was_made_without_demonstrations = False  # said once
             warnings.warn(
                 "demonstrations were set after the agent was made without: guidance='none' "
-                f"(no BC pre-training), n_steps={self.n_steps} and demonstration_fraction={self.demonstration_fraction:g} "
-                "stay. For the defaults with demonstrations, pass demonstrations= to the constructor",
+                f"(no BC pre-training), n_steps={self.n_steps}, demonstration_fraction={self.demonstration_fraction:g} and "
+                f"replay_buffer_kwargs={self.replay_buffer_kwargs!r} stay. For the defaults with "
+                "demonstrations, pass demonstrations= to the constructor",
                 stacklevel=5,
             )
         now = self.demonstrations, self.n_demonstrations
