@@ -127,7 +127,8 @@ class DemonstratedAlgorithm(LearnsFromDemonstrations, StoresLastTransition):
     :param args: policy and env, as SB3's
     :param demonstration_fraction: share of each batch that comes from the demonstrations; without them it has no effect
     :param options: keywords of :class:`LearnsFromDemonstrations` and of the algorithm
-    :raises ValueError: as there, for a share out of range, and for a ``replay_buffer_class``
+    :raises ValueError: as there, for a share out of range, for a ``replay_buffer_class``, and for n-step returns of Dict
+        observations
     """
 
     replay_buffer: DemonstrationReplayBuffer
@@ -141,6 +142,8 @@ class DemonstratedAlgorithm(LearnsFromDemonstrations, StoresLastTransition):
         self._check_actions()
         if self.replay_buffer_class is not None:
             raise ValueError(f"replay_buffer_class={self.replay_buffer_class!r} must be None; for hindsight replay use HER")
+        if self.n_steps > 1 and isinstance(self.observation_space, spaces.Dict):
+            raise ValueError(f"n_steps={self.n_steps} must be 1 with Dict observations: SB3 has no n-step returns for them")
         buffer = self.replay_buffer = self._make_replay_buffer()
         super()._setup_model()
         # SB3 replaces None by its own default, and SBX makes a buffer of its own

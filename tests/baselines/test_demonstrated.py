@@ -106,6 +106,11 @@ def test_a_loaded_agent_takes_another_length_of_returns(tmp_path) -> None:
         assert (buffer.n_steps, buffer.gamma) == (5, 0.9)
 
 
+def test_n_step_returns_of_dict_observations_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"n_steps=3 must be 1 with Dict observations"):
+        TD3Demo("MultiInputPolicy", "GoalReacher-v5", n_steps=3)
+
+
 class WithActions(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]):
     """Pendulum with another action space."""
 
