@@ -41,6 +41,7 @@ NAMES = {
 OTHERS = {
     "ActPC without the gate": "no_gate",
     "imitation only": "imitation_only",
+    "RLPD, ten critics, ten updates per step": "rlpd_utd10",
     "IBRL": "ibrl",
     "TD3+BC": "td3_bc",
     "DDPG-Demo": "ddpg_demo",
@@ -51,6 +52,8 @@ CLONE_FIRST = ("ibrl", "td3_bc", "ddpg_demo")  # evaluated at step 0 before thei
 # dense rewards without demonstrations: name of a row -> variant
 DENSE = {"ActPC, `n_steps=3`": "actpc", "TD3": "TD3", "SAC": "SAC"}
 DENSE_TASKS = ("HalfCheetah-v5", "Hopper-v5")
+FETCH = {**POLICIES, "HER": ("her", "success")}  # success instead of returns
+FETCH_STEPS = (0, 5_000, 10_000, 15_000, 20_000)
 REPORTED = ("Hopper-suboptimal", "Walker2d-suboptimal", "Swimmer-suboptimal", "Walker2d")  # no settings were chosen on them
 
 
@@ -95,6 +98,22 @@ def others_table(others: Results, short: Results, task: str) -> list[str]:
     cloned = cloned[cloned["seed"].isin(seeds)]
     rows.append(["plain BC", str(len(cloned)), spread(cloned["return"]), *[""] * (len(SHORT) - 1)])
     return lines_of(["steps", "seeds", *(f"{step:,}" for step in SHORT)], rows)
+
+
+def success_table(results: Results, task: str) -> list[str]:
+    """Lines of the table of a Fetch task: success of every seed at the steps."""
+    groups = results.groups(task)
+
+    def listed(values: pd.Series) -> str:
+        return ", ".join(f"{value:.2f}" for value in values)
+
+    rows = []
+    for policy, (variant, measure) in FETCH.items():
+        if variant in groups:
+            column = measure.replace("return", "success")
+            rows.append([policy, *(listed(results.at_step(groups[variant], column, step)) for step in FETCH_STEPS)])
+    rows.append(["plain BC", listed(groups["bc"]["success"]), *[""] * (len(FETCH_STEPS) - 1)])
+    return lines_of(["steps", *(f"{step:,}" for step in FETCH_STEPS)], rows)
 
 
 def dense_table(results: Results, task: str) -> list[str]:
@@ -196,6 +215,9 @@ def tables() -> dict[str, list[str]]:
     dense = load_results(FOLDER / "dense_50000")
     for task in DENSE_TASKS:
         found[f"dense_50000: {task}"] = dense_table(dense, task)
+    fetch = load_results(FOLDER / "fetch_20000")
+    for task in ("FetchPickAndPlace-v4", "FetchPush-v4"):
+        found[f"fetch_20000: {task}"] = success_table(fetch, task)
     long_runs = load_results(FOLDER / "steps_50000")
     found["steps_50000: steadiness"] = steadiness(long_runs, STEPS["steps_50000"], 15_000, 700)
     found["summary"] = summary(*(load_results(FOLDER / folder) for folder in STEPS))

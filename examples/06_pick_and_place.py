@@ -44,6 +44,7 @@ def success(model: ActPC) -> float:
 
 shown = Demonstrations.record(pick_and_place, ENV_ID, n_episodes=N_EPISODES, seed=1000)
 print(shown)
+shown.save("pick.npz")
 hindsight = {"replay_buffer_class": "HerReplayBuffer"}
 model = ActPC("MultiInputPolicy", ENV_ID, demonstrations=shown, gamma=0.95, seed=SEED, **hindsight)
 model.learn(1)
