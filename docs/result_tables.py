@@ -100,19 +100,20 @@ def others_table(others: Results, short: Results, task: str) -> list[str]:
     return lines_of(["steps", "seeds", *(f"{step:,}" for step in SHORT)], rows)
 
 
+def listed(values: pd.Series, digits: int) -> str:
+    """The value of every seed."""
+    return ", ".join(f"{value:.{digits}f}" for value in values)
+
+
 def success_table(results: Results, task: str) -> list[str]:
     """Lines of the table of a Fetch task: success of every seed at the steps."""
     groups = results.groups(task)
-
-    def listed(values: pd.Series) -> str:
-        return ", ".join(f"{value:.2f}" for value in values)
-
     rows = []
     for policy, (variant, measure) in FETCH.items():
         if variant in groups:
             column = measure.replace("return", "success")
-            rows.append([policy, *(listed(results.at_step(groups[variant], column, step)) for step in FETCH_STEPS)])
-    rows.append(["plain BC", listed(groups["bc"]["success"]), *[""] * (len(FETCH_STEPS) - 1)])
+            rows.append([policy, *(listed(results.at_step(groups[variant], column, step), 2) for step in FETCH_STEPS)])
+    rows.append(["plain BC", listed(groups["bc"]["success"], 2), *[""] * (len(FETCH_STEPS) - 1)])
     return lines_of(["steps", *(f"{step:,}" for step in FETCH_STEPS)], rows)
 
 
@@ -125,6 +126,16 @@ def dense_table(results: Results, task: str) -> list[str]:
         for name, variant in DENSE.items()
     ]
     return lines_of(["steps", "seeds", *(f"{step:,}" for step in steps)], rows)
+
+
+def many_updates_table(results: Results) -> list[str]:
+    """Lines of the table of SAC with ActPC's updates, without demonstrations: returns of every seed at the steps."""
+    steps = FETCH_STEPS[1:]
+    rows = [
+        [f"`{task}`", *(listed(results.at_step(results.groups(task)["SAC4"], "return", step), 0) for step in steps)]
+        for task in DENSE_TASKS
+    ]
+    return lines_of(["steps", *(f"{step:,}" for step in steps)], rows)
 
 
 def improvement(results: Results, policy: str, step: int, tasks: Sequence[str]) -> str:
@@ -215,6 +226,7 @@ def tables() -> dict[str, list[str]]:
     dense = load_results(FOLDER / "dense_50000")
     for task in DENSE_TASKS:
         found[f"dense_50000: {task}"] = dense_table(dense, task)
+    found["dense_20000"] = many_updates_table(load_results(FOLDER / "dense_20000"))
     fetch = load_results(FOLDER / "fetch_20000")
     for task in ("FetchPickAndPlace-v4", "FetchPush-v4"):
         found[f"fetch_20000: {task}"] = success_table(fetch, task)
