@@ -1,6 +1,6 @@
 """Tables and figures of docs/results.md, from the evaluations in docs/results_data: ``python docs/result_tables.py``."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -54,6 +54,7 @@ DENSE = {"ActPC, `n_steps=3`": "actpc", "TD3": "TD3", "SAC": "SAC"}
 DENSE_TASKS = ("HalfCheetah-v5", "Hopper-v5")
 FETCH = {**POLICIES, "HER": ("her", "success")}  # success instead of returns
 FETCH_STEPS = (0, 5_000, 10_000, 15_000, 20_000)
+DOOR = {"ActPC, moving average": ("imitation", "actor_return"), "ActPC, deployed policy": ("imitation", "return")}
 REPORTED = ("Hopper-suboptimal", "Walker2d-suboptimal", "Swimmer-suboptimal", "Walker2d")  # no settings were chosen on them
 
 
@@ -105,16 +106,15 @@ def listed(values: pd.Series, digits: int) -> str:
     return ", ".join(f"{value:.{digits}f}" for value in values)
 
 
-def success_table(results: Results, task: str) -> list[str]:
-    """Lines of the table of a Fetch task: success of every seed at the steps."""
+def success_table(results: Results, task: str, policies: Mapping[str, tuple[str, str]], steps: Sequence[int]) -> list[str]:
+    """Lines of the table of a task that succeeds or fails: success of every seed at the steps."""
     groups = results.groups(task)
     rows = []
-    for policy, (variant, measure) in FETCH.items():
-        if variant in groups:
-            column = measure.replace("return", "success")
-            rows.append([policy, *(listed(results.at_step(groups[variant], column, step), 2) for step in FETCH_STEPS)])
-    rows.append(["plain BC", listed(groups["bc"]["success"], 2), *[""] * (len(FETCH_STEPS) - 1)])
-    return lines_of(["steps", *(f"{step:,}" for step in FETCH_STEPS)], rows)
+    for policy, (variant, measure) in policies.items():
+        column = measure.replace("return", "success")
+        rows.append([policy, *(listed(results.at_step(groups[variant], column, step), 2) for step in steps)])
+    rows.append(["plain BC", listed(groups["bc"]["success"], 2), *[""] * (len(steps) - 1)])
+    return lines_of(["steps", *(f"{step:,}" for step in steps)], rows)
 
 
 def dense_table(results: Results, task: str) -> list[str]:
@@ -229,7 +229,8 @@ def tables() -> dict[str, list[str]]:
     found["dense_20000"] = many_updates_table(load_results(FOLDER / "dense_20000"))
     fetch = load_results(FOLDER / "fetch_20000")
     for task in ("FetchPickAndPlace-v4", "FetchPush-v4"):
-        found[f"fetch_20000: {task}"] = success_table(fetch, task)
+        found[f"fetch_20000: {task}"] = success_table(fetch, task, FETCH, FETCH_STEPS)
+    found["door_50000"] = success_table(load_results(FOLDER / "door_50000"), "door", DOOR, LONG)
     long_runs = load_results(FOLDER / "steps_50000")
     found["steps_50000: steadiness"] = steadiness(long_runs, STEPS["steps_50000"], 15_000, 700)
     found["summary"] = summary(*(load_results(FOLDER / folder) for folder in STEPS))
