@@ -54,7 +54,11 @@ DENSE = {"ActPC, `n_steps=3`": "actpc", "TD3": "TD3", "SAC": "SAC"}
 DENSE_TASKS = ("HalfCheetah-v5", "Hopper-v5")
 FETCH = {**POLICIES, "HER": ("her", "success")}  # success instead of returns
 FETCH_STEPS = (0, 5_000, 10_000, 15_000, 20_000)
-DOOR = {"ActPC, moving average": ("imitation", "actor_return"), "ActPC, deployed policy": ("imitation", "return")}
+DOOR = {
+    "ActPC, moving average": ("imitation", "actor_return"),
+    "ActPC, deployed policy": ("imitation", "return"),
+    "RLPD, seed 420": ("rlpd", "return"),
+}
 REPORTED = ("Hopper-suboptimal", "Walker2d-suboptimal", "Swimmer-suboptimal", "Walker2d")  # no settings were chosen on them
 
 
