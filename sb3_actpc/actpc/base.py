@@ -159,6 +159,13 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
             needing.append("observation_normalization")
         if needing and self.demonstrations is None:
             raise ValueError(f"{' and '.join(needing)}: give demonstrations=, or leave it out")
+        can_imitate = self.demonstrations is not None or self.replay_buffer_kwargs.get("self_imitation_size") != 0
+        if not self.has_critic_term and not can_imitate:
+            warnings.warn(
+                "critic_weight=0 without demonstrations leaves the actor nothing to learn from: give demonstrations=, or a "
+                "critic_weight above 0",
+                stacklevel=4,
+            )
 
     def _make_policy(self) -> ActPCPolicy:
         if "is_gated" in self.policy_kwargs:

@@ -841,3 +841,9 @@ def test_what_has_no_effect_without_demonstrations_is_named():
         make().learn(5)
     with pytest.warns(UserWarning, match=r"guidance_kwargs=.*have no effect without guidance"):
         make(guidance_kwargs={"gate": False})
+
+
+def test_an_actor_with_nothing_to_learn_from_is_named() -> None:
+    """Without critic term, demonstrations and self-imitation nothing would change."""
+    with pytest.warns(UserWarning, match="critic_weight=0 without demonstrations"):
+        ActPC("MlpPolicy", "Pendulum-v1", critic_weight=0.0)
