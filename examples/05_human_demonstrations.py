@@ -40,7 +40,7 @@ demonstrations = dataclasses.replace(
 demonstrations.save("door.npz")  # sb3-actpc train --env gymnasium_robotics:AdroitHandDoorSparse-v1 --demonstrations door.npz
 print(demonstrations)
 
-# The preset's two values: a critic of 28 action dimensions costs success, so the policy imitates its own successes instead
+# The preset's two values: the critic term costs success for 20,000 steps, so the policy imitates its own successes instead
 model = ActPC("MlpPolicy", ENV_ID, demonstrations=demonstrations, critic_weight=0.0, action_noise=0.03, seed=0)
 for steps in (1, 50_000):
     model.learn(steps, reset_num_timesteps=False)

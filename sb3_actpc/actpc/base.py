@@ -153,7 +153,10 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
                 )
 
     def _check_needs_met(self) -> None:
-        """:raises ValueError: for keywords that say nothing without demonstrations"""
+        """Warns of an actor that nothing teaches.
+
+        :raises ValueError: for keywords that say nothing without demonstrations
+        """
         needing = [name for name in NEED_DEMONSTRATIONS if getattr(self, name)]
         if self.observation_normalization == "demonstrations":
             needing.append("observation_normalization")
