@@ -85,7 +85,6 @@ def save_agent(model: ActPC, path: Path) -> Path:
     if settings["policy"] is None or "policy_kwargs" in settings["unnamed"]:
         raise ValueError(f"{path}: the policy's class or policy_kwargs cannot be written by name; use model.save() instead")
     keywords = {name: settings["keywords"][name] for name in _KEYWORDS}
-    keywords["policy_kwargs"]["dict"].pop("is_gated", None)
     header = {
         "format": FORMAT,
         "settings": {"policy": settings["policy"], "keywords": keywords, "unnamed": []},

@@ -214,6 +214,7 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
             self.replay_buffer.forget_own_episodes()
         if isinstance(self.replay_buffer, HerReplayBuffer):
             assert self.env is not None
+            combined_buffer_class(self.replay_buffer_class, self.observation_space, self.env)  # checks compute_reward
             self.replay_buffer.env = self.env  # whose rewards relabelled transitions get
 
     # ------------------------------------------------------------------ demonstrations

@@ -369,7 +369,7 @@ def combined_buffer_class(
 
     :param given: a class, its name, or None
     :param observation_space: the environment's
-    :param env: the environment
+    :param env: the environment; None for an agent that is loaded without one
     :param n_steps: length of the returns
     :raises ValueError: for a class without a counterpart, or for other observations
     """
@@ -386,6 +386,6 @@ def combined_buffer_class(
     if issubclass(kind, DictReplayBuffer) != has_parts:
         raise ValueError(f"replay_buffer_class={given!r} does not keep observations of {observation_space}: leave it out")
     has_goals = isinstance(observation_space, spaces.Dict) and "desired_goal" in observation_space.spaces
-    if relabels(kind) and not (has_goals and env is not None and env.has_attr("compute_reward")):
+    if relabels(kind) and not (has_goals and (env is None or env.has_attr("compute_reward"))):
         raise ValueError(f"replay_buffer_class={given!r} needs a goal environment with compute_reward (GoalEnv)")
     return kind

@@ -22,7 +22,10 @@ ENOUGH_REWARDS, OTHER_SCALE = 500, 30.0
 
 
 class DemonstrationReplay:
-    """:param demonstrations: N transitions that fit the environment
+    """
+    Minibatches of demonstrated transitions, with signals and n-step returns as the agent's own have.
+
+    :param demonstrations: N transitions that fit the environment
     :param observation_space: the environment's
     :param action_space: the environment's
     :param history: H observations in the working memory; 0 for none

@@ -54,7 +54,7 @@ class OfflineAlgorithm(LearnsFromDemonstrations):
     :param batch_size: B
     :param options: keywords of :class:`~sb3_actpc.demonstrations.mixin.LearnsFromDemonstrations` and of SB3's algorithms
     :raises ValueError: for a keyword with a value that is not allowed, without demonstrations, for demonstrations that do not
-        fit the environment, for other spaces, and for an environment that normalises observations
+        fit the environment, for other spaces, and for VecNormalize(norm_obs=True)
     """
 
     is_offline: ClassVar[bool] = True  # for those who run any algorithm: its steps do nothing in the environment
@@ -100,8 +100,10 @@ class OfflineAlgorithm(LearnsFromDemonstrations):
         """Choose what acts from now on; nothing to choose here."""
 
     def _load_demonstrations(self) -> None:
-        if self.demonstrations is None or self.get_vec_normalize_env() is not None:
-            raise ValueError("demonstrations=None, or VecNormalize: an offline method needs a file, normalizes by it itself")
+        if self.demonstrations is None or self.has_normalized_observations:
+            raise ValueError(
+                "demonstrations=None, or VecNormalize(norm_obs=True): an offline method needs a file, normalizes by it itself"
+            )
         self._take(self._fitted_demonstrations())
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:

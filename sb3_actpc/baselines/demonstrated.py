@@ -175,8 +175,11 @@ class DemonstratedAlgorithm(LearnsFromDemonstrations, StoresLastTransition):
         )
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
-        """As SB3's; an agent that was loaded without an environment gets its replay buffer and its demonstrations now."""
+        """As SB3's; an agent that was loaded without an environment gets its replay buffer and its demonstrations now. With
+        hindsight, relabelled transitions get this environment's rewards."""
         was_played = self.env is None
         super().set_env(env, force_reset)
         if was_played:
             self.replay_buffer = self._make_replay_buffer()
+        elif isinstance(self.replay_buffer, HerReplayBuffer):
+            self.replay_buffer.env = self.env

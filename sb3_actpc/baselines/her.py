@@ -146,7 +146,8 @@ class HER(DDPGDemo):
         random = np.random.random(self.n_envs) < self.random_action_probability
         if random.any():
             drawn = np.array([self.action_space.sample() for _ in range(self.n_envs)])
-            scaled = np.where(random[:, None], self.policy.scale_action(drawn), scaled)
+            random = random.reshape(-1, *[1] * (scaled.ndim - 1))
+            scaled = np.where(random, self.policy.scale_action(drawn), scaled)
             actions = self.policy.unscale_action(scaled)
         return actions, scaled
 

@@ -199,7 +199,7 @@ def buffer_arrays(buffer: ReplayBuffer) -> dict[str, np.ndarray]:
     for name, value in vars(buffer).items():
         parts |= {f"{name}.{key}": part for key, part in value.items()} if isinstance(value, dict) else {}
     arrays = {name: part for name, part in parts.items() if isinstance(part, np.ndarray) and part.dtype != object}
-    return {name: array for name, array in arrays.items() if array.shape[:1] == (buffer.buffer_size,)}
+    return {name: array for name, array in arrays.items() if array.shape[:2] == (buffer.buffer_size, buffer.n_envs)}
 
 
 def _buffer_state(buffer: ReplayBuffer, write: Write) -> dict[str, Any]:

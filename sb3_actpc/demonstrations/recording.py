@@ -52,7 +52,11 @@ def record_episodes(
 
     For the other parameters see ``Demonstrations.record``.
     """
-    for name, value, least in (("n_episodes", n_episodes, 1), ("max_tries", max_tries or 1, 1), ("seed", seed, 0)):
+    for name, value, least in (
+        ("n_episodes", n_episodes, 1),
+        ("max_tries", 1 if max_tries is None else max_tries, 1),
+        ("seed", seed, 0),
+    ):
         if not isinstance(value, Integral) or int(value) < least:
             raise ValueError(f"{name}={value!r} must be at least {least}, a whole number")
     if not isinstance(env.action_space, spaces.Box):

@@ -40,7 +40,7 @@ def write_card(folder: Path, target: Path, n_episodes: int = 10, seed: int = UNS
     read_result(folder)
     run, model = load_run(folder)
     result = evaluate_run(folder, n_episodes, seed)
-    name = f"{run.algo}-{folder_name(run.env)}"
+    name = folder_name(f"{run.algo}-{run.env}")
     target.mkdir(parents=True, exist_ok=True)
     copied = {"model.zip": f"{name}.zip", CONFIG: CONFIG, NormalizedPredictor.FILE: NormalizedPredictor.FILE}
     for source, copy in copied.items():
@@ -87,6 +87,7 @@ def _card_text(run: Run, result: dict[str, Any], name: str, has_video: bool) -> 
     ]
     words = ["sb3-actpc train", f"--algo {run.algo}", f"--env {run.env}", f"--steps {run.n_timesteps}", f"--seed {run.seed}"]
     own = [] if run.demonstrations == "shipped" else [f"--demonstrations {shlex.quote(run.demonstrations)}"]
+    own += ["--gym-packages", *run.gym_packages] if run.gym_packages else []
     parts = [
         f"---\n{yaml.safe_dump(metadata, sort_keys=False)}---",
         f"# {run.algo} on {run.env}",

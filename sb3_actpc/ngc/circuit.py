@@ -186,7 +186,7 @@ class NGCCircuit(nn.Module):
 
     def input_feedback(self, tied: bool = False) -> th.Tensor:
         """
-        E^T of the input's last ``n_feedback_inputs`` columns, (n_first, n_feedback_inputs).
+        E^T of the input's last ``n_feedback_inputs`` columns, (n_first, n_feedback_inputs); of an ensemble with M in front.
 
         :param tied: the weights themselves, whatever the circuit uses
         """

@@ -59,6 +59,8 @@ class SettlingChain:
 
     Layers that no error has reached yet stand still and cost nothing.
 
+    Shapes are those of one circuit; those of an ensemble have its M members in front, (M, B, n).
+
     :param circuit: its synapses are used, never changed, and its settings say how the layers move
     :param x: the clamped input, (B, n_inputs)
     :param memory: m_t, (B, n_memory), or None

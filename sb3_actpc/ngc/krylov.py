@@ -1,5 +1,5 @@
 """
-Settling by minimal residuals: where eq. 1 comes to rest, in two or three steps instead of hundreds.
+Settling by minimal residuals: where eq. 1 comes to rest, in two to four steps instead of hundreds.
 
 Under a clamped output the error neurons follow the output's error by one ordered sweep, ``e_l = φ'(z_l) ⊙ (E_l e_{l+1})``, and
 the states that ride on them answer at the output, which shrinks the error that drives the sweep. Only that answer couples the

@@ -169,7 +169,11 @@ def test_two_runs_with_one_seed_are_equal() -> None:
         (BC, {"input_noise": float("nan")}, "input_noise=nan must be a finite number"),
         (BC, {"n_demonstrations": 99}, "n_demonstrations=99.*: n_episodes must be"),
         (BCRNN, {"policy_kwargs": {"hidden_size": 0}}, "hidden_size=0 must be at least 1"),
-        (BC, {"env": VecNormalize(make_vec_env(ENV))}, "or VecNormalize: an offline method .* normalizes by it itself"),
+        (
+            BC,
+            {"env": VecNormalize(make_vec_env(ENV))},
+            r"or VecNormalize\(norm_obs=True\): an offline .* normalizes by it itself",
+        ),
     ],
 )
 def test_what_it_cannot_learn_from_is_refused(kind: type[BC], options: dict[str, Any], message: str) -> None:

@@ -1,5 +1,7 @@
 """Hindsight replay: the goal tasks, the priorities, the exploration, and that it learns what it is made for."""
 
+from typing import Any
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -226,6 +228,31 @@ def test_a_saved_replay_buffer_relabels_again(tmp_path) -> None:
     assert len(loaded.replay_buffer.sample(16).rewards) == 16
 
 
+@pytest.mark.parametrize("agent", [HER, ActPC])
+def test_relabelled_transitions_get_the_rewards_of_the_environment_that_was_set(agent: type[HER] | type[ActPC]) -> None:
+    kwargs = {"learning_starts": 100} if agent is HER else {"learning_starts": 100, "replay_buffer_class": HerReplayBuffer}
+    model = agent("MultiInputPolicy", "GoalReacher-v5", **kwargs)
+    model.set_env(make_vec_env("GoalReacher-v5", env_kwargs={"miss_reward": -1.0}))
+    rewards = model.learn(60).replay_buffer.sample(200).rewards
+    assert set(rewards.unique().tolist()) <= {-1.0, 1.0}
+
+
+def test_random_actions_have_the_shape_of_the_environments() -> None:
+    class Folded(gym.ActionWrapper):
+        def __init__(self) -> None:
+            super().__init__(gym.make("GoalReacher-v5"))
+            self.action_space = gym.spaces.Box(-1.0, 1.0, (2, 1))
+
+        def action(self, action: np.ndarray) -> np.ndarray:
+            return action[:, 0]
+
+        def compute_reward(self, *args: Any) -> Any:
+            return self.unwrapped.compute_reward(*args)
+
+    model = HER("MultiInputPolicy", make_vec_env(Folded, n_envs=3), random_action_start=0.5, buffer_size=300).learn(30)
+    assert model.replay_buffer.actions.shape[1:] == (3, 2)
+
+
 def test_a_task_without_goals_is_refused() -> None:
     with pytest.raises(ValueError, match="such as GoalReacher-v5"):
         HER("MlpPolicy", "SparseReacher-v5")
@@ -289,10 +316,9 @@ def test_actpc_does_not_fall_below_what_a_slow_arm_shows_of_fetch_reach() -> Non
     model = ActPC(env=env, **settings, seed=0, device="cpu").learn(10_000)
     played = [episode["r"] for episode in model.ep_info_buffer]  # the last hundred: 5,000 steps under pressure
     assert len(played) == 100 and np.mean(played) > shown.episode_returns.mean()
-    habit, _ = evaluate_policy(model, model.get_env(), 20)
-    model.actor.habit.load_state_dict(model.actor.circuit.state_dict())
-    learning, _ = evaluate_policy(model, model.get_env(), 20)
-    assert habit > shown.episode_returns.mean() - 1.5 and learning > shown.episode_returns.mean() - 0.5
+    deployed, _ = evaluate_policy(model, model.get_env(), 20)
+    learning, _ = evaluate_policy(model.actor_policy, model.get_env(), 20)
+    assert deployed > shown.episode_returns.mean() - 1.5 and learning > shown.episode_returns.mean() - 0.5
 
 
 @pytest.mark.slow

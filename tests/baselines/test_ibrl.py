@@ -6,6 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch as th
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_actpc.baselines import IBRL
 from tests.recordings import record
@@ -51,6 +53,11 @@ def test_until_learning_starts_it_acts_as_the_bc_policy(tmp_path: Path) -> None:
         np.testing.assert_allclose(one.predict(rows, deterministic=True)[0], cloned, rtol=1e-5)
     model.learn(60, reset_num_timesteps=False)
     assert not np.allclose(model.predict(rows, deterministic=True)[0], cloned, rtol=1e-5)
+
+
+def test_rewards_alone_may_be_normalized() -> None:
+    env = VecNormalize(make_vec_env(ENV), norm_obs=False)
+    assert IBRL("MlpPolicy", env, demonstrations=record(ENV), learning_starts=5, bc_steps=5).learn(8).num_timesteps == 8
 
 
 def test_critics_are_layer_normalized() -> None:

@@ -198,6 +198,7 @@ def test_observations_that_are_no_boxes_are_refused(space: spaces.Space[Any]) ->
         ({"n_episodes": 0}, "n_episodes=0 must be at least 1"),
         ({"n_episodes": 1.5}, "n_episodes=1.5 must be at least 1, a whole number"),
         ({"n_episodes": "3"}, "n_episodes='3' must be at least 1, a whole number"),
+        ({"max_tries": 0}, "max_tries=0 must be at least 1, a whole number"),
         ({"max_tries": "3"}, "max_tries='3' must be at least 1, a whole number"),
         ({"seed": -1}, "seed=-1 must be at least 0, a whole number"),
         ({"demonstrator": []}, r"\[\] must have SB3's predict"),

@@ -328,7 +328,7 @@ def with_robosuite() -> None:
 @pytest.mark.usefixtures("with_robosuite")
 @pytest.mark.parametrize(("env_id", "obs"), [(LIFT, "paper"), (CAN, "robomimic")])
 def test_a_sure_demonstrator_succeeds(env_id: str, obs: str) -> None:
-    """More episodes: see the README; here a few starts."""
+    """More episodes: see docs/tasks.md; here a few starts."""
     recorded = collect_scripted(env_id, 1.0, n_episodes=2, seed=50, max_tries=2, obs=obs)
     assert recorded.episode_returns.tolist() == [1.0, 1.0]
     assert recorded.terminations.sum() == 2

@@ -5,6 +5,7 @@ import re
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import pytest
 import yaml
 
@@ -16,6 +17,17 @@ from sb3_actpc.experiments.runs.record import read_run
 from sb3_actpc.pretrained import load_pretrained, read_index
 
 ENV_ID = "SparseReacher-v5"
+
+
+class WithoutRewards(gym.Wrapper):
+    """A task with goals that cannot say what another goal would have paid."""
+
+    def get_wrapper_attr(self, name: str) -> Any:
+        if name == "compute_reward":
+            raise AttributeError(name)
+        return super().get_wrapper_attr(name)
+
+
 SETTINGS: dict[str, Any] = {
     "guidance_kwargs": {"bc_updates": 20, "critic_warmup": 0},
     "policy_kwargs": {"net_arch": [16, 16]},
@@ -60,6 +72,21 @@ def test_a_card_holds_what_the_hub_asks_for_and_how_to_use_and_train_the_agent(
     for name in ("settings", "n_timesteps", "policy", "n_envs", "env_kwargs", "normalize", "noise_type"):
         assert getattr(again, name) == getattr(before, name)
     assert again.settings["policy_kwargs"] == {"net_arch": [16, 16]}
+
+
+def test_an_agent_with_hindsight_is_played_without_an_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    task = {"env": "GoalReacher-v5", "demonstrations": "none", "gym_packages": ("sb3_actpc",), "policy": "MultiInputPolicy"}
+    settings = {"replay_buffer_class": "HerReplayBuffer", "learning_starts": 10, "policy_kwargs": {"net_arch": [16]}}
+    run = trained(tmp_path / "run", settings=settings, **task)
+    assert main(["card", str(run), "--output", str(tmp_path / "card"), "--episodes", "1", "--no-video"]) == 0
+    monkeypatch.chdir(tmp_path / "card")
+    text = Path("README.md").read_text(encoding="utf-8")
+    assert "--gym-packages sb3_actpc" in text
+    agent = ActPC.load("actpc-GoalReacher-v5.zip")
+    with pytest.raises(ValueError, match=r"HerReplayBuffer.* needs a goal environment with compute_reward"):
+        agent.set_env(WithoutRewards(gym.make("GoalReacher-v5")))
+    agent.set_env(gym.make("GoalReacher-v5"))
+    assert agent.learn(60, reset_num_timesteps=False).num_timesteps == 80
 
 
 def test_a_folder_with_files_is_not_written_over(run_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -152,6 +152,7 @@ def _run_row(folder: Path, curve: pd.DataFrame) -> dict[str, Any]:
 
 def _labelled(runs: pd.DataFrame) -> pd.DataFrame:
     """Add ``label``: the variant, with a part of the settings' id where a task has several settings of that name."""
-    n_settings = runs.groupby(["task", "variant"])["settings"].transform("nunique")
+    known = runs.assign(settings=runs["settings"].where(runs["settings"] != ""))  # a run can fail before it wrote them
+    n_settings = known.groupby(["task", "variant"])["settings"].transform("nunique")
     detailed = runs["variant"] + " [" + runs["settings"].str[:4] + "]"
-    return runs.assign(label=runs["variant"].where(n_settings == 1, detailed))
+    return runs.assign(label=runs["variant"].where(n_settings <= 1, detailed))

@@ -145,7 +145,8 @@ def preset(env_id: str, name: str | None = None, algo: str = "actpc") -> dict[st
 
 def preset_entry(run: Run) -> dict[str, Any]:
     """What a filled run's settings file would say of its task."""
-    entry = {name: getattr(run, name) for name in RUN_KEYS if getattr(run, name)} | run.settings
+    said = {name: getattr(run, name) for name in RUN_KEYS}
+    entry = {name: value for name, value in said.items() if value not in (None, {})} | run.settings
     if run.normalize == {}:
         entry["normalize"] = True
     return entry

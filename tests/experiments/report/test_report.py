@@ -1,5 +1,6 @@
 """What a report says of runs whose numbers are known."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +30,14 @@ def test_a_row_holds_what_the_run_reached(tmp_path: Path) -> None:
 def test_the_area_weighs_evaluations_by_the_steps_between_them() -> None:
     assert area(np.array([0.0, 10.0, 40.0]), np.array([0.0, 2.0, 2.0])) == pytest.approx((10 * 1 + 30 * 2) / 40)
     assert np.isnan(area(np.array([0.0]), np.array([1.0])))
+
+
+def test_a_run_that_failed_before_its_settings_does_not_rename_the_others(tmp_path: Path) -> None:
+    folder = write_run(tmp_path, seed=0)
+    failed = folder.parent / "seed1_0123456789"
+    failed.mkdir()
+    (failed / "error.json").write_text(json.dumps({"message": "no such task"}), encoding="utf-8")
+    assert load_results(tmp_path).runs["label"].tolist() == ["actpc", "actpc"]
 
 
 def test_the_two_files_make_the_same_report_again(tmp_path: Path) -> None:
