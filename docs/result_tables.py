@@ -55,8 +55,10 @@ DENSE_TASKS = ("HalfCheetah-v5", "Hopper-v5")
 FETCH = {**POLICIES, "HER": ("her", "success")}  # success instead of returns
 FETCH_STEPS = (0, 5_000, 10_000, 15_000, 20_000)
 DOOR = {
-    "ActPC, moving average": ("imitation", "actor_return"),
-    "ActPC, deployed policy": ("imitation", "return"),
+    "ActPC, moving average": ("critic", "actor_return"),
+    "ActPC, deployed policy": ("critic", "return"),
+    "no critic term, moving average": ("imitation", "actor_return"),
+    "no critic term, deployed policy": ("imitation", "return"),
     "RLPD, seed 420": ("rlpd", "return"),
 }
 REPORTED = ("Hopper-suboptimal", "Walker2d-suboptimal", "Swimmer-suboptimal", "Walker2d")  # no settings were chosen on them

@@ -75,8 +75,7 @@ def test_every_entry_builds_its_agent_which_trains(preset: str, key: str, record
     if env_id in ROBOSUITE_IDS:
         pytest.importorskip("robosuite", reason="robosuite is an extra")
     sparse = sparse_env_id(env_id)
-    imitates = sparse.startswith("Sparse") or load_preset(preset, env_id).get("critic_weight") == 0  # or nothing is learned
-    demonstrations = str(record_file(recordings, sparse, N_EPISODES)) if imitates else "none"
+    demonstrations = str(record_file(recordings, sparse, N_EPISODES)) if sparse.startswith("Sparse") else "none"
     n_steps = 16 if algo in ("logo", "ppo", "trpo") else 3
     settings = dict(FEWER[algo])
     if algo in ("her", "actpc") and demonstrations == "none":  # nothing to learn from but an episode of its own
