@@ -11,10 +11,10 @@ import torch as th
 from stable_baselines3.common.type_aliases import GymEnv
 
 from sb3_actpc.actpc import ActPC
-from sb3_actpc.envs import register_envs
 from sb3_actpc.utils.checks import nearest
 from sb3_actpc.utils.files import atomic_write, file_hash
 from sb3_actpc.utils.settings import constructor_settings, read_settings
+from sb3_actpc.utils.weights import check_spaces, read_tensors
 
 AGENTS = Path(__file__).parent / "agents"
 INDEX = "index.json"
@@ -64,7 +64,6 @@ def load_pretrained(env_id: str, env: GymEnv | None = None, folder: Path = AGENT
     :param keywords: constructor keywords that replace the stored ones, such as ``device``
     :raises ValueError: when no agent is bundled, the file is damaged, or the spaces differ
     """
-    register_envs()
     row = find_agent(env_id, folder)
     path = folder / row["file"]
     if not path.is_file() or file_hash(path) != row["sha256"]:
@@ -110,12 +109,7 @@ def load_agent(path: Path, env: GymEnv | str, **keywords: Any) -> ActPC:
     :param keywords: constructor keywords that replace the stored ones
     :raises ValueError: when it is no such file, the spaces differ, or keywords are for learning
     """
-    try:
-        with safetensors.safe_open(path, framework="pt") as file:
-            header = json.loads((file.metadata() or {}).get("sb3_actpc", "{}"))
-            tensors = {name: file.get_tensor(name) for name in file.keys()}
-    except (safetensors.SafetensorError, ValueError) as error:
-        raise ValueError(f"{path}: not a file of save_agent ({' '.join(str(error).split())})") from error
+    header, tensors = read_tensors(path, "save_agent")
     if header.get("format") != FORMAT:
         raise ValueError(f"{path} has the format {header.get('format')!r}, this version reads {FORMAT!r}")
     refused = sorted({"demonstrations", "guidance", "guidance_kwargs"} & keywords.keys())
@@ -123,9 +117,7 @@ def load_agent(path: Path, env: GymEnv | str, **keywords: Any) -> ActPC:
         raise ValueError(f"{refused[0]}= does not go with a bundled agent, which has no critic: train a new agent instead")
     settings = read_settings(header["settings"], {"buffer_size": BUFFER_SIZE, "guidance": "none", **keywords})
     model = ActPC(env=env, **settings)
-    for name in ("observation_space", "action_space"):
-        if str(getattr(model, name)) != header[name]:
-            raise ValueError(f"{path} was trained with {name}={header[name]}, the environment has {getattr(model, name)}")
+    check_spaces(model, header, path)
     state = model.policy.state_dict()
     if _acting_tensors(state, "actor.circuit.").keys() != tensors.keys():
         raise ValueError(f"{path} does not fit its own settings: it is damaged or of another version")

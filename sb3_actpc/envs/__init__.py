@@ -51,8 +51,6 @@ def dense_env_id(env_id: str) -> str:
     return env_id.removeprefix("Sparse")
 
 
-register_envs()
-
 __all__ = [
     "GOAL_MUJOCO_IDS",
     "ROBOSUITE_IDS",

@@ -9,13 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+from stable_baselines3.common.type_aliases import PolicyPredictor
 from stable_baselines3.common.utils import set_random_seed
 
 from sb3_actpc.demonstrations import Demonstrations, shipped_demonstrations
 from sb3_actpc.demonstrations.recording import Report, silent
 from sb3_actpc.envs import ROBOSUITE_IDS, SPARSE_MUJOCO_IDS, dense_env_id, sparse_env_id
 from sb3_actpc.experiments.runs.environments import check_env_id
-from sb3_actpc.experiments.runs.evaluation import Predictor
 from sb3_actpc.experiments.runs.record import CONFIG, read_run
 from sb3_actpc.experiments.runs.run import finish_run, load_run
 from sb3_actpc.experiments.runs.schema import Run
@@ -32,7 +32,7 @@ EARLIER = 0.5  # share of the return at which the weaker half of a mixed set sto
 class Demonstrator:
     """A trained agent: its policy has SB3's ``predict``, for raw observations; its mean dense return is without noise."""
 
-    policy: Predictor
+    policy: PolicyPredictor
     n_steps: int
     mean_return: float
 

@@ -2,6 +2,7 @@
 
 import json
 import os
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -88,9 +89,7 @@ def load_weights(
         if name not in overrides:
             header["settings"]["keywords"].pop(name, None)
     model = algorithm(env=env, device=device, **read_settings(header["settings"], overrides))
-    for name in ("observation_space", "action_space"):
-        if str(getattr(model, name)) != header[name]:
-            raise ValueError(f"{path} was trained with {name}={header[name]}, the environment has {getattr(model, name)}")
+    check_spaces(model, header, path)
     _load_normalizers(model, {name: tensors.pop(name) for name in list(tensors) if name.startswith(_NORMALIZERS)}, path)
     try:
         model.policy.load_state_dict(tensors)
@@ -107,17 +106,30 @@ def _with_suffix(path: Path) -> Path:
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, th.Tensor]]:
     if not path.is_file():
         raise FileNotFoundError(f"no file of weights at {path}")
+    header, tensors = read_tensors(path, "save_weights")
+    if header.get("version") != VERSION:
+        raise ValueError(f"{path} has format version {header.get('version')}, this sb3_actpc reads {VERSION}")
+    return header, tensors
+
+
+def read_tensors(path: Path, writer: str) -> tuple[dict[str, Any], dict[str, th.Tensor]]:
+    """Header and tensors of a file of the function ``writer``; ValueError when it is none."""
     try:
         with safetensors.safe_open(path, framework="pt") as file:
-            text = (file.metadata() or {}).get("sb3_actpc", "")
+            header = json.loads((file.metadata() or {}).get("sb3_actpc", ""))
             tensors = {name: file.get_tensor(name) for name in file.keys()}
-        header = json.loads(text)
-        version = header["version"]
-    except (safetensors.SafetensorError, ValueError, KeyError, TypeError) as error:
-        raise ValueError(f"{path}: not a file of save_weights ({' '.join(str(error).split())})") from error
-    if version != VERSION:
-        raise ValueError(f"{path} has format version {version}, this sb3_actpc reads {VERSION}")
+        if not isinstance(header, dict):
+            raise ValueError("its header is no dictionary")
+    except (safetensors.SafetensorError, ValueError) as error:
+        raise ValueError(f"{path}: not a file of {writer} ({' '.join(str(error).split())})") from error
     return header, tensors
+
+
+def check_spaces(model: BaseAlgorithm, header: Mapping[str, Any], path: Path) -> None:
+    """:raises ValueError: when the environment's spaces are not those of the training"""
+    for name in ("observation_space", "action_space"):
+        if str(getattr(model, name)) != header[name]:
+            raise ValueError(f"{path} was trained with {name}={header[name]}, the environment has {getattr(model, name)}")
 
 
 def _normalizers(model: OffPolicyAlgorithm) -> dict[str, RunningMeanStd]:

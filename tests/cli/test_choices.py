@@ -17,8 +17,8 @@ from sb3_actpc.checkpoints import TrainingStopped
 from sb3_actpc.cli import main
 from sb3_actpc.demonstrations import Demonstrations
 from sb3_actpc.experiments.runs import Run, finish_run
+from tests.checkpoints.runs import Terminate
 from tests.cli.line import ENV_ID, rows_of, train
-from tests.experiments.comparison.tasks import StopAt
 from tests.recordings import write_minari
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -165,7 +165,7 @@ def test_bringing_a_run_to_its_end_begins_goes_on_or_does_nothing() -> None:
     lines: list[str] = []
     run = Run(env=ENV_ID, algo="td3", preset="small.yml", demonstrations="none", steps=40, output="mine", progress=False)
     with pytest.raises(TrainingStopped):
-        finish_run(run, callbacks=[StopAt(10)])
+        finish_run(run, callbacks=[Terminate(10)])
     for steps, end in ((60, 60), (80, 80), (20, 80)):
         lines.clear()
         assert finish_run(Run(**{**run.model_dump(), "n_timesteps": steps}), lines.append)["timesteps"] == end

@@ -11,7 +11,6 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.preprocessing import check_for_nested_spaces
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
-from sb3_actpc.envs import register_envs
 from sb3_actpc.experiments.runs.algorithms import find_in_working_folder
 from sb3_actpc.utils.checks import named_in_errors, nearest
 
@@ -52,9 +51,7 @@ def make_train_env(
 
 
 def register_tasks(env_id: str) -> None:
-    """Register this package's tasks with Gymnasium (again does no harm), and those of gymnasium-robotics where they are
-    meant."""
-    register_envs()
+    """Register the tasks of gymnasium-robotics with Gymnasium where they are meant; this package's are."""
     if ":" not in env_id and env_id not in gym.registry:
         # not installed: Gymnasium will say that the id is unknown; installed: it prints a note on tasks of another kind
         with contextlib.suppress(ImportError), contextlib.redirect_stderr(io.StringIO()):

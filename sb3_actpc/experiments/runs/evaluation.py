@@ -11,12 +11,13 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from io import BufferedIOBase
 from pathlib import Path
-from typing import Any, ClassVar, Protocol, cast
+from typing import Any, ClassVar, cast
 
 import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.type_aliases import PolicyPredictor
 
 from sb3_actpc.experiments.runs.schema import Run
 from sb3_actpc.utils.files import atomic_write
@@ -29,30 +30,21 @@ SUMMARY = ("dense_return", "dense_return_std", "return", "return_std", "success"
 OF_ACTOR = {"return": "actor_return", "dense_return": "actor_dense_return", "success": "actor_success"}  # columns
 
 
-class Predictor(Protocol):
-    """Anything that acts like an SB3 algorithm or policy."""
-
-    def predict(
-        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = False
-    ) -> tuple[Any, Any]:
-        """Actions, (n, action_dim), and the next recurrent state, for n observations."""
-
-
 class NormalizedPredictor:
     """A policy that learned from the observations of SB3's ``VecNormalize``, for those of the bare environment: ``normalize``
     is a function of n of them, (n, obs_dim), or of a dictionary of such."""
 
     FILE = "vecnormalize.pkl"  # in a run's folder, as ``VecNormalize.save`` writes it
 
-    def __init__(self, model: Predictor, normalize: Callable[[Any], Any]) -> None:
+    def __init__(self, model: PolicyPredictor, normalize: Callable[[Any], Any]) -> None:
         self.model, self.normalize = model, normalize
 
     def predict(self, observation: Any, *further: Any, **options: Any) -> tuple[Any, Any]:
-        """See :class:`Predictor`."""
+        """As SB3's, of the normalized observation."""
         return self.model.predict(self.normalize(observation), *further, **options)
 
     @classmethod
-    def wrap(cls, model: BaseAlgorithm, policy: Predictor | None = None) -> Predictor:
+    def wrap(cls, model: BaseAlgorithm, policy: PolicyPredictor | None = None) -> PolicyPredictor:
         """The agent (or a policy of its), or with the present statistics of its environment where that normalizes."""
         wrapper = model.get_vec_normalize_env()
         acting = model if policy is None else policy
@@ -67,7 +59,7 @@ class NormalizedPredictor:
                 pickle.dump(wrapper, file)
 
     @classmethod
-    def wrap_saved(cls, model: Predictor, folder: Path) -> Predictor:
+    def wrap_saved(cls, model: PolicyPredictor, folder: Path) -> PolicyPredictor:
         """The agent itself, or with the statistics that :meth:`save` wrote into the run's folder, which are unpickled."""
         if not (folder / cls.FILE).is_file():
             return model
@@ -103,7 +95,7 @@ def says_one_return(summary: Mapping[str, Any]) -> bool:
     return all(summary[f"dense_{name}"] == summary[name] for name in ("return", "return_std"))
 
 
-def play_episodes(model: Predictor, envs: Sequence[gym.Env[Any, Any]], n_episodes: int, seed: int) -> EpisodeStatistics:
+def play_episodes(model: PolicyPredictor, envs: Sequence[gym.Env[Any, Any]], n_episodes: int, seed: int) -> EpisodeStatistics:
     """Play whole episodes with the deterministic policy, carrying its recurrent state; their numbers are in the order of the
     seeds. Episode i starts from ``reset(seed=seed + i)``, so that two calls with one seed start from the same states. The
     environments, at least one, are stepped side by side, each playing at most one episode at a time, so that the policy is
@@ -119,7 +111,7 @@ def play_episodes(model: Predictor, envs: Sequence[gym.Env[Any, Any]], n_episode
 
 
 def _play_side_by_side(
-    model: Predictor, envs: Sequence[gym.Env[Any, Any]], seed: int, first: int, played: EpisodeStatistics
+    model: PolicyPredictor, envs: Sequence[gym.Env[Any, Any]], seed: int, first: int, played: EpisodeStatistics
 ) -> None:
     """Episodes ``first``, ``first + 1``, ..., one in each environment, noted in what has been ``played``."""
     observations = [env.reset(seed=seed + first + i)[0] for i, env in enumerate(envs)]

@@ -12,6 +12,7 @@ import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, ProgressBarCallback
 from stable_baselines3.common.logger import CSVOutputFormat, KVWriter, Logger, TensorBoardOutputFormat
+from stable_baselines3.common.type_aliases import PolicyPredictor
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_actpc.checkpoints import CheckpointCallback, list_bundles, restore, why_no_checkpoints
@@ -21,7 +22,7 @@ from sb3_actpc.envs import UNSEEN_SEED
 from sb3_actpc.experiments.runs import evaluation, presets, record
 from sb3_actpc.experiments.runs.algorithms import load_algorithm
 from sb3_actpc.experiments.runs.environments import check_env_id, make_eval_envs, make_train_env
-from sb3_actpc.experiments.runs.evaluation import EpisodeLog, EvaluationCallback, NormalizedPredictor, Predictor
+from sb3_actpc.experiments.runs.evaluation import EpisodeLog, EvaluationCallback, NormalizedPredictor
 from sb3_actpc.experiments.runs.record import is_finished, read_result, read_run
 from sb3_actpc.experiments.runs.schema import CONTENT, Run
 from sb3_actpc.utils.extras import import_extra
@@ -237,7 +238,7 @@ def evaluate_run(folder: Path, n_episodes: int = 10, seed: int = UNSEEN_SEED) ->
     }
 
 
-def load_run(folder: Path) -> tuple[Run, Predictor]:
+def load_run(folder: Path) -> tuple[Run, PolicyPredictor]:
     """A run and its model, on the CPU, with its normalisation of observations where it has one. Both are unpickled: open
     only runs that you trust. FileNotFoundError when the folder, ``config.json`` or ``model.zip`` does not exist, ValueError
     when one of the two cannot be read, gymnasium.error.Error when its environment is unknown."""

@@ -10,13 +10,12 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import yaml
-from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_actpc.checkpoints import TrainingStopped
 from sb3_actpc.experiments.comparison import plan_runs, read_comparison
 from sb3_actpc.experiments.comparison.schedule import Outcome, execute_run, run_comparison
 from sb3_actpc.experiments.runs import Run, finish_run
-from tests.checkpoints.runs import log_rows
+from tests.checkpoints.runs import Terminate, log_rows
 
 EPISODE_LENGTH = 8
 TASK = f"{__name__}:SparsePoint-v0"
@@ -110,23 +109,10 @@ def bring_to_end(runs: Sequence[Run], folder: Path, **options: Any) -> tuple[lis
     return begun, lines
 
 
-class StopAt(BaseCallback):
-    """Tells its own process to stop."""
-
-    def __init__(self, step: int) -> None:
-        super().__init__()
-        self.step = step
-
-    def _on_step(self) -> bool:
-        if self.num_timesteps == self.step:
-            os.kill(os.getpid(), signal.SIGTERM)
-        return True
-
-
 def interrupt_after(run: Run, n_steps: int) -> None:
     """Execute a run whose process is stopped at a step, after a checkpoint."""
     try:
-        finish_run(run, callbacks=[StopAt(n_steps)])
+        finish_run(run, callbacks=[Terminate(n_steps)])
     except TrainingStopped:
         return
     raise AssertionError("it was not stopped")
