@@ -65,7 +65,6 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
     policy_delay: int
     demonstration_fraction: float
     observation_normalization: str
-    bc_residual: float | None = None  # what guidance measured in pre-training, for a saved agent
     only_acts = False  # a bundled agent, whose critic is not trained
     expert: DemonstrationReplay | None = None  # the demonstrations, fitted to the environment
     was_made_without_demonstrations: bool
@@ -144,6 +143,11 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
         if self.target_policy_noise is None and self.n_steps > 1:
             raise ValueError(
                 f"n_steps={self.n_steps} does not work with target_policy_noise=None, which values the action taken: use 1"
+            )
+        if self.used_weights.instrumental and self.signals.prior_updates and not self.lr_schedule(1.0):
+            raise ValueError(
+                f"reward_weights['instrumental']={self.used_weights.instrumental:g}: the prior learns before the first step, "
+                "at the learning rate's start value, which is 0: begin above"
             )
         for name in self.policy.circuits():
             own = self.policy.settings_of(name).get("learning_rate")
@@ -289,20 +293,25 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
         expert = self.expert
         env = self._vec_normalize_env
         if expert is not None:
-            if not self.is_pretrained and env is not None and env.norm_obs:
+            if not self.is_pretrained and env is not None and env.norm_obs and env.training:
                 warnings.warn("VecNormalize's statistics drift while the circuits learn: use norm_obs=False", stacklevel=3)
-                if env.training:  # it has seen one observation else
-                    expert.show_to(env)
-                    if self._last_original_obs is not None:
-                        self._last_obs = env.normalize_obs(self._last_original_obs)
+                expert.show_to(env)  # it has seen one observation else
+                if self._last_original_obs is not None:
+                    self._last_obs = env.normalize_obs(self._last_original_obs)
             self._train_prior(expert)
         # BC is of demonstrations: an agent without does not imitate its own episodes first
-        if self.actor_guidance.bc_residual is None:  # of a loaded agent
-            self.actor_guidance.bc_residual = self.bc_residual
+        self._take_residual()
         self.actor_guidance.on_training_start(self._context(), self.is_pretrained or expert is None)
-        self.bc_residual = self.actor_guidance.bc_residual
+        if self.actor_guidance.bc_residual is not None:
+            self.policy.bc_residual.fill_(self.actor_guidance.bc_residual)
+            self._take_residual()
         if expert is not None:
             self.policy.has_imitated.fill_(1.0)
+
+    def _take_residual(self) -> None:
+        """What BC measured, which goes where the synapses go."""
+        residual = float(self.policy.bc_residual)
+        self.actor_guidance.bc_residual = None if residual < 0.0 else residual
 
     def _train_prior(self, expert: DemonstrationReplay) -> None:
         """The updates that the prior has not had yet; without a weight it has no role."""
@@ -500,6 +509,7 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
         groups = [group for circuit in self.policy.circuits().values() for group in circuit.optimizer.param_groups]
         for group, scale in zip(groups, scales, strict=True):
             group["lr_scale"] = scale
+        self._take_residual()
         self.actor_guidance.forget_returns()
 
     def checkpoint_state(self) -> dict[str, Any]:
@@ -566,12 +576,15 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
         """
         As in SB3, which unpickles: load files that you trust.
 
-        :raises ValueError: for a buffer of another algorithm, number of environments or shapes; the agent keeps its own
+        :raises ValueError: for what is no replay buffer, or one of another algorithm, number of environments or shapes; the
+            agent keeps its own
         """
         given = self.replay_buffer
-        super().load_replay_buffer(path, truncate_last_traj)
-        loaded = self.replay_buffer
-        self.replay_buffer = given
+        try:
+            with named_in_errors(str(path), OSError):
+                super().load_replay_buffer(path, truncate_last_traj)
+        finally:
+            loaded, self.replay_buffer = self.replay_buffer, given
         check_loaded_buffer(path, loaded, isinstance(loaded, SignalReplay), self)
         loaded.history = self.policy.memory_history
         self.replay_buffer = loaded
@@ -583,7 +596,10 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
 
         :param path: file to write; ``.safetensors`` is added where it is missing
         :return: the file
+        :raises ValueError: for a bundled agent, whose critic is not trained, and for settings that cannot be written
         """
+        if self.only_acts:
+            raise ValueError("a bundled agent comes without its critic and only acts: it is in the package already")
         return save_weights(self, path)
 
     @classmethod

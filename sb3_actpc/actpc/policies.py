@@ -222,6 +222,7 @@ class ActPCPolicy(BasePolicy):
     actor: ActPCActor
     action_space: spaces.Box
     has_imitated: th.Tensor
+    bc_residual: th.Tensor
     n_prior_updates: th.Tensor
 
     @checked
@@ -299,6 +300,7 @@ class ActPCPolicy(BasePolicy):
         # what the demonstrations have taught, which goes where the synapses go; floats, as SB3 expects of parameters
         self.register_buffer("has_imitated", th.tensor(0.0))
         self.register_buffer("n_prior_updates", th.tensor(0.0))
+        self.register_buffer("bc_residual", th.tensor(-1.0))  # below 0: not measured
         names = ("average", "challenger", "previous") if self.is_gated else ()
         self.selection = nn.ModuleDict({name: self.actor.circuit.projection_copy() for name in names})
         for name, circuit in self.circuits().items():

@@ -24,7 +24,8 @@ def check_loaded_buffer(path: Any, loaded: Any, is_own: bool, agent: Any) -> Non
 def check_observations(observations: Any, step: int) -> None:
     """:raises ValueError: for observations that are not finite in float32, which circuits see"""
 
-    def check(array: np.ndarray) -> None:
+    def check(array: Any) -> None:
+        array = np.asarray(array)  # an environment's last observation may be a number or a list
         with np.errstate(over="ignore"):
             seen = array.astype(np.float32) if array.dtype == np.float64 else array
         check_finite("environment", "observations", seen, step)
@@ -46,7 +47,7 @@ def finite_bounds(observation_space: spaces.Space, is_normalised: bool) -> np.nd
     """
     space = observation_space
     bounds = np.stack([space.low, space.high]) if isinstance(space, spaces.Box) else np.full(1, np.inf)
-    if bounds.ndim != 2 or not np.all(np.abs(bounds) < LARGEST_BOUND) or is_normalised:
+    if bounds.ndim != 2 or not np.all(np.abs(bounds.astype(np.float64)) < LARGEST_BOUND) or is_normalised:
         raise ValueError(
             f"observation_normalization='bounds' needs a flat Box whose bounds are below {LARGEST_BOUND:g}, and no "
             f"VecNormalize(norm_obs=True): observation_space={space}"

@@ -1,5 +1,6 @@
 """The algorithms that ActPC is compared with, as Stable-Baselines3 algorithms on the same tasks and demonstrations."""
 
+from importlib.util import find_spec
 from typing import Any
 
 from sb3_actpc.baselines.bc import BC, BCRNN
@@ -10,7 +11,9 @@ from sb3_actpc.baselines.offline_rl import BCQ, CQL
 from sb3_actpc.baselines.td3 import DDPGDemo, TD3Demo
 from sb3_actpc.utils.extras import import_extra
 
-__all__ = ["BC", "BCQ", "BCRNN", "CQL", "HER", "IBRL", "LOGO", "RLPD", "DDPGDemo", "TD3Demo"]
+__all__ = ["BC", "BCQ", "BCRNN", "CQL", "HER", "IBRL", "LOGO", "DDPGDemo", "TD3Demo"]
+if find_spec("jax") and find_spec("sbx"):
+    __all__ += ["RLPD"]
 
 
 def __getattr__(name: str) -> Any:

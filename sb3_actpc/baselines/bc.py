@@ -100,10 +100,10 @@ class OfflineAlgorithm(LearnsFromDemonstrations):
         """Choose what acts from now on; nothing to choose here."""
 
     def _load_demonstrations(self) -> None:
-        if self.demonstrations is None or self.has_normalized_observations:
-            raise ValueError(
-                "demonstrations=None, or VecNormalize(norm_obs=True): an offline method needs a file, normalizes by it itself"
-            )
+        if self.demonstrations is None:
+            raise ValueError(f"demonstrations=None: {type(self).__name__} learns from demonstrations alone, give some")
+        if self.has_normalized_observations:
+            raise ValueError(f"VecNormalize(norm_obs=True): {type(self).__name__} normalizes by the demonstrations, use False")
         self._take(self._fitted_demonstrations())
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:

@@ -155,7 +155,7 @@ class DemonstratedAlgorithm(LearnsFromDemonstrations, StoresLastTransition):
             return DemonstrationDictReplayBuffer
         return DemonstrationReplayBuffer if self.n_steps == 1 else DemonstrationNStepReplayBuffer
 
-    def _make_replay_buffer(self) -> DemonstrationReplayBuffer:
+    def _make_replay_buffer(self, size: int | None = None) -> DemonstrationReplayBuffer:
         kind, is_played = self._replay_class(), self.env is None
         kwargs = dict(self.replay_buffer_kwargs)
         if issubclass(kind, NStepReplayBuffer):
@@ -163,7 +163,7 @@ class DemonstratedAlgorithm(LearnsFromDemonstrations, StoresLastTransition):
         if issubclass(kind, HerReplayBuffer):
             kwargs["env"] = self.env
         return kind(
-            1 if is_played else self.buffer_size,
+            1 if is_played else size or self.buffer_size,
             self.observation_space,
             self.action_space,
             device=self.device,
@@ -175,11 +175,20 @@ class DemonstratedAlgorithm(LearnsFromDemonstrations, StoresLastTransition):
         )
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
-        """As SB3's; an agent that was loaded without an environment gets its replay buffer and its demonstrations now. With
-        hindsight, relabelled transitions get this environment's rewards."""
+        """As SB3's. An agent that was loaded without an environment gets its replay buffer now. The demonstrations are fitted
+        to this environment, whose rewards relabelled transitions get."""
         was_played = self.env is None
         super().set_env(env, force_reset)
-        if was_played:
+        if was_played and self.replay_buffer.buffer_size == 1:  # no other was loaded
             self.replay_buffer = self._make_replay_buffer()
-        elif isinstance(self.replay_buffer, HerReplayBuffer):
+        elif self.demonstrations is not None:
+            self.replay_buffer.demonstrated = self._make_replay_buffer(1).demonstrated
+        if isinstance(self.replay_buffer, HerReplayBuffer):
             self.replay_buffer.env = self.env
+
+    def load_replay_buffer(self, *args: Any, **options: Any) -> None:
+        """As SB3's, which unpickles: load files that you trust. The demonstrations stay those of the agent."""
+        demonstrated = self.replay_buffer.demonstrated
+        super().load_replay_buffer(*args, **options)
+        if demonstrated is not None:
+            self.replay_buffer.demonstrated = demonstrated

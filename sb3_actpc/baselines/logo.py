@@ -184,3 +184,9 @@ class LOGO(LearnsFromDemonstrations, TRPO):
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         names, variables = super()._get_torch_save_params()
         return names if self.demonstrations is None else [*names, *_NETS], variables
+
+    def set_parameters(self, load_path_or_dict: Any, *args: Any, **options: Any) -> None:
+        """As SB3's; an agent that is loaded without demonstrations, to be played, has no networks that learn from them."""
+        if self.demonstrations is None and isinstance(load_path_or_dict, dict):
+            load_path_or_dict = {name: state for name, state in load_path_or_dict.items() if name not in _NETS}
+        super().set_parameters(load_path_or_dict, *args, **options)

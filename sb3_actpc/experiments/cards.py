@@ -104,9 +104,20 @@ def _card_text(run: Run, result: dict[str, Any], name: str, has_video: bool) -> 
 def _usage(run: Run, name: str) -> str:
     if run.algo != "actpc":
         return f"`{name}.zip` is a file of SB3's `save`. Loading it unpickles: load only files that you trust."
-    code = ["import sb3_actpc  # registers the tasks", f'model = sb3_actpc.ActPC.load("{name}.zip")  # unpickles']
+    code = [f"import {module}" for module in run.gym_packages]
+    code += ["import sb3_actpc  # registers the tasks", f'model = sb3_actpc.ActPC.load("{name}.zip")  # unpickles']
     if run.normalize is None:
-        code.append(f'model = sb3_actpc.ActPC.from_weights("{name}.safetensors", "{run.env}")  # runs no code')
+        env = f'gymnasium.make("{run.env}", **{run.env_kwargs})' if run.env_kwargs else f'"{run.env}"'
+        code += ["import gymnasium"] if run.env_kwargs else []
+        code.append(f'model = sb3_actpc.ActPC.from_weights("{name}.safetensors", {env})  # runs no code')
+    elif run.normalize.get("norm_obs", True):
+        code += [
+            "from stable_baselines3.common.env_util import make_vec_env",
+            "from stable_baselines3.common.vec_env import VecNormalize",
+            f'env = make_vec_env("{run.env}", env_kwargs={run.env_kwargs})',
+            f'env = VecNormalize.load("{NormalizedPredictor.FILE}", env)  # unpickles; the agent sees its observations',
+            "env.training = False",
+        ]
     return "```python\n" + "\n".join(code) + "\n```"
 
 

@@ -53,6 +53,11 @@ class GuidanceConfig:
     def __post_init__(self) -> None:
         for field in fields(self):
             check_value(f"guidance_kwargs[{field.name!r}]", getattr(self, field.name), field.type)
+        if self.gate and not self.evaluation_share:
+            raise ValueError(
+                f"guidance_kwargs['evaluation_share']={self.evaluation_share!r} must be above 0, or no policy is promoted; "
+                "gate=False deploys the actor without evaluation"
+            )
 
 
 class BehaviorGuidance(ActorGuidance):

@@ -23,9 +23,14 @@ def written_as(env: VecEnv) -> str | None:
 
 
 def task_id(env: VecEnv) -> str | None:
-    """The Gymnasium id of its first environment; None where it has none. It is asked for what it is written as: a spec holds
-    the keywords that the environment was made with, and not all of these can be sent from another process (a function without
-    a name, say)."""
+    """The Gymnasium id of its first environment; None where it has none. One in another process is asked for what it is
+    written as: a spec holds the keywords that the environment was made with, and not all of these can be sent (a function
+    without a name, say)."""
+    from stable_baselines3.common.vec_env import DummyVecEnv
+
+    if isinstance(env.unwrapped, DummyVecEnv):
+        spec = getattr(env.unwrapped.envs[0].unwrapped, "spec", None)
+        return spec.id if spec is not None else None
     found = _WRITTEN_ID.search(written_as(env) or "")
     return found.group(1) if found else None
 

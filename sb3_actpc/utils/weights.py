@@ -19,7 +19,7 @@ from sb3_actpc.utils.settings import constructor_settings, read_settings
 
 SelfAlgorithm = TypeVar("SelfAlgorithm", bound=OffPolicyAlgorithm)
 
-VERSION = 7
+VERSION = 8
 _SUFFIX = ".safetensors"
 _STATISTICS = ("mean", "var", "count")
 _NORMALIZERS = "normalizers."

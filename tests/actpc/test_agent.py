@@ -847,3 +847,29 @@ def test_an_actor_with_nothing_to_learn_from_is_named() -> None:
     """Without critic term, demonstrations and self-imitation nothing would change."""
     with pytest.warns(UserWarning, match="critic_weight=0 without demonstrations"):
         ActPC("MlpPolicy", "Pendulum-v1", critic_weight=0.0)
+
+
+class Counter(gym.Env):
+    """Its observation is a whole number of Python's, its episodes have three steps."""
+
+    observation_space, action_space = gym.spaces.Discrete(4), gym.spaces.Box(-1.0, 1.0, (1,))
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.count = 0
+        return self.count, {}
+
+    def step(self, action):
+        self.count += 1
+        return self.count, 0.0, self.count == 3, False, {}
+
+
+def test_observations_may_be_numbers_of_python():
+    assert ActPC("MlpPolicy", Counter(), learning_starts=2, policy_kwargs={"net_arch": [8]}).learn(10).num_timesteps == 10
+
+
+def test_a_prior_that_would_learn_nothing_is_refused():
+    with pytest.raises(ValueError, match=r"reward_weights\['instrumental'\]=1: .*start value, which is 0: begin above"):
+        make(
+            demonstrations=demonstrations(), reward_weights={"instrumental": 1.0}, learning_rate=lambda left: 1e-3 * (1 - left)
+        )

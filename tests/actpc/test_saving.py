@@ -1,5 +1,6 @@
 """Saved agents: without their demonstrations, with other keywords, and files of others."""
 
+import pickle
 import re
 
 import numpy as np
@@ -87,6 +88,11 @@ def test_buffers_of_others_are_refused(tmp_path):
         with pytest.raises(ValueError, match=kind):
             model.load_replay_buffer(tmp_path / name)
         assert model.replay_buffer is mine
+    with open(tmp_path / "numbers.pkl", "wb") as file:
+        pickle.dump([1, 2], file)
+    with pytest.raises(ValueError, match=r"numbers\.pkl: .*inherit from ReplayBuffer"):
+        model.load_replay_buffer(tmp_path / "numbers.pkl")
+    assert model.replay_buffer is mine
     model.save_replay_buffer(tmp_path / "own")
     model.load_replay_buffer(tmp_path / "own")
     assert model.replay_buffer is not mine and model.replay_buffer.pos == 12

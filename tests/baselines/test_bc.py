@@ -164,7 +164,7 @@ def test_two_runs_with_one_seed_are_equal() -> None:
 @pytest.mark.parametrize(
     ("kind", "options", "message"),
     [
-        (BC, {"demonstrations": None}, "demonstrations=None.*: an offline method needs a file"),
+        (BC, {"demonstrations": None}, "demonstrations=None: BC learns from demonstrations alone"),
         (BC, {"batch_size": 0}, "batch_size=0 must be at least 1"),
         (BC, {"input_noise": float("nan")}, "input_noise=nan must be a finite number"),
         (BC, {"n_demonstrations": 99}, "n_demonstrations=99.*: n_episodes must be"),
@@ -172,7 +172,7 @@ def test_two_runs_with_one_seed_are_equal() -> None:
         (
             BC,
             {"env": VecNormalize(make_vec_env(ENV))},
-            r"or VecNormalize\(norm_obs=True\): an offline .* normalizes by it itself",
+            r"VecNormalize\(norm_obs=True\): BC normalizes by the demonstrations",
         ),
     ],
 )

@@ -2,6 +2,7 @@
 are refused, and the caller's settings stay."""
 
 from copy import deepcopy
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -144,3 +145,37 @@ def test_the_callers_dictionaries_stay_as_they_were(kind: type, more: dict[str, 
     before = deepcopy(given)
     kind("MlpPolicy", "Pendulum-v1", demonstrations=record("Pendulum-v1"), **given)
     assert given == before
+
+
+def test_a_loaded_buffer_outlasts_the_environment_that_is_set_and_the_demonstrations_are_the_agents(tmp_path: Path) -> None:
+    few, many = record("Pendulum-v1", 1, 5), record("Pendulum-v1", 2, 10)
+    model = TD3Demo("MlpPolicy", "Pendulum-v1", demonstrations=many, **SMALL).learn(30)
+    model.save(tmp_path / "model")
+    model.save_replay_buffer(tmp_path / "buffer")
+    loaded = TD3Demo.load(tmp_path / "model", demonstrations=many)
+    loaded.load_replay_buffer(tmp_path / "buffer")
+    loaded.set_env(make_vec_env("Pendulum-v1"))
+    assert loaded.replay_buffer.size() == 30
+    other = TD3Demo.load(tmp_path / "model", env=make_vec_env("Pendulum-v1"), demonstrations=few)
+    other.load_replay_buffer(tmp_path / "buffer")
+    assert (other.replay_buffer.size(), other.replay_buffer.demonstrated.size()) == (30, 5)
+
+
+def test_demonstrations_are_paid_by_the_environment_that_was_set() -> None:
+    model = TD3Demo("MultiInputPolicy", "GoalReacher-v5", demonstrations=record("SparseReacher-v5"), **SMALL)
+    model.set_env(make_vec_env("GoalReacher-v5", env_kwargs={"miss_reward": -1.0}))
+    assert set(model.replay_buffer.demonstrated.rewards[:, 0].tolist()) <= {-1.0, 1.0}
+
+
+class Named(gym.Wrapper):
+    """An environment that says what it is in its own words."""
+
+    def __str__(self) -> str:
+        return "a pendulum <at rest>"
+
+
+def test_an_environment_may_describe_itself() -> None:
+    if "Named-v0" not in gym.registry:
+        gym.register("Named-v0", entry_point=lambda: Named(gym.make("Pendulum-v1").unwrapped), max_episode_steps=10)
+    shown = Demonstrations.record(lambda observation: -observation[1:2], "Named-v0", n_episodes=2)
+    assert TD3Demo("MlpPolicy", "Named-v0", demonstrations=shown, **SMALL).learn(5).num_timesteps == 5

@@ -142,6 +142,13 @@ def test_it_saves_and_goes_on_with_its_discriminator(tmp_path: Path) -> None:
     assert not th.equal(before, weights(loaded.learn(64)))
 
 
+def test_it_is_played_without_its_demonstrations(tmp_path: Path) -> None:
+    model, rows = make().learn(64), record("Pendulum-v1").observations[:4]
+    model.save(tmp_path / "model.zip")
+    played = LOGO.load(tmp_path / "model.zip", demonstrations=None)
+    assert np.array_equal(*(one.predict(rows, deterministic=True)[0] for one in (model, played)))
+
+
 def test_bad_settings_and_spaces_that_the_discriminator_cannot_take_are_refused() -> None:
     with pytest.raises(ValueError, match=r"guidance_decay=2\.0 must be between 0 and 1"):
         make(guidance_decay=2.0)

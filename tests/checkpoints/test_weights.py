@@ -17,6 +17,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_actpc import ActPC
 from sb3_actpc.checkpoints import CheckpointCallback, TrainingStopped, continue_learning, load_checkpoint
+from tests.actpc.agents import imitating
 from tests.actpc.envs import CountingEnv, demonstrations
 from tests.checkpoints.runs import SHORT_WARM_UP, Terminate, assert_same, make_actpc
 
@@ -76,6 +77,16 @@ def test_weights_with_demonstrations_go_on_learning_from_new_ones(tmp_path: Path
     before = loaded.prior.weights[0].clone()
     loaded.learn(30)
     assert th.equal(before, loaded.prior.weights[0])  # it was trained before, and is not again
+
+
+def test_what_bc_measured_goes_with_the_weights(tmp_path: Path) -> None:
+    model = imitating().learn(20)
+    model.save_weights(tmp_path / "weights")
+    other = imitating()
+    other.set_parameters(model.get_parameters())
+    weight = model.actor_guidance.filtered_weight(10_000)
+    for again in (ActPC.from_weights(tmp_path / "weights", CountingEnv(), demonstrations=demonstrations()), other):
+        assert again.learn(5).actor_guidance.filtered_weight(10_000) == weight > 0.0
 
 
 def test_a_checkpoint_is_loaded_without_running_code(tmp_path: Path, request: pytest.FixtureRequest) -> None:

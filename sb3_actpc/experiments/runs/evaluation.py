@@ -73,7 +73,7 @@ class EpisodeStatistics:
 
     dense_returns: np.ndarray  # sums of ``info["dense_reward"]`` (of the reward, where the environment does not report it)
     returns: np.ndarray  # sums of the reward
-    successes: np.ndarray  # 1 or 0 as the last ``info`` reports it, NaN where it does not
+    successes: np.ndarray  # 1 or 0 as the last ``info`` reports it, NaN where no episode's does
     lengths: np.ndarray  # steps
     stages: list[str]  # ``info["stage"]`` at the end of each, "" where the environment does not report it
 
@@ -107,6 +107,8 @@ def play_episodes(model: PolicyPredictor, envs: Sequence[gym.Env[Any, Any]], n_e
     played = EpisodeStatistics(dense_returns, returns, successes, lengths, [""] * n_episodes)
     for first in range(0, n_episodes, len(envs)):
         _play_side_by_side(model, envs[: n_episodes - first], seed, first, played)
+    if not np.isnan(played.successes).all():  # an environment may report successes alone
+        np.nan_to_num(played.successes, copy=False)
     return played
 
 
@@ -285,7 +287,8 @@ class EvaluationCallback(CsvCallback):
     def _on_step(self) -> bool:
         # at the last step, the update that belongs to it is still to come
         is_last = self.num_timesteps >= self.model._total_timesteps
-        if not is_last and self.num_timesteps - self.last_timesteps >= (self.run.eval_freq or 1):
+        every = self.run.eval_freq or 1
+        if not is_last and self.num_timesteps // every > max(self.last_timesteps, 0) // every:
             self._evaluate(self.run.eval_episodes)
         return self.run.target_return is None or self.best_return < self.run.target_return
 

@@ -17,7 +17,7 @@ from torch import nn
 from sb3_actpc.checkpoints import why_no_checkpoints
 from sb3_actpc.demonstrations import is_minari_id, shipped_demonstrations
 from sb3_actpc.demonstrations.minari import minari_files
-from sb3_actpc.envs import sparse_env_id
+from sb3_actpc.envs import SPARSE_IDS, sparse_env_id
 from sb3_actpc.experiments.runs.algorithms import check_keywords, default_preset, load_algorithm
 from sb3_actpc.experiments.runs.environments import make_env
 from sb3_actpc.experiments.runs.schema import Run, merged
@@ -236,7 +236,7 @@ def find_demonstrations(env_id: str, choice: str) -> Path | str | None:
             raise FileNotFoundError(f"no demonstrations file at {choice}")
         return Path(choice)
     env_id = sparse_env_id(env_id)
-    return shipped_demonstrations(env_id) if env_id.rpartition(":")[2].startswith("Sparse") else None
+    return shipped_demonstrations(env_id) if env_id.rpartition(":")[2] in SPARSE_IDS else None
 
 
 def takes_demonstrations(run: Run) -> bool:

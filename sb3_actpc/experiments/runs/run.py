@@ -31,7 +31,14 @@ from sb3_actpc.utils.files import atomic_write, folder_lock
 UNSET = "unset"  # a setting that is left to its default, which null is not
 CHECKPOINTS = "checkpoints"  # folder in the run's folder
 DIAGNOSTICS = "diagnostics.csv"  # what the agent logs about itself
-MAY_CHANGE = ("threads", "device", "checkpoint_freq", "progress")  # of a run that is gone on with
+MAY_CHANGE = (
+    "threads",
+    "device",
+    "checkpoint_freq",
+    "progress",
+    "demonstrations",
+    "gym_packages",
+)  # of a run that is gone on with
 
 
 def train_run(run: Run, report: Report = silent, callbacks: Sequence[BaseCallback] = ()) -> dict[str, Any]:
@@ -50,6 +57,8 @@ def train_run(run: Run, report: Report = silent, callbacks: Sequence[BaseCallbac
     :raises gymnasium.error.Error: when the environment is unknown
     """
     check_env_id(run.env, run.gym_packages)
+    if run.demonstrations not in ("shipped", "none") and not presets.takes_demonstrations(run):
+        raise ValueError(f"demonstrations={run.demonstrations!r}: {run.algo} takes none, leave them out")
     return _run(presets.resolve(run), report, callbacks)
 
 
@@ -95,10 +104,11 @@ def _continued(folder: Path, more_steps: int, changes: Mapping[str, Any]) -> Run
     if not list_bundles(folder / CHECKPOINTS):
         without = why_no_checkpoints(load_algorithm(run.algo)) or "left none"
         raise ValueError(f"{folder} has no checkpoint to go on from ({run.algo} {without}): train again, in another folder")
+    run = run.model_copy(update={**changes, "n_timesteps": (run.n_timesteps or 0) + more_steps})
     check_env_id(run.env, run.gym_packages)
     if presets.demonstrations_hash(run) != run.demonstrations_sha256:
         raise ValueError(f"{folder}: the demonstrations ({run.demonstrations}) are not those that the run began with")
-    return run.model_copy(update={**changes, "n_timesteps": (run.n_timesteps or 0) + more_steps})
+    return run
 
 
 def _check_same(stored: Run, run: Run) -> None:
