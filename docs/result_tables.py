@@ -59,7 +59,7 @@ DOOR = {
     "ActPC, deployed policy": ("critic", "return"),
     "no critic term, moving average": ("imitation", "actor_return"),
     "no critic term, deployed policy": ("imitation", "return"),
-    "RLPD, seed 420": ("rlpd", "return"),
+    "RLPD": ("rlpd", "return"),
 }
 REPORTED = ("Hopper-suboptimal", "Walker2d-suboptimal", "Swimmer-suboptimal", "Walker2d")  # no settings were chosen on them
 
