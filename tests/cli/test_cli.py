@@ -235,7 +235,7 @@ def test_evaluate_replays_a_run_and_writes_a_video(capsys: pytest.CaptureFixture
         (["train", "--env", ENV_ID, "--algo", "json:loads"], "loads of json must be a subclass of SB3's BaseAlgorithm"),
         (["train", "--env", ENV_ID, "--algo", "json:nothing"], "found None"),
         (["train", "--env", ENV_ID, "--algo", "no_such_module:Agent"], "No module named 'no_such_module'"),
-        (TRAIN, "sb3-actpc demos collect --env SparseLine-v0"),
+        (["train", "--env", ENV_ID], "sb3-actpc demos collect --env SparseLine-v0"),
         ([*TRAIN, "--demonstrations", "no.npz"], "no.npz"),
         ([*TRAIN, "--set", "gama=1"], "did you mean 'gamma'?"),
         ([*TRAIN, "--set", "gamma"], "expected key=value"),

@@ -17,7 +17,7 @@ from torch import nn
 from sb3_actpc.checkpoints import why_no_checkpoints
 from sb3_actpc.demonstrations import is_minari_id, shipped_demonstrations
 from sb3_actpc.demonstrations.minari import minari_files
-from sb3_actpc.envs import SPARSE_IDS, sparse_env_id
+from sb3_actpc.envs import sparse_env_id
 from sb3_actpc.experiments.runs.algorithms import check_keywords, default_preset, load_algorithm
 from sb3_actpc.experiments.runs.environments import make_env
 from sb3_actpc.experiments.runs.schema import Run, merged
@@ -236,7 +236,7 @@ def find_demonstrations(env_id: str, choice: str) -> Path | str | None:
             raise FileNotFoundError(f"no demonstrations file at {choice}")
         return Path(choice)
     env_id = sparse_env_id(env_id)
-    return shipped_demonstrations(env_id) if env_id.rpartition(":")[2] in SPARSE_IDS else None
+    return shipped_demonstrations(env_id) if env_id.rpartition(":")[2].startswith("Sparse") else None
 
 
 def takes_demonstrations(run: Run) -> bool:
@@ -246,15 +246,19 @@ def takes_demonstrations(run: Run) -> bool:
 
 def missing_demonstrations(run: Run) -> str:
     """A sentence where the algorithm would take shipped demonstrations and the task has none, else an empty string."""
-    has_some = run.demonstrations != "shipped" or find_demonstrations(run.env, "shipped") is not None
-    if has_some or not takes_demonstrations(run):
+    if run.demonstrations != "shipped" or not takes_demonstrations(run) or find_demonstrations(run.env, "shipped") is not None:
         return ""
     return f"{run.env}: no demonstrations are shipped for it, so there are none (--demonstrations FILE gives some)"
 
 
 def demonstrations_hash(run: Run) -> str | None:
     """SHA-256 of what a run's demonstrations hold, None for none; FileNotFoundError when they are not there."""
-    found = find_demonstrations(run.env, run.demonstrations)
+    try:
+        found = find_demonstrations(run.env, run.demonstrations)
+    except FileNotFoundError:
+        if takes_demonstrations(run):
+            raise
+        return None
     if found is None:
         return None
     files = minari_files(found) if isinstance(found, str) else [found]

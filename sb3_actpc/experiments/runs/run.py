@@ -213,7 +213,7 @@ def _begun(run: Run, model: BaseAlgorithm, report: Report) -> Run:
     missing = presets.missing_demonstrations(run)
     if missing:
         report(missing)
-    source = presets.find_demonstrations(run.env, run.demonstrations)
+    source = presets.find_demonstrations(run.env, run.demonstrations) if run.demonstrations_sha256 else None
     returns = None if source is None else resolve_demonstrations(source).dense_returns
     commit, dirty = record.git_state()
     known: dict[str, Any] = {"versions": record.package_versions(), "git_commit": commit, "dirty": dirty}
