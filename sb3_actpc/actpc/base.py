@@ -311,7 +311,8 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
     def _take_residual(self) -> None:
         """What BC measured, which goes where the synapses go."""
         residual = float(self.policy.bc_residual)
-        self.actor_guidance.bc_residual = None if residual < 0.0 else residual
+        if residual >= 0.0:
+            self.actor_guidance.bc_residual = residual
 
     def _train_prior(self, expert: DemonstrationReplay) -> None:
         """The updates that the prior has not had yet; without a weight it has no role."""

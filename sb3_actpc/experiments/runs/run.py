@@ -31,14 +31,8 @@ from sb3_actpc.utils.files import atomic_write, folder_lock
 UNSET = "unset"  # a setting that is left to its default, which null is not
 CHECKPOINTS = "checkpoints"  # folder in the run's folder
 DIAGNOSTICS = "diagnostics.csv"  # what the agent logs about itself
-MAY_CHANGE = (
-    "threads",
-    "device",
-    "checkpoint_freq",
-    "progress",
-    "demonstrations",
-    "gym_packages",
-)  # of a run that is gone on with
+# of a run that is gone on with
+MAY_CHANGE = ("threads", "device", "checkpoint_freq", "progress", "demonstrations", "gym_packages")
 
 
 def train_run(run: Run, report: Report = silent, callbacks: Sequence[BaseCallback] = ()) -> dict[str, Any]:
