@@ -211,6 +211,7 @@ class ActPC(ActPCBase):
         self.guidance = guidance
         self.guidance_kwargs = guidance_kwargs
         self.signals = InternalSignals()
+        self.made_with = {}
         self.was_made_without_demonstrations = not has_demonstrations
         if _init_setup_model:
             self._setup_model()

@@ -12,12 +12,12 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import VectorizedActionNoise
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, TrainFreq, TrainFrequencyUnit
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
-from sb3_actpc.actpc.batches import Batch, minibatches, normalized, to_device
+from sb3_actpc.actpc.batches import Batch, SignalReplaySamples, minibatches, normalized, to_device
 from sb3_actpc.actpc.buffers import SignalReplay, combined_buffer_class
-from sb3_actpc.actpc.demonstration_replay import DemonstrationReplay
+from sb3_actpc.actpc.demonstration_replay import PART, DemonstrationReplay
 from sb3_actpc.actpc.diagnostics import Diagnostics
 from sb3_actpc.actpc.policies import ActPCActor, ActPCPolicy
 from sb3_actpc.actpc.reward_signals import InternalSignals, RewardWeights, check_reward_weights
@@ -68,6 +68,7 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
     only_acts = False  # a bundled agent, whose critic is not trained
     expert: DemonstrationReplay | None = None  # the demonstrations, fitted to the environment
     was_made_without_demonstrations: bool
+    made_with: Settings  # what the circuits depend on
     _used_demonstrations: tuple[Any, ...] = ()
     _described = ""  # what ``learn`` has said
     _rollout_state: tuple[np.ndarray, ...] | None = None  # the working memory of the running episodes
@@ -140,6 +141,9 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
                 f"reward_weights['epistemic']={epistemic:g} does not work with optimize_memory_usage=True, which overwrites "
                 "the last observations of episodes: use optimize_memory_usage=False or a weight of 0"
             )
+        assert isinstance(self.train_freq, TrainFreq)
+        if self.train_freq.unit is TrainFrequencyUnit.EPISODE and self.n_envs > 1:
+            raise ValueError(f"train_freq=({self.train_freq.frequency}, 'episode') needs one environment, not {self.n_envs}")
         if self.target_policy_noise is None and self.n_steps > 1:
             raise ValueError(
                 f"n_steps={self.n_steps} does not work with target_policy_noise=None, which values the action taken: use 1"
@@ -177,6 +181,15 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
     def _make_policy(self) -> ActPCPolicy:
         if "is_gated" in self.policy_kwargs:
             raise ValueError("policy_kwargs has is_gated, which guidance sets: use guidance_kwargs=dict(gate=...)")
+        # A loaded agent has the circuits of its file
+        made_with = {"settling": self.settling, "deployment gate": self.actor_guidance.has_gate}
+        for name, stored in self.made_with.items():
+            if made_with[name] != stored:
+                raise ValueError(
+                    f"the agent was made with {name} {stored!r}, on which its circuits depend, not {made_with[name]!r}: leave "
+                    "settling, guidance and guidance_kwargs out"
+                )
+        self.made_with = made_with
         with named_in_errors(f"policy_kwargs={self.policy_kwargs!r}", ValueError, AssertionError):
             circuit_kwargs = {"settling": self.settling, **(self.policy_kwargs.get("circuit_kwargs") or {})}
             if circuit_kwargs["settling"] != self.settling:
@@ -272,12 +285,10 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
             memory.takes_all = self.actor_guidance.stores == "positive" and not has_negative
             memory.count_from(0.0 if expert is None else expert.failure_reward)
         if self.demonstrations is None:
-            self._go_on_without_demonstrations()
+            self._warn_of_missing_demonstrations()
 
-    def _go_on_without_demonstrations(self) -> None:
-        """Turn off what needs them, and warn of what was set and has no effect now."""
-        self.demonstration_fraction = 0.0
-        self.n_demonstrations = None
+    def _warn_of_missing_demonstrations(self) -> None:
+        """Warn of what was set and has no effect now."""
         if self.is_pretrained and self.refresh_weight:
             warnings.warn(
                 "the agent learned from demonstrations and continues without them: pass demonstrations=", stacklevel=6
@@ -373,6 +384,7 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
             self._described = self.describe()
             print(self._described, flush=True)
         self.pretrain()
+        self._score_stored()
         self.start_time = time.time_ns()  # of the frames per second: pre-training has none
         return total_timesteps, callback
 
@@ -412,11 +424,26 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
         memory = None if past is None or self.actor.memory is None else self.actor.memory(past)
         return self.actor.features(observations), actions, memory
 
+    def _score_stored(self) -> None:
+        """Signals of what was stored before they had a weight, which would be 0; those of the present circuits, as for the
+        demonstrations."""
+        buffer = self.replay_buffer
+        weights = self.used_weights
+        is_new = (weights.epistemic and not buffer.epistemic.any()) or (weights.instrumental and not buffer.instrumental.any())
+        if not is_new or not buffer.can_sample:
+            return
+        pairs = np.indices((buffer.size(), buffer.n_envs)).reshape(2, -1)
+        for rows, envs in zip(*(np.array_split(part, 1 + len(part) // PART) for part in pairs), strict=True):
+            scored = self.score(buffer.gather(rows, envs, self._vec_normalize_env))
+            buffer.epistemic[rows, envs], buffer.instrumental[rows, envs] = scored
+
     def score_newest(self) -> tuple[np.ndarray, np.ndarray]:
-        """Generator and prior settle on the newest transitions: r^ep and r^in as they are stored (lines 10, 12 and 13),
-        (n_envs,) each."""
-        newest = self.replay_buffer.sample(self.n_envs, self._vec_normalize_env, None, n_newest=self.n_envs)
-        raw = self.raw_signals(Batch.of(newest, newest.rewards, self.actor))
+        """Signals of the newest transitions, see :meth:`score`, (n_envs,) each."""
+        return self.score(self.replay_buffer.sample(self.n_envs, self._vec_normalize_env, None, n_newest=self.n_envs))
+
+    def score(self, samples: SignalReplaySamples) -> tuple[np.ndarray, np.ndarray]:
+        """Generator and prior settle on transitions: r^ep and r^in as they are stored (lines 10, 12 and 13), (B,) each."""
+        raw = self.raw_signals(Batch.of(samples, samples.rewards, self.actor))
         epistemic, instrumental = self.signals.score(*raw, self.used_weights)
         check_finite("generator", "signals", epistemic, self.num_timesteps)
         check_finite("prior", "signals", instrumental, self.num_timesteps)
@@ -613,7 +640,7 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
         :param keywords: constructor keywords that replace the stored ones; ``demonstrations`` are not in the file
         """
         without = () if keywords.get("demonstrations") is not None else (*NEED_DEMONSTRATIONS, "observation_normalization")
-        return load_weights(cls, path, env, without=without, **keywords)
+        return load_weights(cls, path, env, without=without, fixed=("settling",), **keywords)
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), *_OF_POLICY, *_DERIVED]

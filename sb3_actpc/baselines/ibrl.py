@@ -3,6 +3,7 @@
 from typing import Any, ClassVar
 
 import torch as th
+from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy, ContinuousCritic
 from stable_baselines3.common.torch_layers import create_mlp
 from stable_baselines3.common.type_aliases import PyTorchObs
@@ -85,7 +86,7 @@ class IBRL(TD3Demo):
     """
 
     policy: IBRLPolicy
-    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": IBRLPolicy}
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": IBRLPolicy, "MultiInputPolicy": IBRLPolicy}
 
     @checked
     def __init__(self, *args: Any, gradient_steps: Positive = 5, **options: Any) -> None:
@@ -95,6 +96,10 @@ class IBRL(TD3Demo):
     def _setup_model(self) -> None:
         if self.env is not None and self.demonstrations is None:
             raise ValueError("demonstrations=None: IBRL needs demonstrations for its BC policy, pass a file")
+        if not isinstance(self.observation_space, spaces.Box):
+            raise ValueError(
+                f"IBRL takes Box observations, found {self.observation_space}: use FlattenObservation of gymnasium"
+            )
         super()._setup_model()
 
     def _clone_actor(self) -> None:

@@ -105,7 +105,10 @@ class LOGO(LearnsFromDemonstrations, TRPO):
 
     def _update_info_buffer(self, infos: list[dict[str, Any]], dones: np.ndarray | None = None) -> None:
         super()._update_info_buffer(infos, dones)
-        self._iteration_returns += [info["episode"]["r"] for info in infos if "episode" in info]
+        returns = [info["episode"]["r"] for info in infos if "episode" in info]
+        if self.demonstrations is not None and dones is not None and dones.any() and not returns:
+            raise ValueError("LOGO's δ follows the returns of episodes: wrap the environments in SB3's Monitor or VecMonitor")
+        self._iteration_returns += returns
 
     def train(self) -> None:
         """One iteration: policy improvement (TRPO), then policy guidance, then the adaptation of δ."""

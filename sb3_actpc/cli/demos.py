@@ -1,6 +1,7 @@
 """``sb3-actpc demos``: make, fetch, convert and look at demonstration files."""
 
 import argparse
+import re
 import shlex
 import sys
 from collections.abc import Sequence
@@ -95,7 +96,7 @@ def _collect(args: argparse.Namespace) -> None:
 
 
 def _default_output(env_id: str, suffix: str = "") -> Path:
-    name = env_id.rpartition(":")[2].split("-v")[0].lower().replace("/", "_")
+    name = re.sub(r"-v\d+$", "", env_id.rpartition(":")[2]).lower().replace("/", "_")
     return Path(f"{name.replace('sparse', 'sparse_', 1)}{suffix}.npz")
 
 

@@ -14,7 +14,12 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
     parser = subparsers.add_parser("train", help=about, description=about)
     task = parser.add_mutually_exclusive_group(required=True)
     task.add_argument("--env", help="Gymnasium id, such as SparseHalfCheetah-v5")
-    task.add_argument("--resume", metavar="DIR", help="go on with the run in this folder; a finished one with --steps MORE")
+    task.add_argument(
+        "--resume",
+        metavar="DIR",
+        help="go on with the run in this folder; a finished one with --steps MORE, if its "
+        "demonstrations have moved with --demonstrations",
+    )
     add = parser.add_argument
     add("--algo", help="algorithm, or MODULE:CLASS of your own (default: actpc)")
     add("--preset", metavar="NAME", help="file of hyperparams/, or a path ending in .yml (default: ALGO)")
@@ -41,12 +46,13 @@ def run(args: argparse.Namespace) -> int:
             chosen["env_kwargs"] = parse_assignments(args.env_kwarg or ())
             result = train_run(Run(**chosen, progress=not args.no_progress), report)
         else:
-            others = set(vars(args)) - {"resume", "steps", "no_progress", "command", "debug"}
+            others = set(vars(args)) - {"resume", "steps", "demonstrations", "no_progress", "command", "debug"}
             for name in sorted(others):
                 if getattr(args, name) is not None:
                     raise ValueError(f"--{name.replace('_', '-')} cannot be given with --resume: leave it out")
             more_steps = Run(**given(args, ["steps"])).n_timesteps or 0
-            result = resume_run(Path(args.resume), report, not args.no_progress, more_steps=more_steps)
+            options = {"more_steps": more_steps, "demonstrations": args.demonstrations}
+            result = resume_run(Path(args.resume), report, not args.no_progress, **options)
     except TrainingStopped as stop:
         run_folder = Path(stop.checkpoint).parents[1]
         print(f"sb3-actpc: {stop}; go on with: sb3-actpc train --resume {shlex.quote(str(run_folder))}", file=sys.stderr)

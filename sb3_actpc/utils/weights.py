@@ -2,6 +2,7 @@
 
 import json
 import os
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeVar
@@ -49,6 +50,10 @@ def save_weights(model: OffPolicyAlgorithm, path: str | os.PathLike[str]) -> Pat
     if settings["policy"] is None or unnamed:
         what = ", ".join(unnamed) or f"policy={model.policy_class.__name__}"
         raise ValueError(f"{what} cannot be written by name: only classes of torch, SB3 and sb3_actpc can; use save() instead")
+    if "action_noise" in settings["unnamed"]:
+        warnings.warn(
+            f"action_noise={model.action_noise!r} has no name and is left out: pass it to from_weights", stacklevel=3
+        )
     settings["unnamed"] = []
     settings["keywords"].pop("demonstrations", None)
     header = {
@@ -73,18 +78,23 @@ def load_weights(
     env: GymEnv | str,
     device: th.device | str = "auto",
     without: tuple[str, ...] = (),
+    fixed: tuple[str, ...] = (),
     **overrides: Any,
 ) -> SelfAlgorithm:
     """Make an agent, with an empty replay buffer, from a file of :func:`save_weights`, whose ``.safetensors`` may be left out.
     Nothing in the file is run: it holds numbers and names. The stored keywords in ``without`` are left at the constructor's
-    defaults, ``overrides`` replace the others. FileNotFoundError when there is no such file, ValueError when it is of another
-    kind or version, names an unknown class or does not fit the environment."""
+    defaults, ``overrides`` replace the others, but must not change those in ``fixed``. FileNotFoundError when there is no such
+    file, ValueError when it is of another kind or version, names an unknown class or does not fit the environment."""
     path = Path(path)
     if not path.exists():
         path = _with_suffix(path)
     header, tensors = _read(path)
     if header["algorithm"] != algorithm.__name__:
         raise ValueError(f"{path} holds weights of {header['algorithm']}, not {algorithm.__name__}")
+    for name in fixed:
+        stored = header["settings"]["keywords"].get(name)
+        if overrides.get(name, stored) != stored:
+            raise ValueError(f"{path} was trained with {name}={stored!r}, on which its circuits depend: leave {name}= out")
     for name in without:
         if name not in overrides:
             header["settings"]["keywords"].pop(name, None)

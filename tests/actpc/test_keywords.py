@@ -9,6 +9,8 @@ from sb3_actpc.utils.settings import constructor_settings
 from tests.actpc.agents import SMALL, make
 from tests.actpc.envs import CountingEnv
 
+NO_SIGNALS = {"epistemic": 0.0, "instrumental": 0.0}
+
 
 def test_numpys_numbers_are_numbers():
     settings = {"seed": np.int64(3), "learning_rate": np.float32(1e-3), "gamma": np.float64(0.9)}
@@ -53,3 +55,28 @@ def test_without_demonstrations_an_agent_imitates_its_own_episodes_only_if_told_
     ]
     actions = [model.predict(np.eye(3, dtype=np.float32))[0] for model in learned]
     assert np.array_equal(*actions) != imitates
+
+
+def test_whole_episodes_are_collected_from_one_environment():
+    with pytest.raises(ValueError, match=r"train_freq=\(1, 'episode'\) needs one environment, not 2"):
+        make(n_envs=2, train_freq=(1, "episode"))
+
+
+def test_a_tuple_is_no_observation():
+    for history in (0, 2):
+        with pytest.raises(ValueError, match=r"passed a tuple to the predict\(\) function"):
+            make(policy_kwargs={"memory_history": history}).predict(CountingEnv().reset())
+
+
+def test_what_was_stored_before_a_signal_had_its_weight_is_scored():
+    """As it would have been with the weight from the first step on, by circuits that have not learned since."""
+    late, early = (
+        make(n_envs=2, reward_weights=weights, signal_kwargs={"normalization": "sampled"}, learning_starts=50)
+        for weights in (NO_SIGNALS, {})
+    )
+    late.learn(20)
+    assert not late.replay_buffer.epistemic.any()
+    late.reward_weights = {"epistemic": 1.0}
+    for model in (late.learn(10, reset_num_timesteps=False), early.learn(30)):
+        assert (model.replay_buffer.epistemic[:15] > 0.0).all()
+    np.testing.assert_allclose(late.replay_buffer.epistemic[:15], early.replay_buffer.epistemic[:15], rtol=1e-5)

@@ -130,3 +130,16 @@ def test_a_loaded_replay_buffer_joins_no_two_episodes(tmp_path):
     assert buffer.size() == 55
     assert buffer.dones[49, 0] and buffer.timeouts[49, 0]
     np.testing.assert_array_equal(buffer.observations[51, 0], buffer.next_observations[50, 0])
+
+
+def test_a_loaded_agent_keeps_what_its_circuits_depend_on(tmp_path):
+    """Another settling has other defaults of the critic, and without a gate no policy is deployed."""
+    model = imitating()
+    model.save(tmp_path / "agent")
+    model.save_weights(tmp_path / "agent")
+    for name, value in (("settling", "iterative"), ("guidance", "none")):
+        with pytest.raises(ValueError, match=r"was made with .*, not .*: leave settling, guidance and guidance_kwargs out"):
+            ActPC.load(tmp_path / "agent", env=CountingEnv(), **{name: value})
+        with pytest.raises(ValueError, match=name):
+            ActPC.from_weights(tmp_path / "agent", CountingEnv(), demonstrations=demonstrations(), **{name: value})
+    assert ActPC.load(tmp_path / "agent", settling="scheduled", guidance="default").policy.is_gated

@@ -67,3 +67,8 @@ def test_critics_are_layer_normalized() -> None:
 def test_without_demonstrations_it_is_refused() -> None:
     with pytest.raises(ValueError, match="demonstrations=None: IBRL needs demonstrations"):
         make(demonstrations=None)
+
+
+def test_dict_observations_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"IBRL takes Box observations, found Dict.*FlattenObservation"):
+        IBRL("MultiInputPolicy", "GoalReacher-v5", demonstrations=record(ENV))

@@ -11,7 +11,7 @@ import torch as th
 from sb3_contrib import TRPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_actpc.baselines import LOGO
 from sb3_actpc.demonstrations.dataset import Demonstrations
@@ -154,3 +154,10 @@ def test_bad_settings_and_spaces_that_the_discriminator_cannot_take_are_refused(
         make(guidance_decay=2.0)
     with pytest.raises(ValueError, match="LOGO's discriminator needs Box spaces"):
         make("CartPole-v1")
+
+
+def test_without_returns_of_episodes_it_says_what_is_missing() -> None:
+    env = DummyVecEnv([lambda: gym.make("Pendulum-v1", max_episode_steps=16)])
+    with pytest.raises(ValueError, match="wrap the environments in SB3's Monitor or VecMonitor"):
+        make(env).learn(64)
+    assert LOGO("MlpPolicy", env, **SMALL).learn(64).num_timesteps == 64

@@ -154,3 +154,12 @@ def test_files_that_do_not_fit_are_refused(tmp_path: Path) -> None:
     model.prior.weights[0].fill_(np.inf)
     with pytest.raises(ValueError, match=r"prior\.weights\.0: weights are not finite"):
         model.save_weights(tmp_path / "agent")
+
+
+def test_a_noise_without_a_name_is_left_out_with_a_warning(tmp_path: Path) -> None:
+    class Mine(NormalActionNoise):
+        pass
+
+    model = ActPC("MlpPolicy", make_vec_env(CountingEnv), action_noise=Mine(np.zeros(2), np.ones(2)), seed=0)
+    with pytest.warns(UserWarning, match="action_noise=.* has no name and is left out: pass it to from_weights"):
+        model.save_weights(tmp_path / "agent")

@@ -22,6 +22,7 @@ from sb3_actpc.experiments.runs.evaluation import EpisodeStatistics, NormalizedP
 from sb3_actpc.experiments.runs.presets import find_demonstrations
 from sb3_actpc.utils.files import FolderBusy
 from tests.cli.line import ENV_ID, PLAIN, RESULTS, RUN, TRAIN, rows_of, train
+from tests.recordings import record
 
 
 class StatefulPolicy:
@@ -142,6 +143,20 @@ def test_a_folder_that_was_named_is_refused_while_another_process_trains_in_it(c
         assert {path.name: path.read_bytes() for path in Path("mine").iterdir() if path.is_file()} == kept
         other.kill()
     assert main(on) == 0
+
+
+def test_a_run_goes_on_when_its_demonstrations_have_moved(capsys: pytest.CaptureFixture[str]) -> None:
+    record(ENV_ID).save("shown.npz")
+    record(ENV_ID, 3).save("others.npz")
+    small = ["--set", "guidance_kwargs.bc_updates=2", "--set", "policy_kwargs.net_arch=[4]", "--eval-episodes", "1"]
+    run = ["train", "--env", ENV_ID, "--demonstrations", "shown.npz", "--output", "mine", "--steps", "12", "--no-progress"]
+    assert main([*run, *small]) == 0
+    Path("shown.npz").rename("moved.npz")
+    capsys.readouterr()
+    for more, code, said in (([], 2, "shown.npz"), (["others.npz"], 2, "are not those"), (["moved.npz"], 0, "written to")):
+        where = ["--demonstrations", *more] if more else []
+        assert main(["train", "--resume", "mine", "--steps", "8", "--no-progress", *where]) == code
+        assert said in "".join(capsys.readouterr())
 
 
 def test_a_run_that_begins_anew_in_a_folder_takes_no_normalisation_over() -> None:

@@ -21,6 +21,7 @@ from sb3_actpc.utils.files import atomic_write
 RESULTS, CURVES = "results.csv", "curves.csv.gz"
 RUN_FOLDER = re.compile(r"seed\d+_[0-9a-f]+")
 MEASURES = ("return", "dense_return", "success", *OF_ACTOR.values())  # columns of progress.csv
+NEAR = 0.05  # share of a step, within which an evaluation stands for it
 SETTLED = 5000  # the worst evaluation is taken from this step on
 # of random actions and of the shipped demonstrations; ``python benchmarks/reference_scores.py`` measures them again
 SCORES_FILE = Path(__file__).with_name("reference_scores.csv")
@@ -56,8 +57,11 @@ class Results:
         return {str(name): rows for name, rows in runs.groupby("label")}
 
     def at_step(self, runs: pd.DataFrame, measure: str, step: int) -> pd.Series:
-        """What some of the runs reached in the evaluation at a step, NaN where they have none."""
-        rows = self.curves[self.curves["timesteps"] == step].drop_duplicates("run", keep="last").set_index("run")
+        """What some of the runs reached in the evaluation at a step, or the one nearest to it within ``NEAR`` of it (several
+        environments step at once); NaN where they have none."""
+        distance = (self.curves["timesteps"] - step).abs()
+        near = self.curves[distance <= NEAR * step].assign(distance=distance)[::-1].sort_values("distance", kind="stable")
+        rows = near.drop_duplicates("run").set_index("run")
         return rows.reindex(index=runs.index, columns=[measure])[measure]
 
 

@@ -46,6 +46,8 @@ def write_report(folder: Path, target: Path | None = None, steps: Sequence[int] 
         draw_summary(scores, target / "summary.png")
         files.append(target / "summary.png")
         text.append(f"## Across tasks\n\n{markdown(_aggregate_table(scores))}\n\n![Across tasks](summary.png)")
+    if partial := sorted(set(results.finished.dropna(subset="normalized")["label"]) - scores.keys()):
+        text.append(f"Not compared across tasks, since they did not run on all: {', '.join(partial)}.")
     improvement = improvement_table(results, steps)
     if not improvement.empty:
         text.append(f"## Probability of improvement\n\nOf the return on a task drawn at random.\n\n{markdown(improvement)}")

@@ -57,14 +57,20 @@ def train_run(run: Run, report: Report = silent, callbacks: Sequence[BaseCallbac
 
 
 def resume_run(
-    folder: Path, report: Report = silent, progress: bool = True, callbacks: Sequence[BaseCallback] = (), more_steps: int = 0
+    folder: Path,
+    report: Report = silent,
+    progress: bool = True,
+    callbacks: Sequence[BaseCallback] = (),
+    more_steps: int = 0,
+    demonstrations: str | None = None,
 ) -> dict[str, Any]:
     """Go on with a run from its newest whole checkpoint, with the settings in its ``config.json``, for the steps that it was
-    to have and ``more_steps``, of which a finished run needs some. ``report`` is given a line of text when the run goes on,
-    after each evaluation and for each damaged checkpoint; see :func:`train_run`. FileNotFoundError when the folder is not that
-    of a run, ValueError when the run is finished and gets no more steps, or its checkpoints do not fit, are all damaged, or
-    are not there."""
-    return _run(_continued(folder, more_steps, {"progress": progress}), report, callbacks, resumes=True)
+    to have and ``more_steps``, of which a finished run needs some. ``demonstrations`` is their file, where it has moved.
+    ``report`` is given a line of text when the run goes on, after each evaluation and for each damaged checkpoint; see
+    :func:`train_run`. FileNotFoundError when the folder is not that of a run, ValueError when the run is finished and gets no
+    more steps, or its checkpoints do not fit, are all damaged, or are not there."""
+    changes = {"progress": progress} | ({} if demonstrations is None else {"demonstrations": demonstrations})
+    return _run(_continued(folder, more_steps, changes), report, callbacks, resumes=True)
 
 
 def finish_run(run: Run, report: Report = silent, callbacks: Sequence[BaseCallback] = ()) -> dict[str, Any]:

@@ -27,6 +27,15 @@ def test_a_row_holds_what_the_run_reached(tmp_path: Path) -> None:
     assert row["normalized"] == pytest.approx((100.0 - 18.157) / (2618.606 - 18.157))
 
 
+def test_an_evaluation_next_to_a_step_stands_for_it(tmp_path: Path) -> None:
+    """Several environments step at once, and on-policy methods in rollouts."""
+    write_run(tmp_path, dense=(0.0, 50.0, 100.0))
+    results = load_results(tmp_path)
+    near = [results.at_step(results.runs, "dense_return", step).item() for step in (4_900, 5_100, 9_600)]
+    assert near == [50.0, 50.0, 100.0]
+    assert np.isnan(results.at_step(results.runs, "dense_return", 7_000).item())
+
+
 def test_the_area_weighs_evaluations_by_the_steps_between_them() -> None:
     assert area(np.array([0.0, 10.0, 40.0]), np.array([0.0, 2.0, 2.0])) == pytest.approx((10 * 1 + 30 * 2) / 40)
     assert np.isnan(area(np.array([0.0]), np.array([1.0])))
@@ -51,7 +60,12 @@ def test_the_two_files_make_the_same_report_again(tmp_path: Path) -> None:
     write_report(tmp_path / "kept")
     assert (tmp_path / "kept" / "report.md").read_text(encoding="utf-8").replace("kept", "runs") == first
     assert {name: (tmp_path / "kept" / name).read_bytes() for name in files} == files
-    assert "50.5 ± 0.7" in first and "Runs that are not in the tables" in first and "| 20 |" in first
+    assert (
+        "did not run on all: actpc, td3." in first
+        and "50.5 ± 0.7" in first
+        and "Runs that are not in the tables" in first
+        and "| 20 |" in first
+    )
     write_report(tmp_path / "kept", tmp_path / "other", (5_000,))
     assert "### Return\n\n| variant | at 5,000 |" in (tmp_path / "other" / "report.md").read_text(encoding="utf-8")
     curves = pd.read_csv(tmp_path / "kept" / "curves.csv.gz")
