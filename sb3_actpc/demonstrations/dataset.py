@@ -135,13 +135,19 @@ class Demonstrations:
         ``[*first.episodes, *second.episodes]``.
 
         :param episodes: columns of n rows. ``next_observations`` may be left out where ``observations`` has n + 1 rows, and
-            ``terminations`` where no episode terminated. Dense rewards are kept if all episodes have them
+            ``terminations`` where time limits ended all episodes. Dense rewards are kept if all episodes have them
         :param env_id: the environment that was recorded
         :param metadata: JSON values
         :param source: for error messages
         :raises ValueError: when there are no episodes, or columns do not fit together
-        :warns UserWarning: for features of the observations that float32 cannot follow
+        :warns UserWarning: for features of the observations that float32 cannot follow, and for episodes without
+            ``terminations`` that are shorter than the environment's time limit
         """
+        if isinstance(episodes, Mapping):
+            raise field_error(
+                source, "episodes", "a list of dictionaries, one of each episode", "one dictionary: put it in a list"
+            )
+        _warn_of_missing_terminations(episodes, env_id)
         episodes = [whole_columns(episode, COLUMNS, source) for episode in episodes]
         if not episodes:
             raise field_error(source, "episodes", "at least one episode", "none")
@@ -213,8 +219,7 @@ class Demonstrations:
         :param final_reward: reward of the last step where there are no ``rews``; all others are 0
         :raises ValueError: when something is missing, does not fit together, or is of a Discrete space
         """
-        spec = gym.registry.get(env_id.rpartition(":")[2])
-        limit = None if spec is None else spec.max_episode_steps
+        _, limit = _time_limit(env_id)
         if limit is None and any(one.infos is None and one.terminal for one in trajectories):
             warnings.warn(
                 f"trajectories without infos, of {env_id}, whose time limit is not known: all their ends count as "
@@ -360,3 +365,22 @@ def shipped_demonstrations(env_id: str) -> Path:
 def base_name(env_id: str) -> str:
     """The environment id without the module before a colon and without its version."""
     return re.sub(r"-v\d+$", "", env_id.rpartition(":")[2])
+
+
+def _time_limit(env_id: str) -> tuple[bool, int | None]:
+    """Whether an environment is registered, and the steps of its time limit; None for no limit."""
+    spec = gym.registry.get(env_id.rpartition(":")[2])
+    return spec is not None, None if spec is None else spec.max_episode_steps
+
+
+def _warn_of_missing_terminations(episodes: Sequence[Mapping[str, Any]], env_id: str) -> None:
+    """A UserWarning for episodes without ``terminations`` that no time limit can have ended."""
+    is_known, limit = _time_limit(env_id)
+    without = [one for one in episodes if isinstance(one, Mapping) and one.get("terminations") is None]
+    lengths = [len(one["actions"]) for one in without if np.ndim(one.get("actions", 0))]
+    if is_known and lengths and (limit is None or min(lengths) < limit):
+        warnings.warn(
+            f"episodes without 'terminations' count as ended by a time limit, but one has {min(lengths)} steps and {env_id} "
+            f"{'no limit' if limit is None else f'a limit of {limit}'}: give the column, true where the task ended one",
+            stacklevel=3,
+        )

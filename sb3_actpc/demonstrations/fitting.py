@@ -12,12 +12,13 @@ from gymnasium import spaces
 
 from sb3_actpc.demonstrations.dataset import DATA_FOLDER, Demonstrations, base_name
 from sb3_actpc.demonstrations.recording import wrapper_names
-from sb3_actpc.demonstrations.rows import box_paths, join_observations, split_observations
+from sb3_actpc.demonstrations.rows import box_paths, join_observations, outside_bounds, split_observations
 from sb3_actpc.envs import SPARSE_MUJOCO_IDS, dense_env_id, sparse_env_id
 
 if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecEnv
 
+MOST_OUTSIDE = 0.02  # share of the observations that may lie outside the bounds, which some environments state roughly
 MINARI_ID = re.compile(r"([\w-]+/)*[\w-]+-v\d+")
 
 
@@ -66,8 +67,8 @@ def fit_demonstrations(
     :raises FileNotFoundError: when there is no such file
     :raises ValueError: for demonstrations that are damaged, too few, of another task, or recorded behind other wrappers of
         observations or actions
-    :warns UserWarning: where episodes are longer than the environment's time limit, other wrappers differ, or those of the
-        recording are not known
+    :warns UserWarning: where episodes are longer than the environment's time limit, observations lie outside its bounds, other
+        wrappers differ, or those of the recording are not known
     """
     has_goals = env is not None and env.has_attr("goal_demonstrations")
     demonstrations = resolve(source, None if has_goals else observation_space)  # they may be of the task without goals
@@ -94,6 +95,7 @@ def fit_demonstrations(
         if env_id is not None and base_name(env_id) != base_name(demonstrations.env_id):
             fix += f", or, if it is the same task, rename them: dataclasses.replace(demonstrations, env_id={env_id!r})"
         raise ValueError(f"{error}: {fix}") from None
+    _compare_observations(demonstrations, observation_space)
     if env is None:
         return demonstrations
     _compare_lengths(demonstrations, env)
@@ -105,6 +107,22 @@ def scaled_actions(demonstrations: Demonstrations, action_space: spaces.Box) -> 
     """(N, action_dim) float32, the actions scaled to [-1, 1]."""
     low, high = action_space.low.ravel(), action_space.high.ravel()
     return np.clip(2.0 * (demonstrations.actions - low) / (high - low) - 1.0, -1.0, 1.0).astype(np.float32)
+
+
+def _compare_observations(demonstrations: Demonstrations, space: spaces.Space[Any]) -> None:
+    """A UserWarning for observations of which a part lies outside the bounds, as in other units."""
+    bounds = spaces.flatten_space(space)
+    assert isinstance(bounds, spaces.Box)
+    outside = outside_bounds(demonstrations.observations, bounds)
+    share = outside.any(axis=1).mean()
+    if share > MOST_OUTSIDE:
+        row, column = np.argwhere(outside)[0]
+        warnings.warn(
+            f"{share:.0%} of the demonstrated observations lie outside the bounds of the environment's, such as "
+            f"{demonstrations.observations[row, column]:g} in column {column}, of [{bounds.low[column]:g}, "
+            f"{bounds.high[column]:g}]: bring them to its units",
+            stacklevel=3,
+        )
 
 
 def _compare_lengths(demonstrations: Demonstrations, env: "VecEnv") -> None:

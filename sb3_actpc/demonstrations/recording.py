@@ -163,7 +163,7 @@ def _play(act: Callable[[Any, bool], np.ndarray], env: gym.Env[Any, Any], seed: 
         n_steps = len(columns["actions"])
         action = act(observation, n_steps == 0)
         is_array = not isinstance(action, tuple) and np.shape(action) == env.action_space.shape
-        if not is_array or outside_bounds(np.ravel(action), env.action_space).any():
+        if not is_array or not np.isfinite(action).all() or outside_bounds(np.ravel(action), env.action_space).any():
             raise ValueError(
                 f"the demonstrator gives {action!r} at step {n_steps}: {env_name(env)} takes an array of "
                 f"{env.action_space} (numpy.clip keeps to the bounds; of an agent give itself, not its predict)"

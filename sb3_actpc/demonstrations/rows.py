@@ -65,9 +65,10 @@ def whole_columns(episode: Mapping[str, Any], known: Sequence[str], source: str)
     if not isinstance(episode, Mapping):
         raise field_error(source, "episodes", "a sequence of dictionaries, one of each episode", f"a {type(episode).__name__}")
     given = {name: column for name, column in episode.items() if column is not None}
-    wrong = sorted(given.keys() - set(known)) + sorted({"observations", "actions", "rewards"} - given.keys())
-    if wrong:
-        raise field_error(source, wrong[0], f"some of the columns {', '.join(known)}", f"{', '.join(given)}")
+    if unknown := sorted(given.keys() - set(known)):
+        raise field_error(source, unknown[0], f"some of the columns {', '.join(known)}", f"{', '.join(given)}")
+    if missing := sorted({"observations", "actions", "rewards"} - given.keys()):
+        raise field_error(source, missing[0], "a column of this name, which is needed", f"{', '.join(given) or 'none'}")
     columns = {name: _array(column, name, source) for name, column in given.items()}
     if columns["actions"].dtype.kind != "f":
         expected = "floats, in the units of a Box action space"

@@ -25,8 +25,12 @@ class GaussianNoise(ActionNoise):
 
 
 def as_action_noise(noise: ActionNoise | float | None, shape: tuple[int, ...]) -> ActionNoise | None:
-    """SB3's noise as it is, Gaussian noise for a standard deviation; None for 0 and None."""
+    """SB3's noise as it is, Gaussian noise for a standard deviation; None for 0 and None. ValueError where SB3's is of another
+    shape than an action."""
     if isinstance(noise, ActionNoise):
+        found = np.shape(vars(getattr(noise, "base_noise", noise)).get("_mu", np.zeros(shape)))
+        if found not in ((), (1,), shape):
+            raise ValueError(f"action_noise={noise!r} is of shape {found}, an action of {shape}: give one number for each")
         return noise
     return GaussianNoise(noise, shape) if noise else None
 

@@ -98,7 +98,11 @@ def load_weights(
     for name in without:
         if name not in overrides:
             header["settings"]["keywords"].pop(name, None)
-    model = algorithm(env=env, device=device, **read_settings(header["settings"], overrides))
+    keywords = read_settings(header["settings"], overrides)
+    try:
+        model = algorithm(env=env, device=device, **keywords)
+    except ValueError as error:
+        raise ValueError(f"{path} was trained with observation_space={header['observation_space']}: {error}") from error
     check_spaces(model, header, path)
     _load_normalizers(model, {name: tensors.pop(name) for name in list(tensors) if name.startswith(_NORMALIZERS)}, path)
     try:

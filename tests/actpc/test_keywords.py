@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.noise import NormalActionNoise
 
 from sb3_actpc import ActPC
 from sb3_actpc.utils.settings import constructor_settings
@@ -55,6 +56,11 @@ def test_without_demonstrations_an_agent_imitates_its_own_episodes_only_if_told_
     ]
     actions = [model.predict(np.eye(3, dtype=np.float32))[0] for model in learned]
     assert np.array_equal(*actions) != imitates
+
+
+def test_noise_is_of_the_shape_of_an_action():
+    with pytest.raises(ValueError, match=r"action_noise=.* is of shape \(3,\), an action of \(2,\)"):
+        make(action_noise=NormalActionNoise(np.zeros(3), np.ones(3)))
 
 
 def test_whole_episodes_are_collected_from_one_environment():

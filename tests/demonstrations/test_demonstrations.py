@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import sys
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -14,10 +15,10 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from sb3_actpc.demonstrations import Demonstrations, resolve, shipped_demonstrations
+from sb3_actpc.demonstrations import Demonstrations, fit_demonstrations, resolve, shipped_demonstrations
 from sb3_actpc.demonstrations.npz import FORMAT_VERSION
 from sb3_actpc.utils.files import atomic_write
-from tests.recordings import write_minari
+from tests.recordings import record, write_minari
 
 OBS_DIM, ACTION_DIM = 4, 2
 LENGTHS = (3, 1, 5)
@@ -481,7 +482,7 @@ def test_an_episode_of_ones_own_arrays() -> None:
     ("change", "named"),
     [
         ({"observations": np.zeros((3, 2))}, "'observations': expected .* an observation more than actions, found 3 and 3"),
-        ({"rewards": None}, "'rewards': expected some of the columns .*, found observations, actions"),
+        ({"rewards": None}, "'rewards': expected a column of this name, which is needed, found observations, actions"),
         ({"termination": np.zeros(3)}, "'termination': expected some of the columns observations, actions"),
         ({"rewards": np.ones(2)}, "'rewards': expected 3 rows, as the episode has actions, found 2"),
         ({"terminations": np.zeros(4)}, "'terminations': expected 3 rows, as the episode has actions, found 4"),
@@ -505,6 +506,33 @@ def test_columns_that_are_missing_or_do_not_fit_are_named(change: dict[str, Any]
 def test_what_is_no_sequence_of_like_episodes_says_so() -> None:
     one = {"observations": np.zeros((4, 2)), "actions": np.zeros((3, 1)), "rewards": np.ones(3)}
     wider: Any = {**one, "observations": np.zeros((4, 3))}
-    for given, named in ((one, "found a str"), ([[1.0]], "found a list"), ([], "found none"), ([one, wider], "of one size")):
+    for given, named in (
+        (one, "put it in a list"),
+        ([[1.0]], "found a list"),
+        ([], "found none"),
+        ([one, wider], "of one size"),
+    ):
         with pytest.raises(ValueError, match=named):
             Demonstrations.from_episodes(given, "Mine-v0")  # type: ignore[arg-type]
+
+
+def test_episodes_that_no_time_limit_ended_need_their_terminations() -> None:
+    """Without the column the critic would bootstrap beyond the end."""
+    one = {"observations": np.zeros((4, 3)), "actions": np.zeros((3, 1)), "rewards": np.ones(3)}
+    with pytest.warns(UserWarning, match=r"one has 3 steps and Pendulum-v1 a limit of 200: give the column"):
+        Demonstrations.from_episodes([one], "Pendulum-v1")
+    whole = {"observations": np.zeros((201, 3)), "actions": np.zeros((200, 1)), "rewards": np.ones(200)}
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        Demonstrations.from_episodes([{**one, "terminations": np.zeros(3, dtype=bool)}, whole], "Pendulum-v1")
+
+
+def test_observations_in_other_units_are_warned_of() -> None:
+    shown = record("Pendulum-v1")
+    with gym.make("Pendulum-v1") as env:
+        spaces_ = env.observation_space, env.action_space
+    with pytest.warns(UserWarning, match=r"of the demonstrated observations lie outside the bounds .* of \[-1, 1\]"):
+        fit_demonstrations(dataclasses.replace(shown, observations=10.0 * shown.observations), None, *spaces_)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        fit_demonstrations(shown, None, *spaces_)

@@ -5,7 +5,9 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import pytest
 
+from sb3_actpc.demonstrations.recording import ENDLESS
 from sb3_actpc.experiments.runs import Run, play_episodes, train_run
 
 
@@ -40,3 +42,9 @@ def test_evaluations_stay_at_multiples_of_their_interval_with_several_environmen
     train_run(run.model_copy(update={"output": str(tmp_path / "run"), "progress": False}))
     rows = np.genfromtxt(tmp_path / "run" / "progress.csv", delimiter=",", names=True)
     assert rows["timesteps"].tolist() == [0, 21, 42, 60, 81, 102]
+
+
+def test_an_evaluation_without_an_end_says_what_is_missing() -> None:
+    env = gym.make("Pendulum-v1", max_episode_steps=ENDLESS + 1)
+    with pytest.warns(UserWarning, match=f"evaluation episode has gone on for {ENDLESS} steps: set an end"):
+        play_episodes(Resting(), [env], 1, seed=0)

@@ -5,6 +5,7 @@ import csv
 import math
 import pickle
 import time
+import warnings
 import zlib
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -19,6 +20,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import PolicyPredictor
 
+from sb3_actpc.demonstrations.recording import ENDLESS
 from sb3_actpc.experiments.runs.schema import Run
 from sb3_actpc.utils.files import atomic_write
 from sb3_actpc.utils.tasks import success_of
@@ -131,6 +133,12 @@ def _play_side_by_side(
             played.lengths[first + i] += 1
             played.stages[first + i] = info.get("stage", "")
             playing[i] = not (terminated or truncated)
+            if playing[i] and played.lengths[first + i] == ENDLESS:
+                warnings.warn(
+                    f"an evaluation episode has gone on for {ENDLESS} steps: set an end with gymnasium.wrappers.TimeLimit, or "
+                    "max_episode_steps= of gymnasium.register",
+                    stacklevel=4,
+                )
 
 
 def _stacked(observations: Sequence[Any]) -> Any:

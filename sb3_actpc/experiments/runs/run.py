@@ -106,7 +106,13 @@ def _continued(folder: Path, more_steps: int, changes: Mapping[str, Any]) -> Run
         raise ValueError(f"{folder} has no checkpoint to go on from ({run.algo} {without}): train again, in another folder")
     run = run.model_copy(update={**changes, "n_timesteps": (run.n_timesteps or 0) + more_steps})
     check_env_id(run.env, run.gym_packages)
-    if presets.demonstrations_hash(run) != run.demonstrations_sha256:
+    try:
+        present = presets.demonstrations_hash(run)
+    except FileNotFoundError as error:
+        raise FileNotFoundError(
+            f"{error}; go on in the folder in which the run began, or give the file with --demonstrations"
+        ) from error
+    if present != run.demonstrations_sha256:
         raise ValueError(f"{folder}: the demonstrations ({run.demonstrations}) are not those that the run began with")
     return run
 
