@@ -1,4 +1,4 @@
-"""``sb3-actpc bench``: the time of one update, or of one step of training, as a ratio to SB3's TD3."""
+"""``sb3-actpc bench``: the time of one update as a ratio to SB3's TD3, and of one step of training as a ratio to RLPD."""
 
 import argparse
 
@@ -9,7 +9,9 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
     parser = subparsers.add_parser("bench", help="time one update of ActPC against SB3's TD3")
     parser.add_argument("--rounds", type=count, default=40, help="interleaved measurements (default: %(default)s)")
     parser.add_argument("--threads", type=count, help="torch threads (default: torch's own choice)")
-    parser.add_argument("--training", action="store_true", help="also steps of training, SBX's SAC with sbx-rl")
+    parser.add_argument(
+        "--training", action="store_true", help="also steps of training with four updates, to RLPD with sbx-rl"
+    )
 
 
 def run(args: argparse.Namespace) -> int:
@@ -20,12 +22,11 @@ def run(args: argparse.Namespace) -> int:
 
     if args.threads is not None:
         th.set_num_threads(args.threads)
-    sizes = f"batch {timing.BATCH_SIZE}, {timing.TASK}, {th.get_num_threads()} threads"
-    print(f"{sizes}; median ratios to {timing.BASE}")
-    kinds = {"update": timing.updates}
+    print(f"{timing.TASK}, {th.get_num_threads()} threads, median ratios of times")
+    kinds = {f"update, batch {timing.BATCH_SIZE}": timing.updates}
     if args.training:
-        kinds["step of training"] = timing.training
+        kinds[f"step with {timing.N_UPDATES} updates, batch {timing.STEP_BATCH}"] = timing.training
     for kind, entries in kinds.items():
         for name, ratio in timing.measure(entries(), args.rounds).items():
-            print(f"{kind:16s}  {name:22s} {ratio:6.2f}")
+            print(f"{kind:32s}  {name:28s} {ratio:6.2f}")
     return 0
