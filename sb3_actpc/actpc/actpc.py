@@ -269,6 +269,7 @@ class ActPC(ActPCBase):
             rewards = normalize.get_original_reward()
         last = last_observations(next_observations, dones, infos, normalize)
         # Store (o_t, a_t, r_t, o_t+1), then its signals
+        self._score_stored()
         replay_buffer.add(observations, last, buffer_action, rewards, dones, infos)
         if self.used_weights.has_signals:
             replay_buffer.store_signals(*self.score_newest())

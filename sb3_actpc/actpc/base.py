@@ -69,6 +69,7 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
     expert: DemonstrationReplay | None = None  # the demonstrations, fitted to the environment
     was_made_without_demonstrations: bool
     made_with: Settings  # what the circuits depend on
+    weighted_signals = (False, False)  # whether the epistemic and the instrumental signal of what is stored had a weight
     _used_demonstrations: tuple[Any, ...] = ()
     _described = ""  # what ``learn`` has said
     _rollout_state: tuple[np.ndarray, ...] | None = None  # the working memory of the running episodes
@@ -285,13 +286,17 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
             memory.takes_all = self.actor_guidance.stores == "positive" and not has_negative
             memory.count_from(0.0 if expert is None else expert.failure_reward)
         if self.demonstrations is None:
-            self._warn_of_missing_demonstrations()
+            self._go_on_without_demonstrations()
 
-    def _warn_of_missing_demonstrations(self) -> None:
-        """Warn of what was set and has no effect now."""
+    def _go_on_without_demonstrations(self) -> None:
+        """Turn off what needs them, and warn of what was set and has no effect now."""
+        self.demonstration_fraction = 0.0
+        self.n_demonstrations = None
         if self.is_pretrained and self.refresh_weight:
             warnings.warn(
-                "the agent learned from demonstrations and continues without them: pass demonstrations=", stacklevel=6
+                "the agent learned from demonstrations and continues without them, from now on with demonstration_fraction=0: "
+                "pass demonstrations=",
+                stacklevel=6,
             )
         unused = (self.reward_weights or {}).get("instrumental")
         if unused:
@@ -384,7 +389,6 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
             self._described = self.describe()
             print(self._described, flush=True)
         self.pretrain()
-        self._score_stored()
         self.start_time = time.time_ns()  # of the frames per second: pre-training has none
         return total_timesteps, callback
 
@@ -425,34 +429,47 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
         return self.actor.features(observations), actions, memory
 
     def _score_stored(self) -> None:
-        """Signals of what was stored before they had a weight, which would be 0; those of the present circuits, as for the
-        demonstrations."""
-        buffer = self.replay_buffer
+        """Transitions that were stored before a signal had its weight get the signal now, from the present circuits, as the
+        demonstrated ones do. They would pay 0 else."""
         weights = self.used_weights
-        is_new = (weights.epistemic and not buffer.epistemic.any()) or (weights.instrumental and not buffer.instrumental.any())
-        if not is_new or not buffer.can_sample:
+        weighted = bool(weights.epistemic), bool(weights.instrumental)
+        is_new = [now and not before for now, before in zip(weighted, self.weighted_signals, strict=True)]
+        self.weighted_signals = weighted
+        buffer = self.replay_buffer
+        if not any(is_new) or not buffer.size():
             return
+        if self.optimize_memory_usage:
+            raise ValueError(
+                f"reward_weights={self.reward_weights!r} were set after transitions were stored with "
+                "optimize_memory_usage=True, which does not keep the last observations: give them to the constructor"
+            )
+        if self.expert is not None:
+            self.expert.has_signals = False
+        of_new = weights._replace(epistemic=is_new[0] * weights.epistemic, instrumental=is_new[1] * weights.instrumental)
         pairs = np.indices((buffer.size(), buffer.n_envs)).reshape(2, -1)
         for rows, envs in zip(*(np.array_split(part, 1 + len(part) // PART) for part in pairs), strict=True):
-            scored = self.score(buffer.gather(rows, envs, self._vec_normalize_env))
-            buffer.epistemic[rows, envs], buffer.instrumental[rows, envs] = scored
+            epistemic, instrumental = self.score(buffer.gather(rows, envs, self._vec_normalize_env), of_new)
+            if is_new[0]:
+                buffer.epistemic[rows, envs] = epistemic
+            if is_new[1]:
+                buffer.instrumental[rows, envs] = instrumental
 
     def score_newest(self) -> tuple[np.ndarray, np.ndarray]:
         """Signals of the newest transitions, see :meth:`score`, (n_envs,) each."""
-        return self.score(self.replay_buffer.sample(self.n_envs, self._vec_normalize_env, None, n_newest=self.n_envs))
+        newest = self.replay_buffer.sample(self.n_envs, self._vec_normalize_env, None, n_newest=self.n_envs)
+        return self.score(newest, self.used_weights)
 
-    def score(self, samples: SignalReplaySamples) -> tuple[np.ndarray, np.ndarray]:
+    def score(self, samples: SignalReplaySamples, weights: RewardWeights) -> tuple[np.ndarray, np.ndarray]:
         """Generator and prior settle on transitions: r^ep and r^in as they are stored (lines 10, 12 and 13), (B,) each."""
-        raw = self.raw_signals(Batch.of(samples, samples.rewards, self.actor))
-        epistemic, instrumental = self.signals.score(*raw, self.used_weights)
+        raw = self.raw_signals(Batch.of(samples, samples.rewards, self.actor), weights)
+        epistemic, instrumental = self.signals.score(*raw, weights)
         check_finite("generator", "signals", epistemic, self.num_timesteps)
         check_finite("prior", "signals", instrumental, self.num_timesteps)
         self.diagnostics.follow(epistemic_signal=epistemic.mean(), instrumental_signal=instrumental.mean())
         return raw if self.signals.normalization == "sampled" else (epistemic, instrumental)
 
-    def raw_signals(self, batch: Batch) -> tuple[np.ndarray, np.ndarray]:
+    def raw_signals(self, batch: Batch, weights: RewardWeights) -> tuple[np.ndarray, np.ndarray]:
         """r̂^ep and r̂^in of transitions, (B,) each; zeros where the signal has no weight."""
-        weights = self.used_weights
         epistemic, instrumental = np.zeros((2, len(batch.features)), dtype=np.float32)
         if weights.epistemic:
             epistemic = self.epistemic.score(batch).cpu().numpy()
@@ -478,7 +495,7 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
             last = self._n_updates - 1
             is_due = last // RESCORING_INTERVAL > (last - n_batches) // RESCORING_INTERVAL
             if is_due or not expert.has_signals:
-                expert.rescore(self.raw_signals, self.signals.rescored, actor, env)
+                expert.rescore(lambda batch: self.raw_signals(batch, weights), self.signals.rescored, actor, env)
         # Replayed transitions of all minibatches at once
         sizes = self.policy.batch_sizes(batch_size)
         del sizes["prior"]
@@ -547,6 +564,7 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
             "rollout_state": self._rollout_state,
             "rollout_starts": self._rollout_starts,
             "signals": self.signals.checkpoint_state(),
+            "weighted_signals": list(self.weighted_signals),
             "expert_signals": None if expert is None else [expert.epistemic, expert.instrumental, expert.has_signals],
             "diagnostics": dict(self.diagnostics.values),
             "guidance": self.actor_guidance.state_dict(),
@@ -572,6 +590,7 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
         self._rollout_state = state["rollout_state"]
         self._rollout_starts = state["rollout_starts"]
         self.signals.restore_checkpoint_state(state["signals"])
+        self.weighted_signals = tuple(state["weighted_signals"])
         self.diagnostics.values = dict(state["diagnostics"])
         self.actor_guidance.load_state_dict(state["guidance"])
 
@@ -640,7 +659,7 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
         :param keywords: constructor keywords that replace the stored ones; ``demonstrations`` are not in the file
         """
         without = () if keywords.get("demonstrations") is not None else (*NEED_DEMONSTRATIONS, "observation_normalization")
-        return load_weights(cls, path, env, without=without, fixed=("settling",), **keywords)
+        return load_weights(cls, path, env, without=without, **keywords)
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), *_OF_POLICY, *_DERIVED]

@@ -178,7 +178,8 @@ class ActPCActor(BasePolicy):
 
         As with SB3's recurrent policies, a bare ``predict(obs)`` then acts with an empty memory.
         """
-        if self.memory is None or isinstance(observation, tuple):  # SB3 says what is wrong with a tuple
+        is_reset = isinstance(observation, tuple) and len(observation) == 2 and isinstance(observation[1], dict)
+        if self.memory is None or is_reset:  # SB3 says what is wrong with what ``env.reset`` returns
             return super().predict(observation, state, episode_start, deterministic)
         observations, vectorized = self.obs_to_tensor(observation)
         n_envs = len(next(iter(observations.values())) if isinstance(observations, dict) else observations)

@@ -106,8 +106,11 @@ class LOGO(LearnsFromDemonstrations, TRPO):
     def _update_info_buffer(self, infos: list[dict[str, Any]], dones: np.ndarray | None = None) -> None:
         super()._update_info_buffer(infos, dones)
         returns = [info["episode"]["r"] for info in infos if "episode" in info]
-        if self.demonstrations is not None and dones is not None and dones.any() and not returns:
-            raise ValueError("LOGO's δ follows the returns of episodes: wrap the environments in SB3's Monitor or VecMonitor")
+        is_guided = self.demonstrations is not None and self.delta > ZERO_DELTA
+        if is_guided and dones is not None and dones.any() and not returns:
+            raise ValueError(
+                "LOGO's δ follows the returns of episodes: make SB3's Monitor (or VecMonitor) the outermost wrapper"
+            )
         self._iteration_returns += returns
 
     def train(self) -> None:

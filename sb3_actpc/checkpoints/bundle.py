@@ -17,7 +17,7 @@ import numpy as np
 
 from sb3_actpc.utils.files import file_hash, named_errors
 
-VERSION = 13
+VERSION = 14
 MANIFEST = "manifest.json"
 _NAME = re.compile(r"\d{6}_step_\d+")
 _TEMPORARY = ".writing-"

@@ -147,8 +147,8 @@ class Demonstrations:
             raise field_error(
                 source, "episodes", "a list of dictionaries, one of each episode", "one dictionary: put it in a list"
             )
-        _warn_of_missing_terminations(episodes, env_id)
-        episodes = [whole_columns(episode, COLUMNS, source) for episode in episodes]
+        given = list(episodes)
+        episodes = [whole_columns(episode, COLUMNS, source) for episode in given]
         if not episodes:
             raise field_error(source, "episodes", "at least one episode", "none")
         columns = {}
@@ -159,7 +159,9 @@ class Demonstrations:
                 raise field_error(source, name, "rows of one size in every episode", str(error)) from None
         warn_of_indistinguishable(columns["observations"], source)
         starts = np.cumsum([0, *(len(episode["rewards"]) for episode in episodes[:-1])])
-        return cls(**columns, episode_starts=starts, env_id=env_id, metadata=dict(metadata or {}), source=source)
+        made = cls(**columns, episode_starts=starts, env_id=env_id, metadata=dict(metadata or {}), source=source)
+        _warn_of_missing_terminations([len(one["rewards"]) for one in given if one.get("terminations") is None], env_id)
+        return made
 
     @classmethod
     def record(
@@ -219,7 +221,8 @@ class Demonstrations:
         :param final_reward: reward of the last step where there are no ``rews``; all others are 0
         :raises ValueError: when something is missing, does not fit together, or is of a Discrete space
         """
-        _, limit = _time_limit(env_id)
+        spec = gym.registry.get(env_id.rpartition(":")[2])
+        limit = None if spec is None else spec.max_episode_steps
         if limit is None and any(one.infos is None and one.terminal for one in trajectories):
             warnings.warn(
                 f"trajectories without infos, of {env_id}, whose time limit is not known: all their ends count as "
@@ -367,18 +370,13 @@ def base_name(env_id: str) -> str:
     return re.sub(r"-v\d+$", "", env_id.rpartition(":")[2])
 
 
-def _time_limit(env_id: str) -> tuple[bool, int | None]:
-    """Whether an environment is registered, and the steps of its time limit; None for no limit."""
+def _warn_of_missing_terminations(lengths: Sequence[int], env_id: str) -> None:
+    """A UserWarning for episodes without ``terminations``, of these lengths, that no time limit can have ended."""
     spec = gym.registry.get(env_id.rpartition(":")[2])
-    return spec is not None, None if spec is None else spec.max_episode_steps
-
-
-def _warn_of_missing_terminations(episodes: Sequence[Mapping[str, Any]], env_id: str) -> None:
-    """A UserWarning for episodes without ``terminations`` that no time limit can have ended."""
-    is_known, limit = _time_limit(env_id)
-    without = [one for one in episodes if isinstance(one, Mapping) and one.get("terminations") is None]
-    lengths = [len(one["actions"]) for one in without if np.ndim(one.get("actions", 0))]
-    if is_known and lengths and (limit is None or min(lengths) < limit):
+    if not lengths or spec is None:
+        return
+    limit = spec.max_episode_steps
+    if limit is None or min(lengths) < limit:
         warnings.warn(
             f"episodes without 'terminations' count as ended by a time limit, but one has {min(lengths)} steps and {env_id} "
             f"{'no limit' if limit is None else f'a limit of {limit}'}: give the column, true where the task ended one",

@@ -12,13 +12,13 @@ from gymnasium import spaces
 
 from sb3_actpc.demonstrations.dataset import DATA_FOLDER, Demonstrations, base_name
 from sb3_actpc.demonstrations.recording import wrapper_names
-from sb3_actpc.demonstrations.rows import box_paths, join_observations, outside_bounds, split_observations
+from sb3_actpc.demonstrations.rows import box_paths, join_observations, split_observations
 from sb3_actpc.envs import SPARSE_MUJOCO_IDS, dense_env_id, sparse_env_id
 
 if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecEnv
 
-MOST_OUTSIDE = 0.02  # share of the observations that may lie outside the bounds, which some environments state roughly
+MOST_OUTSIDE = 0.02  # share of observations that may leave their bounds, and of the range by which: some are stated roughly
 MINARI_ID = re.compile(r"([\w-]+/)*[\w-]+-v\d+")
 
 
@@ -95,9 +95,12 @@ def fit_demonstrations(
         if env_id is not None and base_name(env_id) != base_name(demonstrations.env_id):
             fix += f", or, if it is the same task, rename them: dataclasses.replace(demonstrations, env_id={env_id!r})"
         raise ValueError(f"{error}: {fix}") from None
-    _compare_observations(demonstrations, observation_space)
     if env is None:
         return demonstrations
+    from stable_baselines3.common.vec_env import VecNormalize, unwrap_vec_wrapper  # heavy: demonstrations do without
+
+    if unwrap_vec_wrapper(env, VecNormalize) is None:  # which changes the bounds of images
+        _compare_observations(demonstrations, observation_space)
     _compare_lengths(demonstrations, env)
     _check_wrappers(demonstrations, env)
     return _transposed(demonstrations, env).rewarded_by(env)
@@ -113,14 +116,19 @@ def _compare_observations(demonstrations: Demonstrations, space: spaces.Space[An
     """A UserWarning for observations of which a part lies outside the bounds, as in other units."""
     bounds = spaces.flatten_space(space)
     assert isinstance(bounds, spaces.Box)
-    outside = outside_bounds(demonstrations.observations, bounds)
+    [columns] = np.nonzero(np.isfinite(bounds.low) & np.isfinite(bounds.high))
+    if not len(columns):
+        return
+    low, high = bounds.low[columns], bounds.high[columns]
+    slack = MOST_OUTSIDE * (high - low)
+    rows = demonstrations.observations[:, columns] if len(columns) < len(bounds.low) else demonstrations.observations
+    outside = (rows < low - slack) | (rows > high + slack)
     share = outside.any(axis=1).mean()
     if share > MOST_OUTSIDE:
         row, column = np.argwhere(outside)[0]
         warnings.warn(
-            f"{share:.0%} of the demonstrated observations lie outside the bounds of the environment's, such as "
-            f"{demonstrations.observations[row, column]:g} in column {column}, of [{bounds.low[column]:g}, "
-            f"{bounds.high[column]:g}]: bring them to its units",
+            f"{share:.0%} of the demonstrated observations lie outside the environment's bounds, such as "
+            f"{rows[row, column]:g} in column {columns[column]}, of [{low[column]:g}, {high[column]:g}]: use its units",
             stacklevel=3,
         )
 

@@ -1,7 +1,7 @@
 """Exploration noise that is given as a number."""
 
 import numpy as np
-from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.noise import ActionNoise, NormalActionNoise, OrnsteinUhlenbeckActionNoise
 
 
 class GaussianNoise(ActionNoise):
@@ -28,11 +28,24 @@ def as_action_noise(noise: ActionNoise | float | None, shape: tuple[int, ...]) -
     """SB3's noise as it is, Gaussian noise for a standard deviation; None for 0 and None. ValueError where SB3's is of another
     shape than an action."""
     if isinstance(noise, ActionNoise):
-        found = np.shape(vars(getattr(noise, "base_noise", noise)).get("_mu", np.zeros(shape)))
-        if found not in ((), (1,), shape):
-            raise ValueError(f"action_noise={noise!r} is of shape {found}, an action of {shape}: give one number for each")
+        parts = vars(getattr(noise, "base_noise", noise))
+        if isinstance(noise, (NormalActionNoise, OrnsteinUhlenbeckActionNoise)) and not fits(
+            shape, parts["_mu"], parts["_sigma"]
+        ):
+            raise ValueError(
+                f"action_noise={noise!r} does not fit an action of shape {shape}: give a number for each dimension"
+            )
         return noise
     return GaussianNoise(noise, shape) if noise else None
+
+
+def fits(shape: tuple[int, ...], *arrays: np.ndarray) -> bool:
+    """Whether arrays, together, have a number for each entry of the shape."""
+    try:
+        found = np.broadcast_shapes(*map(np.shape, arrays))
+        return found != () and np.broadcast_shapes(found, shape) == shape
+    except ValueError:
+        return False
 
 
 def noise_with_state(noise: ActionNoise | None) -> ActionNoise | None:

@@ -78,31 +78,22 @@ def load_weights(
     env: GymEnv | str,
     device: th.device | str = "auto",
     without: tuple[str, ...] = (),
-    fixed: tuple[str, ...] = (),
     **overrides: Any,
 ) -> SelfAlgorithm:
     """Make an agent, with an empty replay buffer, from a file of :func:`save_weights`, whose ``.safetensors`` may be left out.
     Nothing in the file is run: it holds numbers and names. The stored keywords in ``without`` are left at the constructor's
-    defaults, ``overrides`` replace the others, but must not change those in ``fixed``. FileNotFoundError when there is no such
-    file, ValueError when it is of another kind or version, names an unknown class or does not fit the environment."""
+    defaults, ``overrides`` replace the others. FileNotFoundError when there is no such file, ValueError when it is of another
+    kind or version, names an unknown class or does not fit the environment."""
     path = Path(path)
     if not path.exists():
         path = _with_suffix(path)
     header, tensors = _read(path)
     if header["algorithm"] != algorithm.__name__:
         raise ValueError(f"{path} holds weights of {header['algorithm']}, not {algorithm.__name__}")
-    for name in fixed:
-        stored = header["settings"]["keywords"].get(name)
-        if overrides.get(name, stored) != stored:
-            raise ValueError(f"{path} was trained with {name}={stored!r}, on which its circuits depend: leave {name}= out")
     for name in without:
         if name not in overrides:
             header["settings"]["keywords"].pop(name, None)
-    keywords = read_settings(header["settings"], overrides)
-    try:
-        model = algorithm(env=env, device=device, **keywords)
-    except ValueError as error:
-        raise ValueError(f"{path} was trained with observation_space={header['observation_space']}: {error}") from error
+    model = algorithm(env=env, device=device, **read_settings(header["settings"], overrides))
     check_spaces(model, header, path)
     _load_normalizers(model, {name: tensors.pop(name) for name in list(tensors) if name.startswith(_NORMALIZERS)}, path)
     try:

@@ -7,7 +7,7 @@ from stable_baselines3.common.noise import NormalActionNoise
 
 from sb3_actpc import ActPC
 from sb3_actpc.utils.settings import constructor_settings
-from tests.actpc.agents import SMALL, make
+from tests.actpc.agents import SMALL, imitating, make
 from tests.actpc.envs import CountingEnv
 
 NO_SIGNALS = {"epistemic": 0.0, "instrumental": 0.0}
@@ -59,8 +59,10 @@ def test_without_demonstrations_an_agent_imitates_its_own_episodes_only_if_told_
 
 
 def test_noise_is_of_the_shape_of_an_action():
-    with pytest.raises(ValueError, match=r"action_noise=.* is of shape \(3,\), an action of \(2,\)"):
+    with pytest.raises(ValueError, match=r"action_noise=.* does not fit an action of shape \(2,\)"):
         make(action_noise=NormalActionNoise(np.zeros(3), np.ones(3)))
+    with pytest.raises(ValueError, match="give a number for each dimension"):
+        make(action_noise=NormalActionNoise(0.0, 0.1))
 
 
 def test_whole_episodes_are_collected_from_one_environment():
@@ -74,15 +76,41 @@ def test_a_tuple_is_no_observation():
             make(policy_kwargs={"memory_history": history}).predict(CountingEnv().reset())
 
 
-def test_what_was_stored_before_a_signal_had_its_weight_is_scored():
-    """As it would have been with the weight from the first step on, by circuits that have not learned since."""
-    late, early = (
-        make(n_envs=2, reward_weights=weights, signal_kwargs={"normalization": "sampled"}, learning_starts=50)
-        for weights in (NO_SIGNALS, {})
-    )
+def late_and_early(**keywords):
+    """Agents that have not learned: one whose signals get their weight after 10 steps, and one that has it from the start."""
+    keywords = {"n_envs": 2, "signal_kwargs": {"normalization": "sampled"}, "learning_starts": 90, **keywords}
+    late, early = (make(reward_weights=weights, **keywords) for weights in (NO_SIGNALS, {}))
     late.learn(20)
     assert not late.replay_buffer.epistemic.any()
     late.reward_weights = {"epistemic": 1.0}
-    for model in (late.learn(10, reset_num_timesteps=False), early.learn(30)):
-        assert (model.replay_buffer.epistemic[:15] > 0.0).all()
-    np.testing.assert_allclose(late.replay_buffer.epistemic[:15], early.replay_buffer.epistemic[:15], rtol=1e-5)
+    return late.learn(10, reset_num_timesteps=False), early.learn(30)
+
+
+@pytest.mark.parametrize("n_steps", [1, 3])
+def test_what_was_stored_before_a_signal_had_its_weight_is_scored(n_steps):
+    late, early = (model.replay_buffer.epistemic[:15] for model in late_and_early(n_steps=n_steps))
+    assert (early > 0.0).all()
+    np.testing.assert_allclose(late, early, rtol=1e-5)
+
+
+def test_a_signal_that_had_its_weight_keeps_what_was_stored():
+    """Another one gets a weight; and one that loses its weight is scored anew when it has it again."""
+    model = imitating(reward_weights={"epistemic": 1.0}, signal_kwargs={"prior_updates": 5})
+    model.learn(40)
+    stored = model.replay_buffer.epistemic[:40].copy()
+    model.reward_weights = {"epistemic": 1.0, "instrumental": 1.0}
+    model.learn(10, reset_num_timesteps=False)
+    buffer, shown = model.replay_buffer, model.expert
+    assert np.array_equal(buffer.epistemic[:40], stored) and (stored > 0.0).all()
+    assert (buffer.instrumental[:50] > 0.0).all() and (shown.instrumental > 0.0).all()
+    for weights in ({}, {"epistemic": 1.0}):
+        model.reward_weights = weights
+        model.learn(10, reset_num_timesteps=False)
+    assert (buffer.epistemic[:70] > 0.0).all()
+
+
+def test_signals_that_get_a_weight_late_need_the_ends_of_episodes():
+    model = imitating(optimize_memory_usage=True, replay_buffer_kwargs={"handle_timeout_termination": False}).learn(20)
+    model.reward_weights = {"instrumental": 1.0}
+    with pytest.raises(ValueError, match=r"which does not keep the last observations: give them to the constructor"):
+        model.learn(5)

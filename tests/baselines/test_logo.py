@@ -158,6 +158,6 @@ def test_bad_settings_and_spaces_that_the_discriminator_cannot_take_are_refused(
 
 def test_without_returns_of_episodes_it_says_what_is_missing() -> None:
     env = DummyVecEnv([lambda: gym.make("Pendulum-v1", max_episode_steps=16)])
-    with pytest.raises(ValueError, match="wrap the environments in SB3's Monitor or VecMonitor"):
+    with pytest.raises(ValueError, match=r"make SB3's Monitor .* the outermost wrapper"):
         make(env).learn(64)
     assert LOGO("MlpPolicy", env, **SMALL).learn(64).num_timesteps == 64

@@ -14,6 +14,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
+from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_actpc.demonstrations import Demonstrations, fit_demonstrations, resolve, shipped_demonstrations
 from sb3_actpc.demonstrations.npz import FORMAT_VERSION
@@ -524,15 +525,18 @@ def test_episodes_that_no_time_limit_ended_need_their_terminations() -> None:
     whole = {"observations": np.zeros((201, 3)), "actions": np.zeros((200, 1)), "rewards": np.ones(200)}
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        Demonstrations.from_episodes([{**one, "terminations": np.zeros(3, dtype=bool)}, whole], "Pendulum-v1")
+        made = Demonstrations.from_episodes([{**one, "terminations": np.zeros(3, dtype=bool)}, whole], "Pendulum-v1")
+        assert_equal(Demonstrations.from_episodes(made.episodes, "Pendulum-v1"), made)
 
 
 def test_observations_in_other_units_are_warned_of() -> None:
     shown = record("Pendulum-v1")
-    with gym.make("Pendulum-v1") as env:
-        spaces_ = env.observation_space, env.action_space
-    with pytest.warns(UserWarning, match=r"of the demonstrated observations lie outside the bounds .* of \[-1, 1\]"):
-        fit_demonstrations(dataclasses.replace(shown, observations=10.0 * shown.observations), None, *spaces_)
+    env = DummyVecEnv([lambda: gym.make("Pendulum-v1")])
+    spaces_ = env.observation_space, env.action_space
+    with pytest.warns(
+        UserWarning, match=r"of the demonstrated observations lie outside the environment's bounds, .* of \[-1, 1\]"
+    ):
+        fit_demonstrations(dataclasses.replace(shown, observations=10.0 * shown.observations), env, *spaces_)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        fit_demonstrations(shown, None, *spaces_)
+        fit_demonstrations(shown, env, *spaces_)

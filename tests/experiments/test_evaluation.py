@@ -46,5 +46,5 @@ def test_evaluations_stay_at_multiples_of_their_interval_with_several_environmen
 
 def test_an_evaluation_without_an_end_says_what_is_missing() -> None:
     env = gym.make("Pendulum-v1", max_episode_steps=ENDLESS + 1)
-    with pytest.warns(UserWarning, match=f"evaluation episode has gone on for {ENDLESS} steps: set an end"):
+    with pytest.warns(UserWarning, match=f"evaluation episode has gone on for {ENDLESS} steps: limit it"):
         play_episodes(Resting(), [env], 1, seed=0)

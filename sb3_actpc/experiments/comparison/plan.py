@@ -8,7 +8,6 @@ from typing import Any
 
 from sb3_actpc.demonstrations import fit_demonstrations
 from sb3_actpc.experiments.runs import ALGORITHMS, Run, resolve
-from sb3_actpc.experiments.runs.algorithms import load_algorithm
 from sb3_actpc.experiments.runs.environments import check_env_id, make_train_env
 from sb3_actpc.experiments.runs.presets import CAN_BE_NONE, read_yaml
 from sb3_actpc.experiments.runs.schema import MAX_SEED, Count, Schema, Seed, merged
@@ -18,7 +17,6 @@ from sb3_actpc.utils.files import folder_name
 OWN_KEYS = ("envs", "algos", "seeds", "first_seed", "output")
 PLANNED = {"seed", "progress", "output"}  # what the comparison itself says of each of its runs
 OF_TASKS, OF_VARIANTS = {"env", "task"}, {"algo", "name", "task_prefix"}  # keys of an entry of envs, and of algos
-OF_STEPS = ("n_timesteps", "eval_freq")
 VARIANTS_FILE = Path(__file__).with_name("variants.yml")
 
 
@@ -102,16 +100,10 @@ def _fill(shared: Run, task: Run, variant: Run) -> Run:
     the command and not each of its runs."""
     module, colon, name = task.env.rpartition(":")
     env_id = f"{module}{colon}{name.replace('Sparse', variant.task_prefix or 'Sparse', 1)}"
-    said = merged(shared, task, variant)
-    is_offline = getattr(load_algorithm(variant.algo), "is_offline", False)
-    if is_offline:  # steps and evaluations are those of its updates: its own, or its preset's and the last
-        said = {name: value for name, value in said.items() if name not in OF_STEPS or name in variant.model_fields_set}
-    run = Run(**{**said, "env": env_id, "task": task.task or task.env, "progress": False})
+    run = Run(**{**merged(shared, task, variant), "env": env_id, "task": task.task or task.env, "progress": False})
     check_env_id(env_id, run.gym_packages)
     try:
         run = resolve(run)
-        if is_offline and variant.eval_freq is None:
-            run = run.model_copy(update={"eval_freq": run.n_timesteps})
         own_demonstrations = run.demonstrations not in ("shipped", "none")
         if own_demonstrations or run.env_kwargs:
             with closing(make_train_env(run.env, run.env_kwargs, 1, run.seed)) as env:

@@ -135,8 +135,8 @@ def _play_side_by_side(
             playing[i] = not (terminated or truncated)
             if playing[i] and played.lengths[first + i] == ENDLESS:
                 warnings.warn(
-                    f"an evaluation episode has gone on for {ENDLESS} steps: set an end with gymnasium.wrappers.TimeLimit, or "
-                    "max_episode_steps= of gymnasium.register",
+                    f"an evaluation episode has gone on for {ENDLESS} steps: limit it with gymnasium.wrappers.TimeLimit, or "
+                    "max_episode_steps= of gymnasium.register, if it never ends",
                     stacklevel=4,
                 )
 

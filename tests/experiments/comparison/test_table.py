@@ -11,7 +11,7 @@ import yaml
 from sb3_actpc.cli import main
 from sb3_actpc.demonstrations import shipped_demonstrations
 from sb3_actpc.experiments.comparison import plan_runs, read_comparison, variant_names
-from sb3_actpc.experiments.runs import ALGORITHMS, Run, load_preset
+from sb3_actpc.experiments.runs import ALGORITHMS, Run
 from sb3_actpc.experiments.runs.schema import content_id
 
 HOPPER = str(shipped_demonstrations("SparseHopper-v5"))
@@ -51,14 +51,6 @@ def test_an_id_follows_the_content_of_a_run_and_nothing_else() -> None:
         plan(steps=500, seeds=2)[1:],
     ]
     assert len({run.id, *(other[0].id for other in others)}) == 1 + len(others)
-
-
-def test_offline_methods_keep_their_gradient_steps() -> None:
-    """The comparison's steps are environment steps."""
-    own = {"name": "short", "base": "bc", "steps": 7, "eval_freq": 3}
-    cloned, short, online = plan(steps=400, eval_freq=40, algos=["bc", own, "td3"])
-    assert cloned.n_timesteps == cloned.eval_freq == load_preset("bc", "SparseReacher-v5")["n_timesteps"] != 400
-    assert (short.n_timesteps, short.eval_freq, online.n_timesteps, online.eval_freq) == (7, 3, 400, 40)
 
 
 def test_a_file_says_the_same_as_the_options(capsys: pytest.CaptureFixture[str]) -> None:
