@@ -142,6 +142,7 @@ class ActPCBase(LearnsFromDemonstrations, StoresLastTransition):
                 f"reward_weights['epistemic']={epistemic:g} does not work with optimize_memory_usage=True, which overwrites "
                 "the last observations of episodes: use optimize_memory_usage=False or a weight of 0"
             )
+        self._convert_train_freq()  # that may have been set since
         assert isinstance(self.train_freq, TrainFreq)
         if self.train_freq.unit is TrainFrequencyUnit.EPISODE and self.n_envs > 1:
             raise ValueError(f"train_freq=({self.train_freq.frequency}, 'episode') needs one environment, not {self.n_envs}")

@@ -68,6 +68,9 @@ def test_noise_is_of_the_shape_of_an_action():
 def test_whole_episodes_are_collected_from_one_environment():
     with pytest.raises(ValueError, match=r"train_freq=\(1, 'episode'\) needs one environment, not 2"):
         make(n_envs=2, train_freq=(1, "episode"))
+    model = make().learn(15)
+    model.train_freq = 5
+    assert model.learn(11, reset_num_timesteps=False).num_timesteps == 30
 
 
 def test_a_tuple_is_no_observation():
