@@ -48,7 +48,8 @@ OTHERS = {
     "LOGO": "logo",
     "BC-RNN": "bc_rnn",
 }
-CLONE_FIRST = ("ibrl", "td3_bc", "ddpg_demo")  # evaluated at step 0 before their BC, with the version that was measured
+CLONE_FIRST = ("ibrl", "td3_bc", "ddpg_demo")
+CLONED_LATER = ("Hopper-suboptimal", "Walker2d-suboptimal")  # there these were evaluated at step 0 before their BC
 # dense rewards without demonstrations: name of a row -> variant
 DENSE = {"ActPC, `n_steps=3`": "actpc", "TD3": "TD3", "SAC": "SAC"}
 DENSE_TASKS = ("HalfCheetah-v5", "Hopper-v5")
@@ -88,23 +89,26 @@ def table(results: Results, task: str, steps: Sequence[int]) -> list[str]:
 def others_table(others: Results, short: Results, task: str) -> list[str]:
     """Lines of the table of the other baselines, and of ActPC, RLPD and BC with the same seeds."""
     groups = others.groups(task)
-    seeds = set(groups["ibrl"]["seed"])
+    steps = STEPS["steps_10000"][task]
+    seeds = {seed for runs in groups.values() for seed in runs["seed"]}
     rows = []
     for policy, (variant, measure) in POLICIES.items():
         runs = short.groups(task)[variant]
         runs = runs[runs["seed"].isin(seeds)]
-        rows.append([policy, str(len(runs)), *(spread(short.at_step(runs, measure, step)) for step in SHORT)])
+        rows.append([policy, str(len(runs)), *(spread(short.at_step(runs, measure, step)) for step in steps)])
     for policy, variant in OTHERS.items():
+        if variant not in groups:
+            continue
         if variant == "bc_rnn":
-            cells = [spread(groups[variant]["return"]), *[""] * (len(SHORT) - 1)]
+            cells = [spread(groups[variant]["return"]), *[""] * (len(steps) - 1)]
         else:
-            cells = [spread(others.at_step(groups[variant], "return", step)) for step in SHORT]
-            cells[0] = "" if variant in CLONE_FIRST else cells[0]
+            cells = [spread(others.at_step(groups[variant], "return", step)) for step in steps]
+            cells[0] = "" if variant in CLONE_FIRST and task in CLONED_LATER else cells[0]
         rows.append([policy, str(len(groups[variant])), *cells])
     cloned = short.groups(task)["bc"]
     cloned = cloned[cloned["seed"].isin(seeds)]
-    rows.append(["plain BC", str(len(cloned)), spread(cloned["return"]), *[""] * (len(SHORT) - 1)])
-    return lines_of(["steps", "seeds", *(f"{step:,}" for step in SHORT)], rows)
+    rows.append(["plain BC", str(len(cloned)), spread(cloned["return"]), *[""] * (len(steps) - 1)])
+    return lines_of(["steps", "seeds", *(f"{step:,}" for step in steps)], rows)
 
 
 def listed(values: pd.Series, digits: int) -> str:
@@ -227,7 +231,7 @@ def tables() -> dict[str, list[str]]:
         steps = [step for step in tasks[reported[0]] if step]
         found[f"{folder}: probability of improvement"] = improvement_table(results, steps, reported)
     others, short = load_results(FOLDER / "baselines_10000"), load_results(FOLDER / "steps_10000")
-    for task in ("Hopper-suboptimal", "Walker2d-suboptimal"):
+    for task in others.finished["task"].unique():
         found[f"baselines_10000: {task}"] = others_table(others, short, task)
     dense = load_results(FOLDER / "dense_50000")
     for task in DENSE_TASKS:
