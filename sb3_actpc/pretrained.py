@@ -112,7 +112,7 @@ def load_agent(path: Path, env: GymEnv | str, **keywords: Any) -> ActPC:
     header, tensors = read_tensors(path, "save_agent")
     if header.get("format") != FORMAT:
         raise ValueError(f"{path} has the format {header.get('format')!r}, this version reads {FORMAT!r}")
-    refused = sorted({"demonstrations", "guidance", "guidance_kwargs", "policy_kwargs", "settling"} & keywords.keys())
+    refused = sorted({"demonstrations", "guidance", "guidance_kwargs", "policy_kwargs"} & keywords.keys())
     if refused:
         raise ValueError(f"{refused[0]}= does not go with a bundled agent, which only acts: train a new agent instead")
     settings = read_settings(header["settings"], {"buffer_size": BUFFER_SIZE, "guidance": "none", **keywords})

@@ -268,8 +268,9 @@ class ActPC(ActPCBase):
             next_observations = normalize.get_original_obs()
             rewards = normalize.get_original_reward()
         last = last_observations(next_observations, dones, infos, normalize)
-        # Store (o_t, a_t, r_t, o_t+1), then its signals
+        # A signal that has a weight only now scores what is stored
         self._score_stored()
+        # Store (o_t, a_t, r_t, o_t+1), then its signals
         replay_buffer.add(observations, last, buffer_action, rewards, dones, infos)
         if self.used_weights.has_signals:
             replay_buffer.store_signals(*self.score_newest())

@@ -21,7 +21,6 @@ BATCH_SIZE, WIDTH, N_FILLED = 256, 256, 1000  # of one update
 N_STEPS = 50  # environment steps of one measurement of training
 N_UPDATES, N_CRITICS, STEP_BATCH = 4, 2, 128  # of one step of training, ActPC's defaults and rlpd.yml's
 N_WARM_UP = 3  # rounds that do not count
-TD3_BASE, RLPD_BASE = "SB3 TD3", "RLPD"
 # preset -> what shortens the training before the first step
 QUICK: dict[str, dict[str, Any]] = {
     "actpc": {"signal_kwargs.prior_updates": 1, "guidance_kwargs.bc_updates": 1, "guidance_kwargs.critic_warmup": 1},
@@ -54,7 +53,7 @@ def updates() -> Entries:
     """Two updates of each learner (TD3 moves its actor every other time), on random transitions; TD3's first."""
     shared: dict[str, Any] = {"learning_starts": 2 * N_STEPS, "batch_size": BATCH_SIZE, "buffer_size": 100 * N_FILLED}
     shared |= {"gradient_steps": 1, "device": "cpu", "seed": 0}
-    models: dict[str, Any] = {TD3_BASE: TD3("MlpPolicy", TASK, policy_kwargs={"net_arch": [WIDTH, WIDTH]}, **shared)}
+    models: dict[str, Any] = {"SB3 TD3": TD3("MlpPolicy", TASK, policy_kwargs={"net_arch": [WIDTH, WIDTH]}, **shared)}
     for name, quick in QUICK.items():
         models[f"ActPC, {name}.yml"] = ActPC(env=TASK, **{**with_changes(preset(TASK, name), quick), **shared})
     entries: Entries = {}
@@ -77,8 +76,8 @@ def training() -> Entries:
     if find_spec("sbx"):
         from sb3_actpc.baselines import RLPD
 
-        models[RLPD_BASE] = RLPD("MlpPolicy", TASK, policy_kwargs={**net_arch, "n_critics": N_CRITICS}, **shared)
-    models[TD3_BASE] = TD3("MlpPolicy", TASK, policy_kwargs=net_arch, **shared)
+        models["RLPD"] = RLPD("MlpPolicy", TASK, policy_kwargs={**net_arch, "n_critics": N_CRITICS}, **shared)
+    models["SB3 TD3"] = TD3("MlpPolicy", TASK, policy_kwargs=net_arch, **shared)
     models["SB3 SAC"] = SAC("MlpPolicy", TASK, policy_kwargs=net_arch, **shared)
     models["ActPC, actpc.yml"] = ActPC(env=TASK, **{**with_changes(preset(TASK, "actpc"), QUICK["actpc"]), **shared})
     models["ActPC without demonstrations"] = ActPC("MlpPolicy", TASK, **shared)

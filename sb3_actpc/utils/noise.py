@@ -28,10 +28,8 @@ def as_action_noise(noise: ActionNoise | float | None, shape: tuple[int, ...]) -
     """SB3's noise as it is, Gaussian noise for a standard deviation; None for 0 and None. ValueError where SB3's is of another
     shape than an action."""
     if isinstance(noise, ActionNoise):
-        parts = vars(getattr(noise, "base_noise", noise))
-        if isinstance(noise, (NormalActionNoise, OrnsteinUhlenbeckActionNoise)) and not fits(
-            shape, parts["_mu"], parts["_sigma"]
-        ):
+        base = getattr(noise, "base_noise", noise)  # of several environments
+        if isinstance(base, (NormalActionNoise, OrnsteinUhlenbeckActionNoise)) and not fits(shape, base._mu, base._sigma):
             raise ValueError(
                 f"action_noise={noise!r} does not fit an action of shape {shape}: give a number for each dimension"
             )
