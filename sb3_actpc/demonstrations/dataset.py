@@ -182,7 +182,7 @@ class Demonstrations:
         :param env: any Gymnasium environment with Box actions and Box observations, or a Dict of such; or its id
         :param n_episodes: episodes wanted
         :param only_successes: keep only episodes that end with a true ``info["is_success"]`` (or ``"success"``); None: all but
-            those that end with a false one
+            those that end with a false one; False: all
         :param metadata: JSON values to keep with the demonstrations
         :param options: ``deterministic`` (of ``predict``, true by default), ``seed``, ``max_tries`` and ``report``, see
             :func:`~sb3_actpc.demonstrations.recording.record_episodes`

@@ -66,6 +66,7 @@ def record_episodes(
     actors = [_actor(demonstrator, deterministic) for demonstrator in demonstrators]
     episodes: list[Columns] = []
     n_tries = 0
+    is_reported = False  # whether an environment says that an episode succeeded; some say nothing of a failure
     while len(episodes) < n_episodes and n_tries < max_tries:
         turn = len(episodes) % len(actors)
         start = getattr(demonstrators[turn], "start", None)
@@ -73,10 +74,18 @@ def record_episodes(
             start(seed + n_tries)
         episode, info = _play(actors[turn], env, seed + n_tries)
         n_tries += 1
-        if _is_kept(info, only_successes):
+        success = success_of(info)
+        is_reported |= success is not None
+        succeeded = not only_successes if success is None else bool(success)
+        if succeeded or only_successes is False:
             episodes.append(episode)
             returns = f"return {sum(episode['rewards']):.1f}, dense {sum(episode['dense_rewards']):.1f}"
             report(f"episode {len(episodes)}/{n_episodes} (try {n_tries}): {returns}")
+    if only_successes and not is_reported:
+        raise ValueError(
+            "only_successes=True needs an environment whose info has is_success or success, found neither at the end of "
+            f"{n_tries} episodes of {env_name(env)}: give False to keep every episode"
+        )
     if len(episodes) < n_episodes:
         raise ValueError(
             f"only {len(episodes)} of {n_tries} episodes succeeded in {env_name(env)}, {n_episodes} are needed: take a better "
@@ -181,12 +190,3 @@ def _play(act: Callable[[Any, bool], np.ndarray], env: gym.Env[Any, Any], seed: 
             limit = "limit it with gymnasium.wrappers.TimeLimit if it never ends"
             warnings.warn(f"an episode of {env_name(env)} has gone on for {ENDLESS} steps: {limit}", stacklevel=2)
     return columns, info
-
-
-def _is_kept(info: Mapping[str, Any], only_successes: bool | None) -> bool:
-    success = success_of(info)
-    if success is None and only_successes:
-        raise ValueError(
-            "only_successes=True needs an environment whose info has is_success or success: give False to keep every episode"
-        )
-    return only_successes is False or success is None or bool(success)

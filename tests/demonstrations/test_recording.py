@@ -17,7 +17,7 @@ from tests.recordings import record
 class Corridor(gym.Env[Any, Any]):
     """Counts its steps; ends by itself after ``length`` steps with success in every second episode."""
 
-    def __init__(self, length: int = 4, reports: bool = True, is_dict: bool = False, dense: bool = False) -> None:
+    def __init__(self, length: int = 4, reports: bool | str = True, is_dict: bool = False, dense: bool = False) -> None:
         self.length, self.reports, self.is_dict, self.dense, self.episode = length, reports, is_dict, dense, -1
         box = spaces.Box(-100, 100, (2,), np.float32)
         # not in alphabetical order
@@ -35,7 +35,8 @@ class Corridor(gym.Env[Any, Any]):
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         self.t += 1
-        info: dict[str, Any] = {"is_success": self.episode % 2 == 1} if self.reports else {}
+        succeeds = self.episode % 2 == 1
+        info: dict[str, Any] = {"is_success": succeeds} if self.reports is True or (succeeds and self.reports) else {}
         if self.dense:
             info["dense_reward"] = 10.0 * self.t
         return self.observe(), float(self.t), self.t == self.length, False, info
@@ -80,9 +81,16 @@ def test_a_time_limit_is_no_termination_and_dense_rewards_are_kept_apart() -> No
 
 @pytest.mark.parametrize(
     ("reports", "only_successes", "episodes"),
-    [(True, None, [1, 3]), (True, True, [1, 3]), (True, False, [0, 1]), (False, None, [0, 1])],
+    [
+        (True, None, [1, 3]),
+        (True, True, [1, 3]),
+        (True, False, [0, 1]),
+        (False, None, [0, 1]),
+        ("successes alone", True, [1, 3]),
+        ("successes alone", None, [0, 1]),
+    ],
 )
-def test_successes_only_unless_told_otherwise(reports: bool, only_successes: bool | None, episodes: list[int]) -> None:
+def test_successes_only_unless_told_otherwise(reports: bool | str, only_successes: bool | None, episodes: list[int]) -> None:
     shown = Demonstrations.record(forward, Corridor(reports=reports), 2, only_successes)
     assert sorted(set(shown.observations[:, 0])) == episodes
     assert shown.metadata["n_tries"] == episodes[-1] + 1
