@@ -262,8 +262,10 @@ class BC(OfflineAlgorithm):
 
     def _take(self, demonstrations: Demonstrations) -> None:
         assert isinstance(self.action_space, spaces.Box)
-        self.policy.normalization.fit(demonstrations.observations)
-        self._observations = self.policy.normalized(demonstrations.observations)
+        if not self._n_updates:  # a loaded agent keeps its statistics
+            self.policy.normalization.fit(demonstrations.observations)
+        self._demonstrated = demonstrations.observations
+        self._observations = self.policy.normalized(self._demonstrated)
         self._actions = th.as_tensor(scaled_actions(demonstrations, self.action_space), device=self.device)
         bounds = demonstrations.episode_bounds
         lengths = bounds[:, 1] - bounds[:, 0]
@@ -278,7 +280,7 @@ class BC(OfflineAlgorithm):
         self._smallest_error = np.inf
         self._networks = [self._new_policy() for _ in range(self.n_seeds)] if held_out.any() else [self.policy]
         for network in self._networks:
-            network.normalization.fit(demonstrations.observations)
+            network.normalization.load_state_dict(self.policy.normalization.state_dict())
         if self._n_updates:  # an agent that was loaded
             self._go_on_from_policy()
 
@@ -289,6 +291,7 @@ class BC(OfflineAlgorithm):
             self._go_on_from_policy()
 
     def _go_on_from_policy(self) -> None:
+        self._observations = self.policy.normalized(self._demonstrated)
         for network in self._networks:
             network.load_state_dict(self.policy.state_dict())
         self._smallest_error = np.inf
@@ -331,7 +334,15 @@ class BC(OfflineAlgorithm):
         return inputs + noise * th.randn_like(inputs) if noise else inputs
 
     def _excluded_save_params(self) -> list[str]:
-        own = ["_observations", "_actions", "_episode_ends", "_training_rows", "_validation_rows", "_networks"]
+        own = [
+            "_demonstrated",
+            "_observations",
+            "_actions",
+            "_episode_ends",
+            "_training_rows",
+            "_validation_rows",
+            "_networks",
+        ]
         return [*super()._excluded_save_params(), *own]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:

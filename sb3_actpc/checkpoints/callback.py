@@ -15,7 +15,6 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from sb3_actpc.checkpoints.bundle import Report, find_bundle, list_bundles, write_bundle
 from sb3_actpc.checkpoints.interrupts import StopSignals, TrainingStopped
 from sb3_actpc.checkpoints.state import Restored, capture_model, describe_model, restore
-from sb3_actpc.utils.callbacks import callback_tree
 from sb3_actpc.utils.checks import check_finite
 from sb3_actpc.utils.settings import constructor_settings, read_settings
 
@@ -176,3 +175,13 @@ def continue_learning(restored: Restored, callback: MaybeCallback = None, **opti
     finally:
         for saver in savers:
             saver.close()
+
+
+def callback_tree(callback: Any) -> list[BaseCallback]:
+    """A callback and all in it, lists left out, in the order in which they are called."""
+    if isinstance(callback, CallbackList):
+        return [one for child in callback.callbacks for one in callback_tree(child)]
+    if not isinstance(callback, BaseCallback):
+        return []
+    children = [getattr(callback, name, None) for name in ("callback", "callback_on_new_best")]  # SB3's EvalCallback has both
+    return [callback, *(one for child in children for one in callback_tree(child))]

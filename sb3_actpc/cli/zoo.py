@@ -38,6 +38,8 @@ def run(args: argparse.Namespace) -> int:
     for options in (["-conf", "--conf-file"], ["--preset"], ["--demonstrations"], ["--output"]):
         parser.add_argument(*options)
     ours, rest = parser.parse_known_args(args.arguments)
+    if len(ours.env) > 1 and args.zoo_command != "plot":
+        raise ValueError(f"--env {' '.join(ours.env)}: zoo {args.zoo_command} takes one environment, only plot takes several")
     module, _, name = SCRIPTS[args.zoo_command].partition(":")
     function = getattr(import_extra(f"rl_zoo3.{module}", "zoo"), name)
     given = sys.argv

@@ -49,15 +49,3 @@ def dense_env_id(env_id: str) -> str:
     if env_id not in SPARSE_MUJOCO_IDS:
         raise ValueError(f"env_id={env_id!r} is not a sparse MuJoCo task: choose one of {', '.join(SPARSE_MUJOCO_IDS)}")
     return env_id.removeprefix("Sparse")
-
-
-__all__ = [
-    "GOAL_MUJOCO_IDS",
-    "ROBOSUITE_IDS",
-    "SPARSE_IDS",
-    "SPARSE_MUJOCO_IDS",
-    "UNSEEN_SEED",
-    "dense_env_id",
-    "register_envs",
-    "sparse_env_id",
-]

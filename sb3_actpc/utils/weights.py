@@ -85,9 +85,13 @@ def load_weights(
     defaults, ``overrides`` replace the others. FileNotFoundError when there is no such file, ValueError when it is of another
     kind or version, names an unknown class or does not fit the environment."""
     path = Path(path)
-    if not path.exists():
+    if not path.is_file():
         path = _with_suffix(path)
-    header, tensors = _read(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"no file of weights at {path}")
+    header, tensors = read_tensors(path, "save_weights")
+    if header.get("version") != VERSION:
+        raise ValueError(f"{path} has format version {header.get('version')}, this sb3_actpc reads {VERSION}")
     if header["algorithm"] != algorithm.__name__:
         raise ValueError(f"{path} holds weights of {header['algorithm']}, not {algorithm.__name__}")
     for name in without:
@@ -106,15 +110,6 @@ def load_weights(
 
 def _with_suffix(path: Path) -> Path:
     return path if path.suffix == _SUFFIX else path.with_name(path.name + _SUFFIX)
-
-
-def _read(path: Path) -> tuple[dict[str, Any], dict[str, th.Tensor]]:
-    if not path.is_file():
-        raise FileNotFoundError(f"no file of weights at {path}")
-    header, tensors = read_tensors(path, "save_weights")
-    if header.get("version") != VERSION:
-        raise ValueError(f"{path} has format version {header.get('version')}, this sb3_actpc reads {VERSION}")
-    return header, tensors
 
 
 def read_tensors(path: Path, writer: str) -> tuple[dict[str, Any], dict[str, th.Tensor]]:

@@ -144,6 +144,27 @@ def test_a_loaded_agent_goes_on_from_its_policy(kind: type[BC], tmp_path: Path) 
     assert error(loaded) < 0.02 and error(make(kind, demonstrations=shown)) > 0.1
 
 
+@pytest.mark.parametrize("gets_env", ["with load", "later"])
+def test_a_loaded_agent_learns_new_demonstrations_in_the_units_it_was_made_for(gets_env: str, tmp_path: Path) -> None:
+    """Their spread is another one. What is learned is what is played."""
+    rng = np.random.default_rng(0)
+
+    def shown(scale: float) -> Demonstrations:
+        observations = rng.normal(0.0, scale, (200, 3))
+        return demonstrated(np.clip(observations[:, :1], -2, 2), observations, [0, 50, 100, 150])
+
+    model = make(demonstrations=shown(1.0), policy_kwargs={"net_arch": [32]}, learning_rate=0.01).learn(200)
+    model.save(tmp_path / "model.zip")
+    new = shown(0.1)
+    keywords: dict[str, Any] = {"env": gym.make(ENV)} if gets_env == "with load" else {}
+    loaded = BC.load(tmp_path / "model.zip", demonstrations=new, learning_rate=1e-3, device="cpu", **keywords)
+    if gets_env == "later":
+        loaded.set_env(make_vec_env(ENV))
+    loaded.learn(300)
+    error = np.square(loaded.predict(new.observations)[0] - new.actions).mean() / new.actions.var()
+    assert error < 0.1
+
+
 def test_a_saved_agent_names_its_demonstrations_as_they_were_given(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     record(ENV).save("mine.npz")

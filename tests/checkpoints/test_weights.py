@@ -70,6 +70,14 @@ def test_weights_are_loaded_without_running_code(tmp_path: Path, request: pytest
     loaded.learn(150)
 
 
+def test_a_folder_of_the_same_name_is_not_in_the_way(tmp_path: Path) -> None:
+    make_actpc(CountingEnv).save_weights(tmp_path / "agent")
+    (tmp_path / "agent").mkdir()
+    assert ActPC.from_weights(tmp_path / "agent", make_vec_env(CountingEnv)).num_timesteps == 0
+    with pytest.raises(FileNotFoundError, match=r"no file of weights at .*other.safetensors"):
+        ActPC.from_weights(tmp_path / "other", make_vec_env(CountingEnv))
+
+
 def test_weights_with_demonstrations_go_on_learning_from_new_ones(tmp_path: Path) -> None:
     model = make_actpc(CountingEnv, demonstrations=demonstrations(), n_demonstrations=2)
     path = model.learn(30).save_weights(tmp_path / "agent.safetensors")

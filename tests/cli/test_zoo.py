@@ -44,6 +44,7 @@ MISTAKES = {
     "optimize --algo td3 --env SparseReacher-v5": "zoo optimize does not know what to vary for 'td3'",
     "enjoy --env SparseReacher-v5 --preset td3": "--preset and --demonstrations are for training",
     "enjoy --env Mine-v0": "give MODULE:Mine-v0",
+    "train --env SparseReacher-v5 SparseHopper-v5": "zoo train takes one environment",
     "train --env SparseReacher-v5 --demonstrations no.npz": "no demonstrations file at no.npz",
     "train --env SparseReacher-v5 -conf c.yml --demonstrations none": "without --conf-file",
     "optimize --env SparseReacher-v5 -conf c.yml --preset td3": "without --conf-file",

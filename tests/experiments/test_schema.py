@@ -159,3 +159,12 @@ def test_a_source_tree_with_changes_is_marked(tmp_path: Path) -> None:
     assert commit is not None and len(commit) == 40 and dirty is False
     (tmp_path / "file").write_text("2")
     assert git_state(tmp_path) == (commit, True)
+
+
+def test_a_run_of_a_device_that_is_not_here_is_read_but_not_trained(tmp_path: Path) -> None:
+    """It plays on the CPU."""
+    write_config(Run(env="SparseReacher-v5", device="abacus", output=str(tmp_path)))
+    run = read_run(tmp_path)
+    assert run.device == "abacus"
+    with pytest.raises(ValueError, match="device='abacus'"):
+        resolve(run)

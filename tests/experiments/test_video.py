@@ -1,5 +1,6 @@
 """What a video needs of an environment."""
 
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,14 @@ class Idle:
 def robot_share(frame: np.ndarray) -> float:
     """Share of the pixels that are orange, as Gymnasium's robots are; floors and skies are not."""
     return float((frame[..., 0].astype(int) - frame[..., 2] > 40).mean())
+
+
+def test_a_missing_extra_leaves_a_note_as_a_machine_that_cannot_render_does(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "imageio.v2", None)
+    note = video.video_note(Idle(), "Hopper-v5", {}, tmp_path / "x.gif", 0)
+    assert note.startswith("no video: ") and "sb3-actpc[experiments]" in note
 
 
 class FarHopper(HopperEnv):

@@ -22,7 +22,7 @@ from sb3_actpc.experiments.runs.algorithms import check_keywords, default_preset
 from sb3_actpc.experiments.runs.environments import make_env
 from sb3_actpc.experiments.runs.schema import Run, merged
 from sb3_actpc.utils.arguments import check_settings
-from sb3_actpc.utils.checks import Settings, check_kind
+from sb3_actpc.utils.checks import Settings, check_device, check_kind
 from sb3_actpc.utils.constructors import constructor_keywords
 from sb3_actpc.utils.files import file_hash
 from sb3_actpc.utils.preset_files import preset_path
@@ -81,6 +81,7 @@ def resolve(run: Run) -> Run:
     filled in; one that is already is returned as it is. FileNotFoundError when the preset or the demonstrations file does not
     exist, ValueError when a setting is unknown or has a wrong value, or a sparse task has no demonstrations, ImportError when
     the algorithm is of another package that is not installed."""
+    check_device("device", run.device)  # not where a run is read: elsewhere it plays on the CPU
     if run.is_resolved:
         return run
     if not run.env:

@@ -208,10 +208,11 @@ def _train(
     if saver is not None and run.continuable:
         saver.save()
     model.logger.close()
+    result = record.write_result(run)  # before checkpoints go: a run that is killed now need not begin anew
     # one of the finished run, so that it can be given more steps; or none
     for bundle in list_bundles(checkpoints)[: -1 if run.continuable else None]:
         shutil.rmtree(bundle)
-    return record.write_result(run)
+    return result
 
 
 def _begun(run: Run, model: BaseAlgorithm, report: Report) -> Run:

@@ -15,7 +15,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, AliasChoices, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
 from sb3_actpc.experiments.runs.algorithms import known_algorithm
-from sb3_actpc.utils.checks import check_device, nearest
+from sb3_actpc.utils.checks import nearest
 from sb3_actpc.utils.files import folder_name
 
 VERSION = 2  # of config.json
@@ -99,7 +99,7 @@ class Run(Schema):
     keep: Literal["last", "best"] = "last"  # the agent of which evaluation (best: dense return) is kept as ``model.zip``
     target_return: Real | None = None  # the training ends at the first evaluation whose mean dense return reaches it
     output: str | None = None  # run folder; by default ``runs/<env>/<algo>_<preset>_seed<seed>``
-    device: Annotated[str, AfterValidator(lambda name: check_device("device", name) or name)] = "cpu"  # torch's
+    device: str = "cpu"  # torch's
     threads: Annotated[Count, Field(le=1024)] = 1  # that torch uses
     progress: bool = True  # show a progress bar
     continuable: bool = True  # keep the last checkpoint of a finished run, so that it can be given more steps

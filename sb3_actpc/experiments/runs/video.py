@@ -52,11 +52,13 @@ def check_video_path(path: Path) -> None:
 
 
 def video_note(*arguments: Any) -> str:
-    """What became of :func:`record_video`, in one line: a machine that cannot render is no error."""
+    """What became of :func:`record_video`, in one line: a machine that cannot render, or lacks the extra, is no error."""
     try:
         return f"video of {record_video(*arguments)} frames written to {arguments[3]}"
     except RenderingUnavailable as error:
         return f"no video: rendering is not available here ({' '.join(str(error).split())})"
+    except ImportError as error:
+        return f"no video: {error}"
 
 
 def record_video(
