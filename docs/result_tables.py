@@ -26,6 +26,8 @@ STEPS: dict[str, dict[str, Sequence[int]]] = {
         "Walker2d-suboptimal": SHORT,
         "Swimmer-suboptimal": SHORT,
         "Walker2d": SHORT,
+        "Hopper-five": SHORT,
+        "Walker2d-five": SHORT,
         "SparseReacher-v5": (0, 2_000, 4_000, 6_000, 8_000),
     },
     "steps_50000": {"Hopper-suboptimal": LONG, "Walker2d-suboptimal": LONG},
@@ -35,6 +37,8 @@ NAMES = {
     "Walker2d-suboptimal": "Walker2d",
     "Swimmer-suboptimal": "Swimmer",
     "Walker2d": "Walker2d, shipped demonstrations",
+    "Hopper-five": "Hopper, five demonstrations",
+    "Walker2d-five": "Walker2d, five demonstrations",
     "SparseReacher-v5": "Reacher, shipped demonstrations",
 }
 # the other baselines: name -> variant, in a folder of their own, with fewer seeds
@@ -62,7 +66,8 @@ DOOR = {
     "no critic term, deployed policy": ("imitation", "return"),
     "RLPD": ("rlpd", "return"),
 }
-REPORTED = ("Hopper-suboptimal", "Walker2d-suboptimal", "Swimmer-suboptimal", "Walker2d")  # no settings were chosen on them
+# no settings were chosen on them
+REPORTED = ("Hopper-suboptimal", "Walker2d-suboptimal", "Swimmer-suboptimal", "Walker2d", "Hopper-five", "Walker2d-five")
 
 
 def spread(values: pd.Series) -> str:
