@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
+from gymnasium.envs.registration import EnvSpec
 from stable_baselines3 import DDPG, SAC, TD3
 from stable_baselines3.common.env_util import make_vec_env
 
@@ -174,8 +175,9 @@ class Named(gym.Wrapper):
         return "a pendulum <at rest>"
 
 
-def test_an_environment_may_describe_itself() -> None:
-    if "Named-v0" not in gym.registry:
-        gym.register("Named-v0", entry_point=lambda: Named(gym.make("Pendulum-v1").unwrapped), max_episode_steps=10)
+def test_an_environment_may_describe_itself(monkeypatch: pytest.MonkeyPatch) -> None:
+    # for this test alone: others use the id unregistered
+    spec = EnvSpec("Named-v0", lambda: Named(gym.make("Pendulum-v1").unwrapped), max_episode_steps=10)
+    monkeypatch.setitem(gym.registry, "Named-v0", spec)
     shown = Demonstrations.record(lambda observation: -observation[1:2], "Named-v0", n_episodes=2)
     assert TD3Demo("MlpPolicy", "Named-v0", demonstrations=shown, **SMALL).learn(5).num_timesteps == 5
