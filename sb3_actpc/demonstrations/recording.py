@@ -52,11 +52,8 @@ def record_episodes(
 
     For the other parameters see ``Demonstrations.record``.
     """
-    for name, value, least in (
-        ("n_episodes", n_episodes, 1),
-        ("max_tries", 1 if max_tries is None else max_tries, 1),
-        ("seed", seed, 0),
-    ):
+    counts = {"n_episodes": (n_episodes, 1), "max_tries": (1 if max_tries is None else max_tries, 1), "seed": (seed, 0)}
+    for name, (value, least) in counts.items():
         if not isinstance(value, Integral) or int(value) < least:
             raise ValueError(f"{name}={value!r} must be at least {least}, a whole number")
     if not isinstance(env.action_space, spaces.Box):
@@ -81,16 +78,13 @@ def record_episodes(
             episodes.append(episode)
             returns = f"return {sum(episode['rewards']):.1f}, dense {sum(episode['dense_rewards']):.1f}"
             report(f"episode {len(episodes)}/{n_episodes} (try {n_tries}): {returns}")
-    if only_successes and not is_reported:
-        raise ValueError(
-            "only_successes=True needs an environment whose info has is_success or success, found neither at the end of "
-            f"{n_tries} episodes of {env_name(env)}: give False to keep every episode"
-        )
     if len(episodes) < n_episodes:
+        needs = "; only_successes=True needs an environment whose info has is_success or success"
         raise ValueError(
             f"only {len(episodes)} of {n_tries} episodes succeeded in {env_name(env)}, {n_episodes} are needed: take a better "
             "demonstrator (train it longer: --steps), allow more tries (--max-tries, max_tries=), ask for fewer episodes "
             "(--episodes, n_episodes=), or keep those that fail too (only_successes=False)"
+            f"{needs if only_successes and not is_reported else ''}"
         )
     made_by = {"seed": seed, "n_tries": n_tries, "deterministic": deterministic, "wrappers": wrapper_names(str(env))}
     simulators = [name for name in ("gymnasium", "mujoco", "robosuite") if name in sys.modules]
