@@ -35,6 +35,20 @@ def test_a_missing_extra_leaves_a_note_as_a_machine_that_cannot_render_does(
     assert note.startswith("no video: ") and "sb3-actpc[experiments]" in note
 
 
+class Broken(Idle):
+    """A policy with a fault of its own."""
+
+    def predict(self, observation: np.ndarray, **_: Any) -> tuple[np.ndarray, None]:
+        raise RuntimeError("my fault")
+
+
+def test_a_policys_own_error_is_not_taken_for_a_machine_that_cannot_render(tmp_path: Path) -> None:
+    if video.choose_gl_backend() is None:
+        pytest.skip("this machine cannot render")
+    with pytest.raises(RuntimeError, match="my fault"):
+        video.video_note(Broken(), "Hopper-v5", {}, tmp_path / "x.gif", 0)
+
+
 class FarHopper(HopperEnv):
     """Moves 1 m a step; its model has a camera."""
 

@@ -88,27 +88,26 @@ def record_video(
 
 @contextlib.contextmanager
 def _rendering(env_id: str, env_kwargs: dict[str, Any]) -> Iterator[Any]:
-    """The environment, made to render, and closed in the end; what goes wrong in a renderer as ``RenderingUnavailable``."""
+    """The environment, made to render, and closed in the end; ``RenderingUnavailable`` when it renders no first image."""
     import gymnasium as gym
     from mujoco import FatalError
 
     from sb3_actpc.experiments.runs.environments import make_env
 
-    try:
+    with contextlib.ExitStack() as opened:
         try:
-            env = make_env(env_id, env_kwargs, render_mode="rgb_array")
-        except ValueError as error:  # it takes no render_mode
-            raise RenderingUnavailable(str(error)) from error
-        with contextlib.closing(env):
+            env = opened.enter_context(contextlib.closing(make_env(env_id, env_kwargs, render_mode="rgb_array")))
             if env.render_mode is None:
-                raise RenderingUnavailable(f"{env_id} takes render_mode and does not keep it")
+                raise ValueError(f"{env_id} takes render_mode and does not keep it")
             if not CAMERA_KEYWORDS & env_kwargs.keys():
                 _follow_robot(env.unwrapped)
-            yield env
-    except RenderingUnavailable:
-        raise
-    except (FatalError, gym.error.Error, ImportError, OSError, RuntimeError, AttributeError) as error:
-        raise RenderingUnavailable(f"{type(error).__name__}: {error}") from error
+            env.reset()
+            frame = env.render()
+        except (ValueError, FatalError, gym.error.Error, ImportError, OSError, RuntimeError, AttributeError) as error:
+            raise RenderingUnavailable(f"{type(error).__name__}: {error}") from error
+        if not isinstance(frame, np.ndarray):
+            raise RenderingUnavailable(f"the environment renders {type(frame).__name__}, not an image")
+        yield env
 
 
 def _follow_robot(simulator: Any) -> None:
@@ -131,7 +130,5 @@ def _play(model: Any, env: Any, seed: int, n_frames: int) -> list[np.ndarray]:
 
     collection = RenderCollection(TimeLimit(env, max(1, n_frames - 1)))
     play_episodes(model, [collection], 1, seed)
-    frames: list[Any] = collection.render()[:n_frames]
-    if not all(isinstance(frame, np.ndarray) for frame in frames):
-        raise RenderingUnavailable(f"the environment renders {type(frames[0]).__name__}, not an image")
-    return frames
+    frames: list[np.ndarray] = collection.render()  # type: ignore[assignment]
+    return frames[:n_frames]
