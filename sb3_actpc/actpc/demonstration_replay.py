@@ -39,7 +39,7 @@ class DemonstrationReplay:
         bounds = demonstrations.episode_bounds
         lengths = bounds[:, 1] - bounds[:, 0]
         self.ends = np.repeat(bounds[:, 1], lengths)
-        self.failure_reward = failure_reward(demonstrations.rewards, demonstrations.terminations)
+        self.failure_reward = failure_reward(demonstrations.rewards, bounds[:, 0])
         returns = np.add.reduceat(demonstrations.rewards.astype(np.float64) - self.failure_reward, bounds[:, 0])
         self.episodes = Episodes(
             observations=split_observations(observation_space, demonstrations.observations),

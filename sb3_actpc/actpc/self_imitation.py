@@ -153,11 +153,12 @@ class SelfImitationMemory:
         vars(self).update({**state, "episodes": episodes})
 
 
-def failure_reward(rewards: np.ndarray, terminations: np.ndarray) -> float:
-    """What a step without success pays: of two demonstrated rewards the smaller, if it is negative (-1 and 0, -0.1 and 10)
-    and no penalty at the end of an episode alone; else 0. Counted from it, the returns of a sparse task are not negative."""
+def failure_reward(rewards: np.ndarray, starts: np.ndarray) -> float:
+    """What a step without success pays, by (N,) demonstrated rewards of episodes that begin at ``starts``: of two rewards the
+    smaller (-1 and 0, -0.1 and 10), if it is negative, the other is not, and most episodes begin with it; else 0. It is no
+    penalty then (0, and -1 for a collision or a time limit). Returns of a sparse task that count from it are not negative."""
     paid = np.unique(rewards)
-    is_sparse = len(paid) == 2 and not terminations[rewards == paid[0]].all()
+    is_sparse = len(paid) == 2 and paid[1] >= 0.0 and (rewards[starts] == paid[0]).mean() > 0.5
     return min(float(paid[0]), 0.0) if is_sparse else 0.0
 
 

@@ -189,18 +189,24 @@ def test_a_task_that_pays_negative_rewards_alone_is_warned_of_once():
 
 
 @pytest.mark.parametrize(
-    ("rewards", "ends", "expected"),
+    ("episodes", "expected"),
     [
-        ([0.0, 1.0, 0.0], [0, 0, 0], 0.0),
-        ([-1.0, -1.0, 0.0], [0, 0, 0], -1.0),
-        ([-1.0, -1.0, 0.0], [0, 0, 1], -1.0),
-        ([0.0, 0.0, -1.0], [0, 0, 1], 0.0),  # a penalty where an episode ends is none of success
-        ([-1.0, -1.0, -1.0], [0, 0, 0], 0.0),
-        ([-2.0, -1.0, 0.0], [0, 0, 0], 0.0),
+        ([[0.0, 1.0, 0.0]], 0.0),
+        ([[-1.0, -1.0, 0.0]], -1.0),
+        ([[-1.0, -1.0, 0.0], [-1.0, 0.0], [0.0, 0.0]], -1.0),  # one begins at its goal
+        ([[-0.5, 10.0]], -0.5),
+        ([[-1.0, -1.0, -1.0]], 0.0),
+        ([[-2.0, -1.0, 0.0]], 0.0),
+        # penalties are no failures to succeed: at an end or a time limit, for a collision, beside a cost of every step
+        ([[0.0, 0.0, -1.0], [0.0, 0.0]], 0.0),
+        ([[0.0, -1.0, 0.0]], 0.0),
+        ([[1.0, 1.0, -1.0]], 0.0),
+        ([[-1.0, -10.0, -1.0], [-1.0, -1.0]], 0.0),
     ],
 )
-def test_the_reward_of_failure_is_the_smaller_of_two(rewards, ends, expected):
-    assert failure_reward(np.array(rewards, dtype=np.float32), np.array(ends, dtype=bool)) == expected
+def test_the_reward_of_failure_is_the_smaller_of_two_with_which_episodes_begin(episodes, expected):
+    starts = np.cumsum([0, *map(len, episodes[:-1])])
+    assert failure_reward(np.concatenate(episodes).astype(np.float32), starts) == expected
 
 
 def test_stored_returns_count_from_the_reward_of_failure_that_is_told_later():
