@@ -118,7 +118,7 @@ class IBRL(TD3Demo):
     def _next_values(self, batch: Any, next_actions: th.Tensor) -> th.Tensor:
         """Of the actor's and the BC policy's actions the better one's, by the smaller value of two critics, (B, 1)."""
         actions = th.cat([next_actions, self.policy.bc_actions(batch.next_observations)])
-        values = th.stack(self.critic_target(batch.next_observations.repeat(2, 1), actions))
+        values = th.stack(self.critic_target(th.cat([batch.next_observations] * 2), actions))
         drawn = th.randperm(len(values), device=values.device)[:N_TARGET_CRITICS]
         return values[drawn].amin(dim=0).view(2, -1, 1).amax(dim=0)
 

@@ -1,5 +1,6 @@
 """Hooks in a training environment: calls are counted, and what an environment returns is a copy."""
 
+import copy
 import copyreg
 import multiprocessing
 import signal
@@ -24,7 +25,9 @@ def copied(values: Any) -> Any:
     if isinstance(values, np.ndarray):
         return values.copy()
     if isinstance(values, dict):
-        return {name: copied(value) for name, value in values.items()}
+        made = copy.copy(values)  # of its own class, which wrappers may rely on
+        made.update((name, copied(value)) for name, value in values.items())
+        return made
     return type(values)(map(copied, values)) if type(values) in (tuple, list) else values
 
 

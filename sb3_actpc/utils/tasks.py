@@ -36,6 +36,10 @@ def task_id(env: VecEnv) -> str | None:
 
 
 def success_of(info: Mapping[str, Any]) -> float | None:
-    """1 or 0, of SB3's ``is_success`` or, as in Gymnasium-Robotics' Adroit tasks and Meta-World, ``success``; None without."""
+    """1 or 0, of SB3's ``is_success`` or, as in Gymnasium-Robotics' Adroit tasks and Meta-World, ``success``; None without.
+    ValueError for what is no number."""
     success = info.get("is_success", info.get("success"))
-    return None if success is None else float(success)
+    try:
+        return None if success is None else float(success)
+    except (TypeError, ValueError):
+        raise ValueError(f"info['is_success'] (or 'success') must be true or false, found {success!r}") from None

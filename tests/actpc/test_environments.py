@@ -64,3 +64,28 @@ def test_last_observations_of_whole_numbers_are_stored_as_they_were():
     buffer = model.replay_buffer
     assert buffer.dones[:20].sum() >= 2
     np.testing.assert_array_equal(buffer.next_observations[:20] - buffer.observations[:20], 10)
+
+
+class Info(dict):
+    """Its keys are attributes too."""
+
+    def __getattr__(self, name):
+        if name not in self:
+            raise AttributeError(name)
+        return self[name]
+
+
+class Attributes(CountingEnv):
+    def step(self, action):
+        *result, info = super().step(action)
+        return *result, Info(info, energy=1.0)
+
+
+class Costly(gym.Wrapper):
+    def step(self, action):
+        observation, reward, *ends, info = self.env.step(action)
+        return observation, reward - info.energy, *ends, info
+
+
+def test_infos_of_a_class_of_their_own_stay_such():
+    assert make(DummyVecEnv([lambda: Costly(Attributes())])).learn(20).num_timesteps == 20

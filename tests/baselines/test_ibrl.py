@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
@@ -10,6 +11,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_actpc.baselines import IBRL
+from sb3_actpc.demonstrations import Demonstrations
 from tests.recordings import record
 
 ENV = "Pendulum-v1"
@@ -72,3 +74,20 @@ def test_without_demonstrations_it_is_refused() -> None:
 def test_dict_observations_are_refused() -> None:
     with pytest.raises(ValueError, match=r"IBRL takes Box observations, found Dict.*FlattenObservation"):
         IBRL("MultiInputPolicy", "GoalReacher-v5", demonstrations=record(ENV))
+
+
+class Matrices(gym.ObservationWrapper):
+    """The Pendulum's observations three times over, (3, 3)."""
+
+    def __init__(self) -> None:
+        super().__init__(gym.make(ENV))
+        self.observation_space = gym.spaces.Box(-8.0, 8.0, (3, 3))
+
+    def observation(self, observation: np.ndarray) -> np.ndarray:
+        return np.stack([observation] * 3)
+
+
+def test_observations_may_have_several_axes() -> None:
+    shown = Demonstrations.record(lambda _: np.zeros(1), Matrices(), 2)
+    model = IBRL("MlpPolicy", Matrices(), demonstrations=shown, learning_starts=5, bc_steps=5, batch_size=8)
+    assert model.learn(8).num_timesteps == 8

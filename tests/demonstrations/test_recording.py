@@ -339,3 +339,13 @@ def test_another_tasks_demonstrations_are_named(recorded_id: str, env_id: str, m
     with pytest.raises(ValueError, match=message):
         fit_demonstrations(record(recorded_id), env, env.observation_space, env.action_space)
     env.close()
+
+
+def test_a_success_that_is_no_number_is_named() -> None:
+    class Named(gym.Wrapper):  # type: ignore[type-arg]
+        def step(self, action: Any) -> Any:
+            *result, info = self.env.step(action)
+            return *result, {**info, "is_success": {"task": True}}
+
+    with pytest.raises(ValueError, match=r"must be true or false, found \{'task': True\}"):
+        Demonstrations.record(lambda _: np.zeros(1), Named(gym.make("Pendulum-v1")), 1)
