@@ -78,7 +78,9 @@ def train_demonstrator(run: Run, folder: Path, report: Report = silent) -> Demon
                 f"--steps {stored}"
             )
         result = finish_run(run.model_copy(update={"output": str(folder)}), report)
-    return Demonstrator(load_run(folder)[1], result["timesteps"], result["dense_return"])
+    if not result["kept_timesteps"]:
+        report(f"{folder}: no evaluation was better than the first, of the untrained agent: train longer (--steps)")
+    return Demonstrator(load_run(folder)[1], result["kept_timesteps"], result["dense_return"])
 
 
 def train_mixed(run: Run, folder: Path, report: Report = silent) -> list[Demonstrator]:

@@ -80,7 +80,8 @@ def write_result(run: Run) -> dict[str, Any]:
     """Write ``result.json`` of a run that has come to its end, from its ``progress.csv``.
 
     :return: its content: the means and standard deviations of the last evaluation (of the best one, where that agent was to be
-        kept), the steps trained, training steps per second (evaluations left out), seconds, and where it comes from
+        kept), the steps trained, those of the kept agent, training steps per second (evaluations left out), seconds, and where
+        it comes from
     """
     import pandas as pd  # takes as long to import as the rest
 
@@ -95,6 +96,7 @@ def write_result(run: Run) -> dict[str, Any]:
     result = {
         **{name: value for name, value in kept.items() if name not in ("seconds", "evaluation_seconds")},
         "timesteps": last["timesteps"],
+        "kept_timesteps": kept["timesteps"],
         "updates": last["updates"],
         **{name: getattr(run, name) for name in names},
         "preset": run.preset_name,
