@@ -155,8 +155,13 @@ def _run_row(folder: Path, curve: pd.DataFrame) -> dict[str, Any]:
 
 
 def _labelled(runs: pd.DataFrame) -> pd.DataFrame:
-    """Add ``label``: the variant, with a part of the settings' id where a task has several settings of that name."""
+    """Add ``label``: the variant; where a task has several settings of that name with its steps, or, where these are the same,
+    with a part of the settings' id, which other tasks do not share."""
     known = runs.assign(settings=runs["settings"].where(runs["settings"] != ""))  # a run can fail before it wrote them
-    n_settings = known.groupby(["task", "variant"])["settings"].transform("nunique")
-    detailed = runs["variant"] + " [" + runs["settings"].str[:4] + "]"
-    return runs.assign(label=runs["variant"].where(n_settings <= 1, detailed))
+    known["ended_at"] = runs["steps"].where(runs["status"] == FINISHED)
+    counts = known.groupby(["task", "variant"])[["settings", "ended_at"]].transform("nunique")
+    per_settings = known.groupby(["task", "variant", "settings"])["ended_at"].transform("nunique")
+    is_told_by_steps = (counts["ended_at"] == counts["settings"]) & (per_settings == 1)
+    by_steps = runs["variant"] + " (" + runs["steps"].astype(str) + " steps)"
+    detailed = by_steps.where(is_told_by_steps, runs["variant"] + " [" + runs["settings"].str[:4] + "]")
+    return runs.assign(label=runs["variant"].where(counts["settings"] <= 1, detailed))

@@ -10,7 +10,7 @@ import pytest
 from sb3_actpc.cli import main
 from sb3_actpc.experiments.report.results import area, load_results, reference_score
 from sb3_actpc.experiments.report.tables import improvement_table, mean_and_deviation, write_report
-from tests.experiments.report.folders import HOPPER, REACHER, write_run
+from tests.experiments.report.folders import HOPPER, REACHER, STEPS, write_run
 
 
 def test_a_row_holds_what_the_run_reached(tmp_path: Path) -> None:
@@ -99,6 +99,18 @@ def test_settings_of_one_name_are_told_apart(tmp_path: Path) -> None:
     write_run(tmp_path, seed=0, gamma=0.9)
     write_run(tmp_path, seed=1, gamma=0.8)
     assert len(load_results(tmp_path).groups(HOPPER)) == 2
+
+
+def test_runs_of_fewer_steps_have_one_name_on_all_tasks(tmp_path: Path) -> None:
+    for task in (HOPPER, REACHER):
+        write_run(tmp_path, task, seed=0)
+        shorter = write_run(tmp_path, task, seed=1)
+        config = json.loads((shorter / "config.json").read_text(encoding="utf-8"))
+        (shorter / "config.json").write_text(json.dumps({**config, "n_timesteps": STEPS[1]}), encoding="utf-8")
+        rows = (shorter / "progress.csv").read_text(encoding="utf-8").splitlines(keepends=True)
+        (shorter / "progress.csv").write_text("".join(rows[:-1]), encoding="utf-8")
+    results = load_results(tmp_path)
+    assert [list(results.groups(task)) for task in (HOPPER, REACHER)] == [["actpc (10000 steps)", "actpc (5000 steps)"]] * 2
 
 
 def test_the_demonstrators_score_more_than_random_actions() -> None:
