@@ -155,13 +155,14 @@ def _run_row(folder: Path, curve: pd.DataFrame) -> dict[str, Any]:
 
 
 def _labelled(runs: pd.DataFrame) -> pd.DataFrame:
-    """Add ``label``: the variant; where a task has several settings of that name with its steps, or, where these are the same,
-    with a part of the settings' id, which other tasks do not share."""
-    known = runs.assign(settings=runs["settings"].where(runs["settings"] != ""))  # a run can fail before it wrote them
-    known["ended_at"] = runs["steps"].where(runs["status"] == FINISHED)
-    counts = known.groupby(["task", "variant"])[["settings", "ended_at"]].transform("nunique")
-    per_settings = known.groupby(["task", "variant", "settings"])["ended_at"].transform("nunique")
-    is_told_by_steps = (counts["ended_at"] == counts["settings"]) & (per_settings == 1)
-    by_steps = runs["variant"] + " (" + runs["steps"].astype(str) + " steps)"
-    detailed = by_steps.where(is_told_by_steps, runs["variant"] + " [" + runs["settings"].str[:4] + "]")
-    return runs.assign(label=runs["variant"].where(counts["settings"] <= 1, detailed))
+    """Add ``label``: the variant. Where a task has several settings of that name, it has their steps, if these tell them
+    apart, or else a part of the settings' id, which other tasks do not share."""
+    labels = runs["variant"].copy()
+    known = runs[runs["settings"] != ""]  # a run can fail before it wrote them
+    for _, rows in known.groupby(["task", "variant"]):
+        n_settings = rows["settings"].nunique()
+        if n_settings > 1:
+            ends = rows.loc[rows["status"] == FINISHED, ["settings", "steps"]].drop_duplicates()
+            by_steps, by_id = " (" + rows["steps"].astype(str) + " steps)", " [" + rows["settings"].str[:4] + "]"
+            labels[rows.index] += by_steps if len(ends) == ends["steps"].nunique() == n_settings else by_id
+    return runs.assign(label=labels)
