@@ -16,9 +16,11 @@ from typing import Any, ClassVar, cast
 
 import gymnasium as gym
 import numpy as np
+import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import PolicyPredictor
+from torch import nn
 
 from sb3_actpc.demonstrations.recording import ENDLESS
 from sb3_actpc.experiments.runs.schema import Run
@@ -95,6 +97,12 @@ class EpisodeStatistics:
 def says_one_return(summary: Mapping[str, Any]) -> bool:
     """Whether the dense returns of a summary equal the sparse ones: the environment reports none, or its reward is dense."""
     return all(summary[f"dense_{name}"] == summary[name] for name in ("return", "return_std"))
+
+
+def are_equal(one: nn.Module, other: nn.Module) -> bool:
+    """Whether two modules of equal structure have the same parameters and buffers."""
+    theirs = other.state_dict()
+    return all(th.equal(value, theirs[name]) for name, value in one.state_dict().items())
 
 
 def play_episodes(model: PolicyPredictor, envs: Sequence[gym.Env[Any, Any]], n_episodes: int, seed: int) -> EpisodeStatistics:
@@ -308,7 +316,7 @@ class EvaluationCallback(CsvCallback):
         started = time.perf_counter()
         seed = self.run.seed + EVALUATION_SEED_OFFSET
         summary = play_episodes(NormalizedPredictor.wrap(self.model), self.envs, n_episodes, seed).summary()
-        of_actor = self._evaluate_actor(n_episodes, seed)
+        of_actor = self._evaluate_actor(summary, n_episodes, seed)
         dense_return = summary["dense_return"] or 0.0
         if self.run.keep == "last" or dense_return >= self.best_return:
             NormalizedPredictor.save(self.model, self.run.folder)
@@ -337,11 +345,13 @@ class EvaluationCallback(CsvCallback):
         success = "" if summary["success"] is None else f" success {summary['success']:.2f}"
         self.report(f"step {self.num_timesteps:>8}  {shown}{success}")
 
-    def _evaluate_actor(self, n_episodes: int, seed: int) -> dict[str, float | None]:
-        """The columns ``OF_ACTOR``; none without a deployment gate."""
+    def _evaluate_actor(self, summary: Mapping[str, float | None], n_episodes: int, seed: int) -> dict[str, float | None]:
+        """The columns ``OF_ACTOR``; none without a deployment gate. ``summary`` is of the deployed policy, whose episodes are
+        not played twice where the actor is that policy, as after BC."""
         agent: Any = self.model
         if getattr(getattr(agent, "actor", None), "deployed", None) is None:
             return {}
-        learning = NormalizedPredictor.wrap(agent, agent.actor_policy)
-        summary = play_episodes(learning, self.envs, n_episodes, seed).summary()
+        learning = agent.actor_policy
+        if not are_equal(learning.acting, agent.actor.acting):
+            summary = play_episodes(NormalizedPredictor.wrap(agent, learning), self.envs, n_episodes, seed).summary()
         return {column: summary[name] for name, column in OF_ACTOR.items()}
