@@ -117,18 +117,23 @@ def others_table(others: Results, short: Results, task: str) -> list[str]:
 
 
 def listed(values: pd.Series, digits: int) -> str:
-    """The value of every seed."""
-    return ", ".join(f"{value:.{digits}f}" for value in values)
+    """The value of every seed that has got so far."""
+    return ", ".join(f"{value:.{digits}f}" for value in values.dropna())
+
+
+def runs_of(results: Results, task: str, variant: str) -> pd.DataFrame:
+    """Finished runs of a variant, one for each seed, whatever their steps and defaults: their learner is the same."""
+    runs = results.finished
+    return runs[(runs["task"] == task) & (runs["variant"] == variant)].sort_values("seed", kind="stable")
 
 
 def success_table(results: Results, task: str, policies: Mapping[str, tuple[str, str]], steps: Sequence[int]) -> list[str]:
     """Lines of the table of a task that succeeds or fails: success of every seed at the steps."""
-    groups = results.groups(task)
     rows = []
     for policy, (variant, measure) in policies.items():
-        column = measure.replace("return", "success")
-        rows.append([policy, *(listed(results.at_step(groups[variant], column, step), 2) for step in steps)])
-    rows.append(["plain BC", listed(groups["bc"]["success"], 2), *[""] * (len(steps) - 1)])
+        runs, column = runs_of(results, task, variant), measure.replace("return", "success")
+        rows.append([policy, *(listed(results.at_step(runs, column, step), 2) for step in steps)])
+    rows.append(["plain BC", listed(runs_of(results, task, "bc")["success"], 2), *[""] * (len(steps) - 1)])
     return lines_of(["steps", *(f"{step:,}" for step in steps)], rows)
 
 
@@ -137,8 +142,7 @@ def dense_table(results: Results, task: str) -> list[str]:
     steps = (5_000, *LONG[1:])
     rows = []
     for name, variant in DENSE.items():
-        # by variant: a seed that ran later has the same learner from other defaults
-        runs = results.finished[(results.finished["task"] == task) & (results.finished["variant"] == variant)]
+        runs = runs_of(results, task, variant)
         rows.append([name, str(len(runs)), *(spread(results.at_step(runs, "return", step)) for step in steps)])
     return lines_of(["steps", "seeds", *(f"{step:,}" for step in steps)], rows)
 
@@ -246,6 +250,8 @@ def tables() -> dict[str, list[str]]:
     for task in ("FetchPickAndPlace-v4", "FetchPush-v4"):
         found[f"fetch_20000: {task}"] = success_table(fetch, task, FETCH, FETCH_STEPS)
     found["door_50000"] = success_table(load_results(FOLDER / "door_50000"), "door", DOOR, LONG)
+    can = {name: columns for name, columns in POLICIES.items() if name != "RLPD"}
+    found["can_40000"] = success_table(load_results(FOLDER / "can_40000"), "Can-10", can, LONG[:-1])
     long_runs = load_results(FOLDER / "steps_50000")
     found["steps_50000: steadiness"] = steadiness(long_runs, STEPS["steps_50000"], 15_000, 700)
     found["summary"] = summary(*(load_results(FOLDER / folder) for folder in STEPS))
