@@ -1,6 +1,5 @@
 """When a training is evaluated, and what evaluation episodes report."""
 
-import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -8,11 +7,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from sb3_actpc import shipped_demonstrations
-from sb3_actpc.demonstrations import Demonstrations
 from sb3_actpc.demonstrations.recording import ENDLESS
 from sb3_actpc.experiments.runs import Run, play_episodes, train_run
-from sb3_actpc.experiments.runs.evaluation import EVALUATION_SEED_OFFSET
 
 
 class Silent(gym.Wrapper):
@@ -52,29 +48,3 @@ def test_an_evaluation_without_an_end_says_what_is_missing() -> None:
     env = gym.make("Pendulum-v1", max_episode_steps=ENDLESS + 1)
     with pytest.warns(UserWarning, match=f"evaluation episode has gone on for {ENDLESS} steps: limit it"):
         play_episodes(Resting(), [env], 1, seed=0)
-
-
-def test_a_policy_is_evaluated_once_until_the_actor_differs_from_it(tmp_path: Path) -> None:
-    seeds: list[int] = []
-
-    class Noted(gym.Wrapper):
-        """Notes the seeds of evaluation episodes."""
-
-        def reset(self, *, seed: int | None = None, **options: Any) -> Any:
-            seeds.extend(() if seed is None or seed < EVALUATION_SEED_OFFSET else (seed,))
-            return super().reset(seed=seed, **options)
-
-    gym.register("Noted-v0", lambda: Noted(gym.make("SparseReacher-v5")), max_episode_steps=50)
-    try:
-        settings = {"policy_kwargs": {"net_arch": [8]}, "guidance_kwargs": {"bc_updates": 5}}
-        run = Run(env="Noted-v0", n_timesteps=4, eval_freq=4, eval_episodes=2, settings=settings)
-        shown = Demonstrations.load(shipped_demonstrations("SparseReacher-v5"))
-        dataclasses.replace(shown, env_id="Noted-v0").save(tmp_path / "shown.npz")
-        paths = {"output": str(tmp_path / "run"), "demonstrations": str(tmp_path / "shown.npz")}
-        train_run(run.model_copy(update={"progress": False, **paths}))
-    finally:
-        gym.registry.pop("Noted-v0")
-    rows = np.genfromtxt(tmp_path / "run" / "progress.csv", delimiter=",", names=True)
-    first = EVALUATION_SEED_OFFSET + run.seed
-    assert seeds == [first, first + 1, *[first, first + 1] * 2]  # the same policy after BC, then two
-    assert rows["actor_return"][0] == rows["return_"][0] and rows["actor_return"].shape == (2,)
