@@ -101,6 +101,9 @@ SUCCESSES: dict[str, tuple[Player, Curve]] = {
     "0.95 next to 0.85": chance(0.85, lambda steps, now: 0.95),
     "1 next to 0.85": chance(0.85, lambda steps, now: 1.0),
     "1 next to 0.95": chance(0.95, lambda steps, now: 1.0),
+    "0.7 next to 0.5": chance(0.5, lambda steps, now: 0.7),
+    "0.35 next to 0.55": chance(0.55, lambda steps, now: 0.35),
+    "0.15 next to 0.55": chance(0.55, lambda steps, now: 0.15),
     "a tenth below the deployed policy, from 0.9": chance(0.9, lambda steps, now: now - 0.1),
     "a tenth below, from 0.6": chance(0.6, lambda steps, now: now - 0.1),
     "a twentieth below, from 0.85": chance(0.85, lambda steps, now: now - 0.05),
@@ -181,7 +184,7 @@ def last_deployed(
     while steps < total:
         learner = curve(steps, deployed) if steps > kind.learns_from else actor[0]
         explores = learner._replace(chance=max(learner.chance - kind.noise, 0.0))
-        players = {"average": explores, "incumbent": deployed, "challenger": challenger}
+        players = {"average": explores, "incumbent": deployed, "challenger": challenger, "previous": previous}
         episode_return, length = kind.play(rng, players[selection.roles[0]])
         selection.running[0] = episode_return
         selection.steps += length

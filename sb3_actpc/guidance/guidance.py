@@ -94,8 +94,7 @@ class BehaviorGuidance(ActorGuidance):
         if self.selection is None or context.selection_circuits is None:
             return [context.actor] * context.n_envs
         circuits = context.selection_circuits
-        players = {"average": circuits["average"], "incumbent": circuits["deployed"], "challenger": circuits["challenger"]}
-        return [players[role] for role in self.selection.roles]
+        return [circuits["deployed" if role == "incumbent" else role] for role in self.selection.roles]
 
     def explores(self, env: int) -> bool:
         """Only episodes of the average have noise."""

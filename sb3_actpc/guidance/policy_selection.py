@@ -4,7 +4,8 @@ An *incumbent* is deployed. The actor's moving average explores. A *challenger*,
 episodes until it has as many as the incumbent; then both take turns. A group sequential test on the difference of mean
 returns promotes or rejects the challenger; its threshold falls with the number of episodes (O'Brien and Fleming, Biometrics
 1979). If exploration returns of the average are as clearly better, it is the next challenger, and one evaluation episode
-confirms it: it may be stuck without noise. An incumbent that is worse than the one before is rolled back.
+confirms it: it may be stuck without noise. A promoted policy and the one before it then play further episodes. By these alone
+it may be rolled back: of the returns that promoted it, its own were lucky and the others unlucky.
 """
 
 import math
@@ -12,7 +13,7 @@ from dataclasses import dataclass, field
 from statistics import fmean
 from typing import Literal
 
-Role = Literal["average", "challenger", "incumbent"]
+Role = Literal["average", "challenger", "incumbent", "previous"]
 Decision = Literal["promoted", "rejected", "rolled back"]
 
 
@@ -26,8 +27,9 @@ class PolicySelection:
     :param promote: standard errors by which the challenger's mean return must exceed the incumbent's after ``budget``
         episodes; after n of them sqrt(budget / n) times as many
     :param reject: standard errors by which it, or a new incumbent that is rolled back, must fall short
-    :param budget: evaluation episodes of a policy at most
+    :param budget: evaluation episodes of a policy in a test, at most
     :param min_episodes: evaluation episodes of a policy before any decision
+    :param n_rechecks: further episodes of a promoted policy, and of the one before it
     """
 
     n_envs: int
@@ -36,16 +38,19 @@ class PolicySelection:
     reject: float = 0.5
     budget: int = 20
     min_episodes: int = 2
+    n_rechecks: int = 4
     steps: int = 0
     evaluation_steps: int = 0
     has_challenger: bool = False
     incumbent_returns: list[float] = field(default_factory=list)
     challenger_returns: list[float] = field(default_factory=list)
     previous_returns: list[float] = field(default_factory=list)
+    previous_rechecks: list[float] = field(default_factory=list)
+    n_deciding: int = 0  # returns of the incumbent that promoted it
     exploration_returns: list[float] = field(default_factory=list)  # the newest of the average, some time after the last copy
     support: list[float] = field(default_factory=list)  # exploration returns for which the challenger was copied at once
     worst: float = math.inf  # return of any episode, exploration episodes included
-    n_needed: int = 0  # returns of the incumbent before the next challenger begins: a lucky promotion shows in further ones
+    n_needed: int = 0  # returns of the incumbent before the next challenger begins
     roles: list[Role] = field(default_factory=list)
     running: list[float] = field(default_factory=list)
     n_promoted: int = 0
@@ -88,6 +93,8 @@ class PolicySelection:
             return None
         if role == "incumbent":
             self.incumbent_returns.append(episode_return)
+        elif role == "previous":
+            self.previous_rechecks.append(episode_return)
         elif self.has_challenger:
             self.challenger_returns.append(episode_return)
         return self._decide()
@@ -100,14 +107,18 @@ class PolicySelection:
         if is_busy or self.evaluation_steps > self.share * self.steps:
             return False
         n_incumbent = len(self.incumbent_returns)
-        begins = actor_differs and not self.has_challenger and (n_incumbent >= self.n_needed or bool(self.support))
+        rechecks = bool(self.previous_returns) and len(self.previous_rechecks) < self.n_rechecks
+        is_ready = n_incumbent >= self.n_needed and not rechecks
+        begins = actor_differs and not self.has_challenger and (is_ready or bool(self.support))
         if begins:
             self.has_challenger = True
             self.challenger_returns = []
             self.exploration_returns = []
         # steps that the incumbent does not need are saved for the challenger
         n_needed = self.budget if self.has_challenger else self.n_needed
-        if self.has_challenger and (len(self.challenger_returns) <= n_incumbent or n_incumbent >= n_needed):
+        if rechecks and not self.has_challenger and len(self.previous_rechecks) <= n_incumbent - self.n_deciding:
+            self.roles[env] = "previous"
+        elif self.has_challenger and (len(self.challenger_returns) <= n_incumbent or n_incumbent >= n_needed):
             self.roles[env] = "challenger"
         elif n_incumbent < n_needed:
             self.roles[env] = "incumbent"
@@ -125,31 +136,33 @@ class PolicySelection:
             loss, error = compare(self.incumbent_returns, self.challenger_returns)
             # one evaluation episode is enough for a copy that exploration speaks for
             if loss < 0 and len(ours) >= self.min_episodes and self._exceed(ours):
-                self.n_needed = min(max(2 * n, self.min_episodes), self.budget)
+                self.n_deciding = n
+                self.n_needed = n + self.n_rechecks
                 self.previous_returns = self.incumbent_returns
+                self.previous_rechecks = []
                 self.incumbent_returns = self.challenger_returns
                 self.exploration_returns = []
-                self.has_challenger = False
-                self.support = []
                 self.n_promoted += 1
-                return "promoted"
+                return self._end_test("promoted")
             is_enough = n >= self.min_episodes or bool(self.support)
             if (is_enough and loss > self.reject * error) or n >= self.budget:
                 self.n_needed = min(len(self.incumbent_returns) + 1, self.budget)
-                self.has_challenger = False
-                self.support = []
                 self.n_rejected += 1
-                return "rejected"
-        if self.previous_returns and len(self.incumbent_returns) >= self.min_episodes:
-            loss, error = compare(self.previous_returns, self.incumbent_returns)
+                return self._end_test("rejected")
+        rechecks = self.incumbent_returns[self.n_deciding :]
+        if self.previous_returns and min(len(rechecks), len(self.previous_rechecks)) >= self.min_episodes:
+            loss, error = compare(self.previous_rechecks, rechecks)
             if loss > self.reject * error:
-                self.incumbent_returns = self.previous_returns
+                self.incumbent_returns = [*self.previous_returns, *self.previous_rechecks]
                 self.previous_returns = []
-                self.has_challenger = False
-                self.support = []
                 self.n_rolled_back += 1
-                return "rolled back"
+                return self._end_test("rolled back")
         return None
+
+    def _end_test(self, decision: Decision) -> Decision:
+        self.has_challenger = False
+        self.support = []
+        return decision
 
 
 def compare(ours: list[float], theirs: list[float]) -> tuple[float, float]:

@@ -21,8 +21,8 @@ class Game:
         candidate = self.challenger
         for _ in range(n_steps // LENGTH):
             role = self.selection.roles[0]
-            policy = {"incumbent": self.deployed, "challenger": candidate, "average": lambda rng: 0.0}[role]
-            episode_return = policy(self.rng)
+            players = {"incumbent": self.deployed, "challenger": candidate, "previous": self.previous}
+            episode_return = 0.0 if role == "average" else players[role](self.rng)
             for step in range(LENGTH):
                 self.selection.step(0, episode_return / LENGTH, step == 0)
             decision = self.selection.end_episode(0, actor_differs=True)
@@ -120,6 +120,31 @@ def test_a_lucky_promotion_is_rolled_back():
     assert game.decisions[0] == "promoted"
     assert "rolled back" in game.decisions
     assert game.deployed is incumbent
+
+
+def test_a_policy_that_lost_by_bad_luck_comes_back():
+    """It fails in the two episodes that are compared first, and never again."""
+
+    class Unlucky:
+        def __init__(self) -> None:
+            self.n = 0
+
+        def __call__(self, rng) -> float:
+            self.n += 1
+            return 0.0 if self.n <= 2 else 100.0 + rng.normal()
+
+    incumbent = Unlucky()
+    game = Game(0, incumbent, noisy(50.0, 1.0))
+    game.play(4000)
+    assert game.decisions[:2] == ["promoted", "rolled back"]
+    assert game.deployed is incumbent
+
+
+def test_a_policy_that_seldom_succeeds_seldom_stays_deployed():
+    """Returns of 0 and 1, as with a reward at the end."""
+    succeeds = lambda chance: lambda rng: float(rng.random() < chance)  # noqa: E731
+    assert rate(succeeds(0.55), succeeds(0.15)) < 0.15
+    assert rate(succeeds(0.55), succeeds(0.95)) > 0.98
 
 
 def test_equal_returns_of_zero_change_nothing():
