@@ -25,7 +25,9 @@ class PolicySelection:
     :param n_envs: environments
     :param share: share of environment steps in evaluation episodes above which none begins
     :param promote: standard errors by which the challenger's mean return must exceed the incumbent's after ``budget``
-        episodes; after n of them sqrt(budget / n) times as many
+        episodes; after n of them sqrt(budget / n) times as many. A copy is tested although exploration does not speak for it:
+        noise may hide what it gained
+    :param promote_supported: the same where exploration returns speak for it, and for these
     :param reject: standard errors by which it, or a new incumbent that is rolled back, must fall short
     :param budget: evaluation episodes of a policy in a test, at most
     :param min_episodes: evaluation episodes of a policy before any decision
@@ -34,7 +36,8 @@ class PolicySelection:
 
     n_envs: int
     share: float = 0.25
-    promote: float = 0.2
+    promote: float = 0.4
+    promote_supported: float = 0.2
     reject: float = 0.5
     budget: int = 20
     min_episodes: int = 2
@@ -44,8 +47,8 @@ class PolicySelection:
     has_challenger: bool = False
     incumbent_returns: list[float] = field(default_factory=list)
     challenger_returns: list[float] = field(default_factory=list)
-    previous_returns: list[float] = field(default_factory=list)
-    previous_rechecks: list[float] = field(default_factory=list)
+    has_previous: bool = False
+    previous_returns: list[float] = field(default_factory=list)  # since it was replaced
     n_deciding: int = 0  # returns of the incumbent that promoted it
     exploration_returns: list[float] = field(default_factory=list)  # the newest of the average, some time after the last copy
     support: list[float] = field(default_factory=list)  # exploration returns for which the challenger was copied at once
@@ -87,14 +90,14 @@ class PolicySelection:
             if actor_differs:
                 self.exploration_returns = [*self.exploration_returns, episode_return][-self.budget :]
             n = min(len(self.exploration_returns), len(self.incumbent_returns))
-            if not self.support and n >= self.min_episodes and self._exceed(self.exploration_returns):
+            if not self.support and n >= self.min_episodes and self._exceed(self.exploration_returns, self.promote_supported):
                 self.support = self.exploration_returns
                 self.has_challenger = False  # an older copy makes room
             return None
         if role == "incumbent":
             self.incumbent_returns.append(episode_return)
         elif role == "previous":
-            self.previous_rechecks.append(episode_return)
+            self.previous_returns.append(episode_return)
         elif self.has_challenger:
             self.challenger_returns.append(episode_return)
         return self._decide()
@@ -107,7 +110,7 @@ class PolicySelection:
         if is_busy or self.evaluation_steps > self.share * self.steps:
             return False
         n_incumbent = len(self.incumbent_returns)
-        rechecks = bool(self.previous_returns) and len(self.previous_rechecks) < self.n_rechecks
+        rechecks = self.has_previous and len(self.previous_returns) < self.n_rechecks
         is_ready = n_incumbent >= self.n_needed and not rechecks
         begins = actor_differs and not self.has_challenger and (is_ready or bool(self.support))
         if begins:
@@ -116,7 +119,7 @@ class PolicySelection:
             self.exploration_returns = []
         # steps that the incumbent does not need are saved for the challenger
         n_needed = self.budget if self.has_challenger else self.n_needed
-        if rechecks and not self.has_challenger and len(self.previous_rechecks) <= n_incumbent - self.n_deciding:
+        if rechecks and not self.has_challenger and len(self.previous_returns) <= n_incumbent - self.n_deciding:
             self.roles[env] = "previous"
         elif self.has_challenger and (len(self.challenger_returns) <= n_incumbent or n_incumbent >= n_needed):
             self.roles[env] = "challenger"
@@ -124,22 +127,23 @@ class PolicySelection:
             self.roles[env] = "incumbent"
         return begins
 
-    def _exceed(self, ours: list[float]) -> bool:
+    def _exceed(self, ours: list[float], threshold: float) -> bool:
         """Both get a pseudo-episode of the worst return: a policy with few episodes may not have failed yet."""
         gain, error = compare([*ours, self.worst], [*self.incumbent_returns, self.worst])
-        return gain > self.promote * (self.budget / len(ours)) ** 0.5 * error
+        return gain > threshold * (self.budget / len(ours)) ** 0.5 * error
 
     def _decide(self) -> Decision | None:
         n = len(self.challenger_returns)
         if self.has_challenger and n:
             ours = [*self.support, *self.challenger_returns]
+            threshold = self.promote_supported if self.support else self.promote
             loss, error = compare(self.incumbent_returns, self.challenger_returns)
             # one evaluation episode is enough for a copy that exploration speaks for
-            if loss < 0 and len(ours) >= self.min_episodes and self._exceed(ours):
+            if loss < 0 and len(ours) >= self.min_episodes and self._exceed(ours, threshold):
                 self.n_deciding = n
                 self.n_needed = n + self.n_rechecks
-                self.previous_returns = self.incumbent_returns
-                self.previous_rechecks = []
+                self.has_previous = True
+                self.previous_returns = []
                 self.incumbent_returns = self.challenger_returns
                 self.exploration_returns = []
                 self.n_promoted += 1
@@ -149,12 +153,13 @@ class PolicySelection:
                 self.n_needed = min(len(self.incumbent_returns) + 1, self.budget)
                 self.n_rejected += 1
                 return self._end_test("rejected")
-        rechecks = self.incumbent_returns[self.n_deciding :]
-        if self.previous_returns and min(len(rechecks), len(self.previous_rechecks)) >= self.min_episodes:
-            loss, error = compare(self.previous_rechecks, rechecks)
+        further = self.incumbent_returns[self.n_deciding :]
+        if self.has_previous and min(len(further), len(self.previous_returns)) >= self.min_episodes:
+            loss, error = compare(self.previous_returns, further)
             if loss > self.reject * error:
-                self.incumbent_returns = [*self.previous_returns, *self.previous_rechecks]
+                self.incumbent_returns = self.previous_returns
                 self.previous_returns = []
+                self.has_previous = False
                 self.n_rolled_back += 1
                 return self._end_test("rolled back")
         return None

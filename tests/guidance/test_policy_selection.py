@@ -140,6 +140,22 @@ def test_a_policy_that_lost_by_bad_luck_comes_back():
     assert game.deployed is incumbent
 
 
+def test_the_returns_that_promoted_a_policy_do_not_keep_it():
+    """The mean of all its returns stays above the incumbent's, that of the further ones is below."""
+
+    class Lucky:
+        def __init__(self) -> None:
+            self.n = 0
+
+        def __call__(self, rng) -> float:
+            self.n += 1
+            return 100.0 if self.n <= 2 else 15.0 + rng.normal()
+
+    game = Game(0, noisy(20.0, 1.0), Lucky())
+    game.play(2000)
+    assert game.decisions[:2] == ["promoted", "rolled back"]
+
+
 def test_a_policy_that_seldom_succeeds_seldom_stays_deployed():
     """Returns of 0 and 1, as with a reward at the end."""
     succeeds = lambda chance: lambda rng: float(rng.random() < chance)  # noqa: E731
