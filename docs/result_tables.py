@@ -71,7 +71,9 @@ REPORTED = ("Hopper-suboptimal", "Walker2d-suboptimal", "Swimmer-suboptimal", "W
 
 
 def spread(values: pd.Series) -> str:
-    """The mean, with the smallest and the largest in brackets."""
+    """The mean, with the smallest and the largest in brackets; of a single value that one."""
+    if len(values) == 1:
+        return f"{values.iloc[0]:.0f}"
     return f"{values.mean():.0f} ({values.min():.0f} to {values.max():.0f})"
 
 
@@ -250,8 +252,7 @@ def tables() -> dict[str, list[str]]:
     for task in ("FetchPickAndPlace-v4", "FetchPush-v4"):
         found[f"fetch_20000: {task}"] = success_table(fetch, task, FETCH, FETCH_STEPS)
     found["door_50000"] = success_table(load_results(FOLDER / "door_50000"), "door", DOOR, LONG)
-    can = {name: columns for name, columns in POLICIES.items() if name != "RLPD"}
-    found["can_40000"] = success_table(load_results(FOLDER / "can_40000"), "Can-10", can, LONG[:-1])
+    found["can_40000"] = success_table(load_results(FOLDER / "can_40000"), "Can-10", POLICIES, LONG[:-1])
     long_runs = load_results(FOLDER / "steps_50000")
     found["steps_50000: steadiness"] = steadiness(long_runs, STEPS["steps_50000"], 15_000, 700)
     found["summary"] = summary(*(load_results(FOLDER / folder) for folder in STEPS))
