@@ -31,7 +31,7 @@ class PolicySelection:
     :param reject: standard errors by which it, or a new incumbent that is rolled back, must fall short
     :param budget: evaluation episodes of a policy in a test, at most
     :param min_episodes: evaluation episodes of a policy before any decision
-    :param n_rechecks: further episodes of a promoted policy, and of the one before it
+    :param n_rechecks: further episodes of a promoted policy, and of the one before it; compared from ``min_episodes`` on
     """
 
     n_envs: int
@@ -119,8 +119,9 @@ class PolicySelection:
             self.exploration_returns = []
         # steps that the incumbent does not need are saved for the challenger
         n_needed = self.budget if self.has_challenger else self.n_needed
-        if rechecks and not self.has_challenger and len(self.previous_returns) <= n_incumbent - self.n_deciding:
-            self.roles[env] = "previous"
+        if rechecks and not self.has_challenger:
+            n_further = n_incumbent - self.n_deciding
+            self.roles[env] = "previous" if len(self.previous_returns) <= n_further else "incumbent"
         elif self.has_challenger and (len(self.challenger_returns) <= n_incumbent or n_incumbent >= n_needed):
             self.roles[env] = "challenger"
         elif n_incumbent < n_needed:
