@@ -66,6 +66,12 @@ DOOR = {
     "no critic term, deployed policy": ("imitation", "return"),
     "RLPD": ("rlpd", "return"),
 }
+# runs with the present gate: task -> the columns of moving average and deployed policy, and digits
+PRESENT_GATE = {
+    "SparseReacher-v5": (("actor_return", "return"), 0),
+    "Walker2d": (("actor_return", "return"), 0),
+    "Can-10": (("actor_success", "success"), 2),
+}
 # no settings were chosen on them
 REPORTED = ("Hopper-suboptimal", "Walker2d-suboptimal", "Swimmer-suboptimal", "Walker2d", "Hopper-five", "Walker2d-five")
 
@@ -137,6 +143,18 @@ def success_table(results: Results, task: str, policies: Mapping[str, tuple[str,
         rows.append([policy, *(listed(results.at_step(runs, column, step), 2) for step in steps)])
     rows.append(["plain BC", listed(runs_of(results, task, "bc")["success"], 2), *[""] * (len(steps) - 1)])
     return lines_of(["steps", *(f"{step:,}" for step in steps)], rows)
+
+
+def gate_table(results: Results) -> list[str]:
+    """Lines of the table of runs with the present gate: the policy after BC, and average and deployed policy at the end."""
+    rows = []
+    for task, ((average, deployed), digits) in PRESENT_GATE.items():
+        runs = runs_of(results, task, "actpc")
+        last = int(runs["steps"].iloc[0])
+        at = ((deployed, 0), (average, last), (deployed, last))
+        cells = [listed(results.at_step(runs, column, step), digits) for column, step in at]
+        rows.append([task, ", ".join(str(seed) for seed in runs["seed"]), f"{last:,}", *cells])
+    return lines_of(["task", "seeds", "steps", "after BC", "moving average", "deployed policy"], rows)
 
 
 def dense_table(results: Results, task: str) -> list[str]:
@@ -253,6 +271,7 @@ def tables() -> dict[str, list[str]]:
         found[f"fetch_20000: {task}"] = success_table(fetch, task, FETCH, FETCH_STEPS)
     found["door_50000"] = success_table(load_results(FOLDER / "door_50000"), "door", DOOR, LONG)
     found["can_40000"] = success_table(load_results(FOLDER / "can_40000"), "Can-10", POLICIES, LONG[:-1])
+    found["present_gate"] = gate_table(load_results(FOLDER / "present_gate"))
     long_runs = load_results(FOLDER / "steps_50000")
     found["steps_50000: steadiness"] = steadiness(long_runs, STEPS["steps_50000"], 15_000, 700)
     found["summary"] = summary(*(load_results(FOLDER / folder) for folder in STEPS))
