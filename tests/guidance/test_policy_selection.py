@@ -1,5 +1,7 @@
 """The deployment gate, played with policies whose returns are known."""
 
+import itertools
+
 import numpy as np
 import pytest
 
@@ -37,6 +39,12 @@ class Game:
 
 def noisy(mean: float, std: float):
     return lambda rng: float(rng.normal(mean, std))
+
+
+def changing(n: int, first: float, later: float):
+    """Returns around ``first`` in ``n`` episodes, then around ``later``."""
+    played = itertools.count()
+    return lambda rng: (first if next(played) < n else later) + float(rng.normal())
 
 
 def rate(incumbent, challenger, n_steps: int = 4000) -> float:
@@ -105,17 +113,8 @@ def test_a_share_of_zero_never_evaluates_after_the_first_step():
 
 def test_a_lucky_promotion_is_rolled_back():
     """The challenger's first episodes are lucky; later ones are far worse than the incumbent's."""
-
-    class Lucky:
-        def __init__(self) -> None:
-            self.n = 0
-
-        def __call__(self, rng) -> float:
-            self.n += 1
-            return 200.0 + rng.normal() if self.n <= 3 else 10.0 + rng.normal()
-
     incumbent = noisy(100.0, 5.0)
-    game = Game(1, incumbent, Lucky())
+    game = Game(1, incumbent, changing(3, 200.0, 10.0))
     game.play(20_000)
     assert game.decisions[0] == "promoted"
     assert "rolled back" in game.decisions
@@ -124,16 +123,7 @@ def test_a_lucky_promotion_is_rolled_back():
 
 def test_a_policy_that_lost_by_bad_luck_comes_back():
     """It fails in the two episodes that are compared first, and never again."""
-
-    class Unlucky:
-        def __init__(self) -> None:
-            self.n = 0
-
-        def __call__(self, rng) -> float:
-            self.n += 1
-            return 0.0 if self.n <= 2 else 100.0 + rng.normal()
-
-    incumbent = Unlucky()
+    incumbent = changing(2, 0.0, 100.0)
     game = Game(0, incumbent, noisy(50.0, 1.0))
     game.play(4000)
     assert game.decisions[:2] == ["promoted", "rolled back"]
@@ -142,16 +132,7 @@ def test_a_policy_that_lost_by_bad_luck_comes_back():
 
 def test_the_returns_that_promoted_a_policy_do_not_keep_it():
     """The mean of all its returns stays above the incumbent's, that of the further ones is below."""
-
-    class Lucky:
-        def __init__(self) -> None:
-            self.n = 0
-
-        def __call__(self, rng) -> float:
-            self.n += 1
-            return 100.0 if self.n <= 2 else 15.0 + rng.normal()
-
-    game = Game(0, noisy(20.0, 1.0), Lucky())
+    game = Game(0, noisy(20.0, 1.0), changing(2, 100.0, 15.0))
     game.play(2000)
     assert game.decisions[:2] == ["promoted", "rolled back"]
 
