@@ -116,11 +116,15 @@ class IBRL(TD3Demo):
         return super()._sample_action(0, *args, **options)
 
     def _next_values(self, batch: Any, next_actions: th.Tensor) -> th.Tensor:
-        """Of the actor's and the BC policy's actions the better one's, by the smaller value of two critics, (B, 1)."""
+        """Of the actor's and the BC policy's actions the better one's value, (B, 1): two drawn critics choose the action, two
+        others value it, each pair by its smaller value."""
         actions = th.cat([next_actions, self.policy.bc_actions(batch.next_observations)])
         values = th.stack(self.critic_target(th.cat([batch.next_observations] * 2), actions))
-        drawn = th.randperm(len(values), device=values.device)[:N_TARGET_CRITICS]
-        return values[drawn].amin(dim=0).view(2, -1, 1).amax(dim=0)
+        choosing, valuing = (
+            values[th.randperm(len(values), device=values.device)[:N_TARGET_CRITICS]].amin(dim=0).view(2, -1, 1)
+            for _ in range(2)
+        )
+        return valuing.gather(0, choosing.argmax(dim=0, keepdim=True))[0]
 
     def _actor_values(self, observations: Any, actions: th.Tensor) -> th.Tensor:
         """The smallest value of all critics."""

@@ -5,15 +5,19 @@ from typing import Any, ClassVar
 import jax  # type: ignore[import-not-found]
 import jax.numpy as jnp  # type: ignore[import-not-found]
 import numpy as np
+import torch as th
 from sbx import SAC
 from sbx.sac.policies import SACPolicy
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.utils import get_device
 
-from sb3_actpc.baselines.demonstrated import DemonstratedAlgorithm
+from sb3_actpc.baselines.demonstrated import (
+    DemonstratedAlgorithm,
+    DemonstrationHerReplayBuffer,
+    DemonstrationReplayBuffer,
+)
+from sb3_actpc.utils.normalization import OBSERVATION_CLIP, ObservationNormalizer
 
-SMALLEST_SPREAD = 1e-2  # an entry that hardly varies in the demonstrations is not scaled up
-LARGEST_INPUT = 10.0  # as in SB3's VecNormalize
 N_TARGET_CRITICS = 2  # drawn to bootstrap (REDQ, arXiv 2101.05982)
 
 
@@ -26,17 +30,18 @@ class RLPDPolicy(SACPolicy):
     def __init__(self, *args: Any, n_critics: int = 10, **options: Any) -> None:
         super().__init__(*args, **{"layer_norm": True, **options, "n_critics": n_critics})
         self.mean = np.float32(0.0)
-        self.spread = np.float32(1.0)
+        self.scale = np.float32(1.0)
 
     def fit_normalization(self, observations: np.ndarray) -> None:
-        """Give these observations, (N, obs_dim), mean 0 and standard deviation 1."""
-        self.mean = observations.mean(axis=0)
-        self.spread = np.maximum(observations.std(axis=0), SMALLEST_SPREAD)
+        """Give these observations, (N, obs_dim), mean 0 and standard deviation 1, but for constant entries."""
+        normalizer = ObservationNormalizer(observations.shape[1])
+        normalizer.fit(th.as_tensor(observations))
+        self.mean, self.scale = normalizer.mean.numpy(), normalizer.scale.numpy()
 
     def normalized(self, observations: np.ndarray) -> np.ndarray:
         """Normalized observations, (B, obs_dim)."""
-        rows = (observations - self.mean) / self.spread
-        return np.clip(rows, -LARGEST_INPUT, LARGEST_INPUT).astype(np.float32)
+        rows = (observations - self.mean) * self.scale
+        return np.clip(rows, -OBSERVATION_CLIP, OBSERVATION_CLIP).astype(np.float32)
 
     def prepare_obs(self, observation: Any) -> tuple[np.ndarray, bool]:
         """As SBX's, normalized; they are flattened, (n, obs_dim)."""
@@ -55,11 +60,13 @@ class RLPD(DemonstratedAlgorithm, SAC):
     1. Observations are normalized by the demonstrations' mean and standard deviation, or else by VecNormalize.
     2. The target has no entropy term for any task; there the task decides.
     3. Returns can be n-step (``n_steps``).
+    4. The entropy weight begins with 0.1 unless ``ent_coef`` says otherwise (there 1).
 
     :param args: policy, "MlpPolicy" or "MultiInputPolicy", and env; ``policy_kwargs`` takes ``net_arch`` and ``n_critics``
     :param gradient_steps: critic updates per environment step, and per actor update unless ``policy_delay`` is given
+    :param hindsight: relabel goals, those of the demonstrations too (hindsight replay, not of RLPD's paper); for goal tasks
     :param options: keywords of :class:`~sb3_actpc.baselines.demonstrated.DemonstratedAlgorithm` and of SBX's SAC, whose
-        ``ent_coef`` is "auto_0.1" unless given
+        ``ent_coef`` is "auto_0.1" and ``target_entropy`` minus half the number of action dimensions (as there) unless given
     :raises ValueError: for a keyword with a value that is not allowed, for demonstrations that do not fit the environment
     """
 
@@ -67,12 +74,22 @@ class RLPD(DemonstratedAlgorithm, SAC):
     is_resumable: ClassVar[bool] = False  # checkpoints hold torch networks, these are JAX's
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": RLPDPolicy, "MultiInputPolicy": RLPDPolicy}
 
-    def __init__(self, *args: Any, gradient_steps: int = 10, **options: Any) -> None:
+    def __init__(self, *args: Any, gradient_steps: int = 10, hindsight: bool = False, **options: Any) -> None:
+        self.hindsight = hindsight
         options = {"policy_delay": gradient_steps, "ent_coef": "auto_0.1", **options}
         super().__init__(*args, gradient_steps=gradient_steps, **options)
 
+    def _replay_class(self) -> type[DemonstrationReplayBuffer]:
+        if not self.hindsight:
+            return super()._replay_class()
+        if "desired_goal" not in getattr(self.observation_space, "spaces", {}):
+            raise ValueError(f"hindsight=True needs a goal task, found observations of {self.observation_space}: use False")
+        return DemonstrationHerReplayBuffer
+
     def _setup_model(self) -> None:
         self.device = get_device("cpu")  # of the replay buffer: SBX takes its batches as NumPy arrays
+        if self.target_entropy == "auto":
+            self.target_entropy = -0.5 * float(np.prod(self.action_space.shape))  # type: ignore[arg-type]
         is_new = getattr(self, "policy", None) is None
         super()._setup_model()
         has_data = self.env is not None and self.demonstrations is not None

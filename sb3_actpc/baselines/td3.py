@@ -35,8 +35,9 @@ class TD3Demo(DemonstratedAlgorithm, TD3):
     :param cloning_weight: of the mean over the batch's demonstrations of the squared distance between action and
         demonstrated action (scaled to [-1, 1], summed over its dimensions); 0 for none
     :param q_filter: clone only the demonstrated actions that the critic values above the actor's own
-    :param normalize_values: divide ``policy_gradient_weight`` by the batch's mean absolute action-value. TD3+BC (Fujimoto
-        and Gu, arXiv 2106.06860) with ``policy_gradient_weight=2.5, cloning_weight=1.0``
+    :param normalize_values: the loss of TD3+BC (Fujimoto and Gu, arXiv 2106.06860) with ``policy_gradient_weight=2.5,
+        cloning_weight=1.0``: ``policy_gradient_weight`` is divided by the batch's mean absolute action-value, and the cloning
+        loss is a mean over the action's dimensions
     :param bc_steps: steps of behavior cloning on the demonstrations, before the first ``learn`` begins
     :param observation_normalization: "demonstrations" normalizes observations by their mean and standard deviation (as TD3+BC
         does by its data), "none" leaves them as they are
@@ -159,6 +160,7 @@ class TD3Demo(DemonstratedAlgorithm, TD3):
         distances = (own - demonstrated).square().sum(dim=1, keepdim=True)
         value_weight = self.policy_gradient_weight
         if self.normalize_values:
+            distances = distances / own.shape[1]
             value_weight = value_weight / values.detach().abs().mean().clamp(min=SMALLEST_VALUE).item()
         return self.cloning_weight * (distances * is_cloned).mean() - value_weight * values.mean()
 

@@ -59,6 +59,19 @@ def test_actions_are_chosen_from_observations_in_units_of_the_demonstrations() -
     np.testing.assert_allclose(rows.std(axis=0), 1, atol=1e-4)
 
 
+def test_a_small_entry_is_normalized_and_a_constant_one_is_not() -> None:
+    policy = make().policy
+    rows = np.random.default_rng(0).normal(size=(500, 3)).astype(np.float32) * [1.0, 1e-3, 0.0] + 2.0
+    policy.fit_normalization(rows)
+    np.testing.assert_allclose(policy.normalized(rows).std(axis=0), [1.0, 1.0, 0.0], atol=2e-3)
+    np.testing.assert_allclose(policy.normalized(rows[:1] + [0.0, 0.0, 0.5])[0, 2], 0.5, atol=1e-4)
+
+
+def test_the_entropy_is_held_at_minus_half_the_number_of_action_dimensions() -> None:
+    assert make().target_entropy == -0.5
+    assert make(target_entropy=-3.0).target_entropy == -3.0
+
+
 def test_observations_are_normalized_once() -> None:
     env = VecNormalize(make_vec_env(ENV))
     model = RLPD("MlpPolicy", env, demonstrations=record(ENV), policy_kwargs={"net_arch": [8]}, **SMALL)
@@ -84,3 +97,18 @@ def test_goal_tasks_have_demonstrations_too() -> None:
     model = RLPD("MultiInputPolicy", "GoalReacher-v5", demonstrations=demonstrations, policy_kwargs={"net_arch": [8]}, **SMALL)
     model.learn(12)
     assert int(model.policy.qf_state.step) == 4
+
+
+def test_hindsight_relabels_the_goals_of_the_demonstrations_too() -> None:
+    options = {**SMALL, "learning_starts": 60, "policy_kwargs": {"net_arch": [8]}, "demonstration_fraction": 1.0}
+    model = RLPD("MultiInputPolicy", "GoalReacher-v5", demonstrations=record("SparseReacher-v5"), hindsight=True, **options)
+    batch = model.replay_buffer.sample(200)
+    achieved, wanted = batch.next_observations["achieved_goal"], batch.next_observations["desired_goal"]
+    assert 0.05 < np.isclose(achieved, wanted).all(axis=1).mean()  # without it no goal is hit exactly
+    model.learn(64)
+    assert int(model.policy.qf_state.step) > 0
+
+
+def test_hindsight_needs_goals() -> None:
+    with pytest.raises(ValueError, match="hindsight=True needs a goal task"):
+        make(hindsight=True)

@@ -70,7 +70,7 @@ def demonstrating(**options: object) -> DDPGDemo:
 
 def actor_step(**options: object) -> tuple[th.Tensor, th.Tensor]:
     """The change of the actor's last bias by one update with plain gradient descent of rate 1, and the gradient that the
-    equations of Nair et al. give, with weights 0.25 and 2."""
+    equations of Nair et al. give, with weights 0.25 and 2; with ``normalize_values`` those of TD3+BC."""
     model = demonstrating(policy_gradient_weight=0.25, cloning_weight=2.0, demonstration_fraction=1.0, **options)
     model.actor.optimizer = th.optim.SGD(model.actor.parameters(), lr=1.0)
     model.lr_schedule = lambda _: 1.0
@@ -86,6 +86,7 @@ def actor_step(**options: object) -> tuple[th.Tensor, th.Tensor]:
     distances = (actions - batch.actions).square().sum(dim=1, keepdim=True)
     cloning = distances * is_cloned if model.q_filter else distances
     scale = values.detach().abs().mean() if model.normalize_values else 1.0
+    cloning = cloning / actions.shape[1] if model.normalize_values else cloning
     [gradient] = th.autograd.grad(2.0 * cloning.mean() - 0.25 / scale * values.mean(), bias)
     np.random.seed(5)
     model.train(1, 16)
