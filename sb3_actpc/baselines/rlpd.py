@@ -29,8 +29,8 @@ class RLPDPolicy(SACPolicy):
 
     def __init__(self, *args: Any, n_critics: int = 10, **options: Any) -> None:
         super().__init__(*args, **{"layer_norm": True, **options, "n_critics": n_critics})
-        self.mean = np.float32(0.0)
-        self.scale = np.float32(1.0)
+        self.mean = np.zeros(1, dtype=np.float32)
+        self.scale = np.ones(1, dtype=np.float32)
 
     def fit_normalization(self, observations: np.ndarray) -> None:
         """Give these observations, (N, obs_dim), mean 0 and standard deviation 1, but for constant entries."""
@@ -71,6 +71,7 @@ class RLPD(DemonstratedAlgorithm, SAC):
     """
 
     policy: RLPDPolicy
+    target_entropy: Any
     is_resumable: ClassVar[bool] = False  # checkpoints hold torch networks, these are JAX's
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": RLPDPolicy, "MultiInputPolicy": RLPDPolicy}
 
@@ -89,7 +90,7 @@ class RLPD(DemonstratedAlgorithm, SAC):
     def _setup_model(self) -> None:
         self.device = get_device("cpu")  # of the replay buffer: SBX takes its batches as NumPy arrays
         if self.target_entropy == "auto":
-            self.target_entropy = -0.5 * float(np.prod(self.action_space.shape))  # type: ignore[arg-type]
+            self.target_entropy = -0.5 * float(np.prod(self.action_space.shape or ()))
         is_new = getattr(self, "policy", None) is None
         super()._setup_model()
         has_data = self.env is not None and self.demonstrations is not None

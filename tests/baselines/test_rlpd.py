@@ -64,7 +64,7 @@ def test_a_small_entry_is_normalized_and_a_constant_one_is_not() -> None:
     rows = np.random.default_rng(0).normal(size=(500, 3)).astype(np.float32) * [1.0, 1e-3, 0.0] + 2.0
     policy.fit_normalization(rows)
     np.testing.assert_allclose(policy.normalized(rows).std(axis=0), [1.0, 1.0, 0.0], atol=2e-3)
-    np.testing.assert_allclose(policy.normalized(rows[:1] + [0.0, 0.0, 0.5])[0, 2], 0.5, atol=1e-4)
+    np.testing.assert_allclose(policy.normalized(rows[:1] + 0.5)[0, 2], 0.5, atol=1e-4)
 
 
 def test_the_entropy_is_held_at_minus_half_the_number_of_action_dimensions() -> None:

@@ -62,16 +62,16 @@ def test_wrong_settings_are_named(options: dict, message: str) -> None:
         TD3Demo("MlpPolicy", "Pendulum-v1", **options)
 
 
-def demonstrating(**options: object) -> DDPGDemo:
+def demonstrating(env_id: str = "Pendulum-v1", **options: object) -> DDPGDemo:
     """One critic, half of each batch demonstrated, and a few transitions of the agent's, before any update."""
-    given = {"demonstrations": record("Pendulum-v1"), "demonstration_fraction": 0.5, "learning_starts": 1000, **options}
-    return DDPGDemo("MlpPolicy", "Pendulum-v1", **{**SMALL, **given}).learn(20)
+    given = {"demonstrations": record(env_id), "demonstration_fraction": 0.5, "learning_starts": 1000, **options}
+    return DDPGDemo("MlpPolicy", env_id, **{**SMALL, **given}).learn(20)
 
 
-def actor_step(**options: object) -> tuple[th.Tensor, th.Tensor]:
+def actor_step(env_id: str, **options: object) -> tuple[th.Tensor, th.Tensor]:
     """The change of the actor's last bias by one update with plain gradient descent of rate 1, and the gradient that the
     equations of Nair et al. give, with weights 0.25 and 2; with ``normalize_values`` those of TD3+BC."""
-    model = demonstrating(policy_gradient_weight=0.25, cloning_weight=2.0, demonstration_fraction=1.0, **options)
+    model = demonstrating(env_id, policy_gradient_weight=0.25, cloning_weight=2.0, demonstration_fraction=1.0, **options)
     model.actor.optimizer = th.optim.SGD(model.actor.parameters(), lr=1.0)
     model.lr_schedule = lambda _: 1.0
     model.critic.optimizer = th.optim.SGD([th.nn.Parameter(th.zeros(1))], lr=0.0)  # the critic stands still
@@ -93,9 +93,10 @@ def actor_step(**options: object) -> tuple[th.Tensor, th.Tensor]:
     return before - bias.detach(), gradient
 
 
+@pytest.mark.parametrize("env_id", ["Pendulum-v1", "SparseReacher-v5"])
 @pytest.mark.parametrize("options", [{}, {"q_filter": False}, {"q_filter": False, "normalize_values": True}])
-def test_the_actor_climbs_its_value_and_clones_what_the_critic_prefers(options: dict) -> None:
-    change, gradient = actor_step(**options)
+def test_the_actor_climbs_its_value_and_clones_what_the_critic_prefers(options: dict, env_id: str) -> None:
+    change, gradient = actor_step(env_id, **options)
     assert change.numpy() == pytest.approx(gradient.numpy(), rel=1e-4)
 
 
