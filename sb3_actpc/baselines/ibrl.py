@@ -76,12 +76,14 @@ class IBRL(TD3Demo):
        layers of 1024, 1e-4 and 0.01.
     3. The better of two actions is taken; there one is drawn with probabilities softmax(10 Q).
     4. The choice when acting uses the smallest value of all target critics, not of two drawn ones.
+    5. The actor's loss is of its action without noise (there with that of the targets).
+    6. The BC policy acts for the first ``learning_starts`` steps, which count (there for 40 episodes, which do not).
 
     :param args: policy, "MlpPolicy", and env; ``policy_kwargs`` are those of :class:`IBRLPolicy`
     :param gradient_steps: critic updates per environment step, and per actor update unless ``policy_delay`` is given
     :param options: keywords of :class:`~sb3_actpc.baselines.TD3Demo`, of which ``bc_steps`` (of
-        :class:`~sb3_actpc.baselines.BC`) is 2500 and ``target_policy_noise``, on the actor's proposal for the next state, 0.1
-        unless given; exploration noise is ``policy_kwargs``' own
+        :class:`~sb3_actpc.baselines.BC`) is 2500 and ``target_policy_noise``, on the actor's proposal for the next state, 0.1,
+        clipped to 0.3, unless given; exploration noise is ``policy_kwargs``' own
     :raises ValueError: without demonstrations, and as there
     """
 
@@ -90,7 +92,8 @@ class IBRL(TD3Demo):
 
     @checked
     def __init__(self, *args: Any, gradient_steps: Positive = 5, **options: Any) -> None:
-        options = {"bc_steps": 2500, "policy_delay": gradient_steps, "target_policy_noise": 0.1, **options}
+        theirs = {"target_policy_noise": 0.1, "target_noise_clip": 0.3}
+        options = {"bc_steps": 2500, "policy_delay": gradient_steps, **theirs, **options}
         super().__init__(*args, gradient_steps=gradient_steps, **options)
 
     def _setup_model(self) -> None:
