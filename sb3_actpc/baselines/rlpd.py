@@ -60,13 +60,15 @@ class RLPD(DemonstratedAlgorithm, SAC):
     1. Observations are normalized by the demonstrations' mean and standard deviation, or else by VecNormalize.
     2. The target has no entropy term for any task; there the task decides.
     3. Returns can be n-step (``n_steps``).
-    4. The entropy weight begins with 0.1 unless ``ent_coef`` says otherwise (there 1).
+    4. The entropy weight begins with 0.1 and holds an entropy of minus the number of action dimensions, unless ``ent_coef``
+       and ``target_entropy`` say otherwise (there 1, and minus half the number).
 
     :param args: policy, "MlpPolicy" or "MultiInputPolicy", and env; ``policy_kwargs`` takes ``net_arch`` and ``n_critics``
     :param gradient_steps: critic updates per environment step, and per actor update unless ``policy_delay`` is given
     :param hindsight: relabel goals, those of the demonstrations too (hindsight replay, not of RLPD's paper); for goal tasks
     :param options: keywords of :class:`~sb3_actpc.baselines.demonstrated.DemonstratedAlgorithm` and of SBX's SAC, whose
-        ``ent_coef`` is "auto_0.1" and ``target_entropy`` minus half the number of action dimensions (as there) unless given
+        ``ent_coef`` is "auto_0.1" unless given; ``target_entropy`` can also be "half", minus half the number of action
+        dimensions
     :raises ValueError: for a keyword with a value that is not allowed, for demonstrations that do not fit the environment
     """
 
@@ -89,7 +91,7 @@ class RLPD(DemonstratedAlgorithm, SAC):
 
     def _setup_model(self) -> None:
         self.device = get_device("cpu")  # of the replay buffer: SBX takes its batches as NumPy arrays
-        if self.target_entropy == "auto":
+        if self.target_entropy == "half":
             self.target_entropy = -0.5 * float(np.prod(self.action_space.shape or ()))
         is_new = getattr(self, "policy", None) is None
         super()._setup_model()

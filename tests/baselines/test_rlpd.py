@@ -67,9 +67,9 @@ def test_a_small_entry_is_normalized_and_a_constant_one_is_not() -> None:
     np.testing.assert_allclose(policy.normalized(rows[:1] + 0.5)[0, 2], 0.5, atol=1e-4)
 
 
-def test_the_entropy_is_held_at_minus_half_the_number_of_action_dimensions() -> None:
-    assert make().target_entropy == -0.5
-    assert make(target_entropy=-3.0).target_entropy == -3.0
+@pytest.mark.parametrize(("given", "held"), [("auto", -1.0), ("half", -0.5), (-3.0, -3.0)])
+def test_the_entropy_is_held_at_a_share_of_the_number_of_action_dimensions(given: str | float, held: float) -> None:
+    assert make(target_entropy=given).target_entropy == held
 
 
 def test_observations_are_normalized_once() -> None:
