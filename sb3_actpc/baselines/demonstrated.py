@@ -145,9 +145,10 @@ class DemonstratedAlgorithm(LearnsFromDemonstrations, StoresLastTransition):
         if self.n_steps > 1 and isinstance(self.observation_space, spaces.Dict):
             raise ValueError(f"n_steps={self.n_steps} must be 1 with Dict observations: SB3 has no n-step returns for them")
         buffer = self.replay_buffer = self._make_replay_buffer()
+        kwargs, self.replay_buffer_kwargs = self.replay_buffer_kwargs, {}
         super()._setup_model()
-        # SB3 replaces None by its own default, and SBX makes a buffer of its own
-        self.replay_buffer_class = None
+        # SB3 replaces None by its own default, and SBX makes a buffer of its own, of a class that has no such keywords
+        self.replay_buffer_class, self.replay_buffer_kwargs = None, kwargs
         self.replay_buffer = buffer
 
     def _replay_class(self) -> type[DemonstrationReplayBuffer]:

@@ -120,7 +120,7 @@ class IBRL(TD3Demo):
 
     def _next_values(self, batch: Any, next_actions: th.Tensor) -> th.Tensor:
         """Of the actor's and the BC policy's actions the better one's value, (B, 1): two drawn critics choose the action, two
-        others value it, each pair by its smaller value."""
+        drawn anew value it, each pair by its smaller value."""
         actions = th.cat([next_actions, self.policy.bc_actions(batch.next_observations)])
         values = th.stack(self.critic_target(th.cat([batch.next_observations] * 2), actions))
         choosing, valuing = (

@@ -16,7 +16,8 @@ from sb3_actpc.baselines.demonstrated import (
     DemonstrationHerReplayBuffer,
     DemonstrationReplayBuffer,
 )
-from sb3_actpc.utils.normalization import OBSERVATION_CLIP, ObservationNormalizer
+from sb3_actpc.utils.arguments import Positive, checked
+from sb3_actpc.utils.normalization import ObservationNormalizer
 
 N_TARGET_CRITICS = 2  # drawn to bootstrap (REDQ, arXiv 2101.05982)
 
@@ -31,17 +32,18 @@ class RLPDPolicy(SACPolicy):
         super().__init__(*args, **{"layer_norm": True, **options, "n_critics": n_critics})
         self.mean = np.zeros(1, dtype=np.float32)
         self.scale = np.ones(1, dtype=np.float32)
+        self.clip = np.inf
 
     def fit_normalization(self, observations: np.ndarray) -> None:
         """Give these observations, (N, obs_dim), mean 0 and standard deviation 1, but for constant entries."""
         normalizer = ObservationNormalizer(observations.shape[1])
         normalizer.fit(th.as_tensor(observations))
-        self.mean, self.scale = normalizer.mean.numpy(), normalizer.scale.numpy()
+        self.mean, self.scale, self.clip = normalizer.mean.numpy(), normalizer.scale.numpy(), normalizer.clip.item()
 
     def normalized(self, observations: np.ndarray) -> np.ndarray:
         """Normalized observations, (B, obs_dim)."""
         rows = (observations - self.mean) * self.scale
-        return np.clip(rows, -OBSERVATION_CLIP, OBSERVATION_CLIP).astype(np.float32)
+        return np.clip(rows, -self.clip, self.clip).astype(np.float32)
 
     def prepare_obs(self, observation: Any) -> tuple[np.ndarray, bool]:
         """As SBX's, normalized; they are flattened, (n, obs_dim)."""
@@ -77,7 +79,11 @@ class RLPD(DemonstratedAlgorithm, SAC):
     is_resumable: ClassVar[bool] = False  # checkpoints hold torch networks, these are JAX's
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": RLPDPolicy, "MultiInputPolicy": RLPDPolicy}
 
-    def __init__(self, *args: Any, gradient_steps: int = 10, hindsight: bool = False, **options: Any) -> None:
+    @checked
+    def __init__(self, *args: Any, gradient_steps: Positive = 10, hindsight: bool = False, **options: Any) -> None:
+        entropy = options.get("target_entropy", "auto")
+        if isinstance(entropy, str) and entropy not in ("auto", "half"):
+            raise ValueError(f"target_entropy={entropy!r} must be 'auto', 'half' or a number")
         self.hindsight = hindsight
         options = {"policy_delay": gradient_steps, "ent_coef": "auto_0.1", **options}
         super().__init__(*args, gradient_steps=gradient_steps, **options)
@@ -98,6 +104,14 @@ class RLPD(DemonstratedAlgorithm, SAC):
         has_data = self.env is not None and self.demonstrations is not None
         if is_new and has_data and not self.has_normalized_observations:
             self.policy.fit_normalization(self._fitted_demonstrations().observations)
+
+    def train(self, gradient_steps: int, batch_size: int) -> None:
+        """The updates of one step; none before the first episode has ended where goals are relabelled, unless all is
+        demonstrated."""
+        buffer: Any = self.replay_buffer
+        n_rows = gradient_steps * batch_size
+        if not self.hindsight or buffer.n_demonstrated(n_rows) == n_rows or buffer.ep_length.any():
+            super().train(gradient_steps, batch_size)
 
     def _train(self, tau: float, target_entropy: Any, gradient_steps: int, data: Any, *states: Any) -> Any:
         """SBX's updates, on normalized observations. SBX cuts the rows into batches, and the demonstrated rows come last: each

@@ -33,7 +33,7 @@ class TD3Demo(DemonstratedAlgorithm, TD3):
     :param critic_kwargs: the same for the critic
     :param policy_gradient_weight: of minus the mean action-value, where a cloning loss is added; otherwise 1
     :param cloning_weight: of the mean over the batch's demonstrations of the squared distance between action and
-        demonstrated action (scaled to [-1, 1], summed over its dimensions); 0 for none
+        demonstrated action (scaled to [-1, 1], summed over its dimensions unless ``normalize_values``); 0 for none
     :param q_filter: clone only the demonstrated actions that the critic values above the actor's own
     :param normalize_values: the loss of TD3+BC (Fujimoto and Gu, arXiv 2106.06860) with ``policy_gradient_weight=2.5,
         cloning_weight=1.0``: ``policy_gradient_weight`` is divided by the batch's mean absolute action-value, and the cloning

@@ -67,9 +67,20 @@ def test_a_small_entry_is_normalized_and_a_constant_one_is_not() -> None:
     np.testing.assert_allclose(policy.normalized(rows[:1] + 0.5)[0, 2], 0.5, atol=1e-4)
 
 
-@pytest.mark.parametrize(("given", "held"), [("auto", -1.0), ("half", -0.5), (-3.0, -3.0)])
+@pytest.mark.parametrize(("given", "held"), [("auto", -2.0), ("half", -1.0), (-3.0, -3.0)])
 def test_the_entropy_is_held_at_a_share_of_the_number_of_action_dimensions(given: str | float, held: float) -> None:
-    assert make(target_entropy=given).target_entropy == held
+    task = "SparseReacher-v5"  # two dimensions
+    assert RLPD("MlpPolicy", task, policy_kwargs={"net_arch": [8]}, target_entropy=given, **SMALL).target_entropy == held
+
+
+def test_another_target_entropy_is_refused() -> None:
+    with pytest.raises(ValueError, match="target_entropy='Half' must be 'auto', 'half' or a number"):
+        make(target_entropy="Half")
+
+
+def test_without_demonstrations_observations_stay_as_they_are() -> None:
+    rows = np.array([[50.0, -2.0, 100.0]], dtype=np.float32)
+    np.testing.assert_array_equal(make(demonstrations=None).policy.prepare_obs(rows)[0], rows)
 
 
 def test_observations_are_normalized_once() -> None:
@@ -99,14 +110,26 @@ def test_goal_tasks_have_demonstrations_too() -> None:
     assert int(model.policy.qf_state.step) == 4
 
 
-def test_hindsight_relabels_the_goals_of_the_demonstrations_too() -> None:
-    options = {**SMALL, "learning_starts": 60, "policy_kwargs": {"net_arch": [8]}, "demonstration_fraction": 1.0}
-    model = RLPD("MultiInputPolicy", "GoalReacher-v5", demonstrations=record("SparseReacher-v5"), hindsight=True, **options)
+def with_hindsight(**options: object) -> RLPD:
+    given = {**SMALL, "policy_kwargs": {"net_arch": [8]}, "demonstrations": record("SparseReacher-v5"), "hindsight": True}
+    return RLPD("MultiInputPolicy", "GoalReacher-v5", **{**given, **options})
+
+
+@pytest.mark.parametrize("fraction", [0.0, 1.0])
+def test_hindsight_relabels_the_goals_of_agent_and_demonstrations(fraction: float) -> None:
+    model = with_hindsight(demonstration_fraction=fraction).learn(60)
     batch = model.replay_buffer.sample(200)
     achieved, wanted = batch.next_observations["achieved_goal"], batch.next_observations["desired_goal"]
     assert 0.05 < np.isclose(achieved, wanted).all(axis=1).mean()  # without it no goal is hit exactly
-    model.learn(64)
-    assert int(model.policy.qf_state.step) > 0
+
+
+def test_hindsight_waits_for_the_end_of_an_episode(tmp_path: Path) -> None:
+    model = with_hindsight(learning_starts=10, replay_buffer_kwargs={"n_sampled_goal": 8})
+    assert int(model.learn(48).policy.qf_state.step) == 0
+    assert int(model.learn(8, reset_num_timesteps=False).policy.qf_state.step) > 0
+    model.save(tmp_path / "model.zip")
+    loaded = RLPD.load(tmp_path / "model.zip", env=gym.make("GoalReacher-v5"), demonstrations=record("SparseReacher-v5"))
+    assert loaded.learn(8, reset_num_timesteps=False).replay_buffer.n_sampled_goal == 8
 
 
 def test_hindsight_needs_goals() -> None:
