@@ -48,17 +48,26 @@ OTHERS = {
     "RLPD, ten critics, ten updates per step": "rlpd_utd10",
     "IBRL": "ibrl",
     "TD3+BC": "td3_bc",
+    "TD3+BC, stronger cloning, one update per step": "td3_bc_strong",
     "DDPG-Demo": "ddpg_demo",
     "LOGO": "logo",
     "BC-RNN": "bc_rnn",
 }
-CLONE_FIRST = ("ibrl", "td3_bc", "ddpg_demo")
+CLONE_FIRST = ("ibrl", "td3_bc_strong", "ddpg_demo")
 CLONED_LATER = ("Hopper-suboptimal", "Walker2d-suboptimal")  # there these were evaluated at step 0 before their BC
 # dense rewards without demonstrations: name of a row -> variant
 DENSE = {"ActPC, `n_steps=3`": "actpc", "TD3": "TD3", "SAC": "SAC"}
 DENSE_TASKS = ("HalfCheetah-v5", "Hopper-v5")
-FETCH = {**POLICIES, "HER": ("her", "success")}  # success instead of returns
+FETCH = {**POLICIES, "RLPD with hindsight": ("rlpd_her", "success"), "HER": ("her", "success")}  # success instead of returns
 FETCH_STEPS = (0, 5_000, 10_000, 15_000, 20_000)
+# plain BC with early stopping, and with all demonstrations in batches of 256: task -> the measure and its digits
+BC_TASKS = {
+    "Walker2d": ("return", 0),
+    "HalfCheetah-suboptimal": ("return", 0),
+    "Swimmer-suboptimal": ("return", 0),
+    "SparseReacher-v5": ("return", 0),
+    "door": ("success", 2),
+}
 DOOR = {
     "ActPC, moving average": ("critic", "actor_return"),
     "ActPC, deployed policy": ("critic", "return"),
@@ -155,6 +164,29 @@ def gate_table(results: Results) -> list[str]:
         cells = [listed(results.at_step(runs, column, step), digits) for column, step in at]
         rows.append([task, ", ".join(str(seed) for seed in runs["seed"]), f"{last:,}", *cells])
     return lines_of(["task", "seeds", "steps", "after BC", "moving average", "deployed policy"], rows)
+
+
+def bc_table(checked: Results, folders: Sequence[Results]) -> list[str]:
+    """Lines of the table of plain BC with two settings, every seed; a task is in the first of the results that has it."""
+    rows = []
+    for task, (measure, digits) in BC_TASKS.items():
+        stopped = next(runs for runs in (runs_of(one, task, "bc") for one in (checked, *folders)) if len(runs))
+        stopped = stopped[stopped["seed"] <= 422]
+        whole = runs_of(checked, task, "bc_256")
+        rows.append([task, listed(stopped[measure], digits), listed(whole[measure], digits)])
+    return lines_of(["demonstrations", "early stopping (`bc.yml`)", "batches of 256, no early stopping"], rows)
+
+
+def entropy_table(checked: Results, short: Results) -> list[str]:
+    """Lines of the table of RLPD with two target entropies: returns of every seed at quarters of its steps."""
+    rows = []
+    for task in ("Walker2d", "SparseReacher-v5"):
+        half, steps = runs_of(checked, task, "rlpd_half"), STEPS["steps_10000"][task]
+        same = runs_of(short, task, "rlpd")
+        same = same[same["seed"].isin(half["seed"])]
+        for name, results, runs in (("-A", short, same), ("-A / 2", checked, half)):
+            rows.append([task, name, *(listed(results.at_step(runs, "return", step), 0) for step in steps[1:])])
+    return lines_of(["task", "target entropy", "a quarter of the steps", "half", "three quarters", "all"], rows)
 
 
 def dense_table(results: Results, task: str) -> list[str]:
@@ -262,6 +294,10 @@ def tables() -> dict[str, list[str]]:
     others, short = load_results(FOLDER / "baselines_10000"), load_results(FOLDER / "steps_10000")
     for task in others.finished["task"].unique():
         found[f"baselines_10000: {task}"] = others_table(others, short, task)
+    checked = load_results(FOLDER / "checked_baselines")
+    found["checked_baselines: HalfCheetah"] = table(checked, "HalfCheetah-suboptimal", SHORT)
+    found["checked_baselines: BC"] = bc_table(checked, (short, load_results(FOLDER / "door_50000")))
+    found["checked_baselines: entropy"] = entropy_table(checked, short)
     dense = load_results(FOLDER / "dense_50000")
     for task in DENSE_TASKS:
         found[f"dense_50000: {task}"] = dense_table(dense, task)
