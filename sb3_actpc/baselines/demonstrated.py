@@ -64,6 +64,10 @@ class DemonstrationReplayBuffer(ReplayBuffer):
         """How many of B transitions are demonstrated ones; they are the last rows."""
         return 0 if self.demonstrated is None else round(self.demonstration_fraction * batch_size)
 
+    def can_sample(self, batch_size: int) -> bool:
+        """Whether there are transitions to draw."""
+        return True
+
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> Any:
         """B transitions: those of the agent, then those of the demonstrations; ``env`` as SB3's."""
         n_demonstrated = self.n_demonstrated(batch_size)
@@ -100,6 +104,10 @@ class DemonstrationHerReplayBuffer(DemonstrationReplayBuffer, HerReplayBuffer):
         super().set_env(env)
         if isinstance(self.demonstrated, HerReplayBuffer):
             self.demonstrated.set_env(env)
+
+    def can_sample(self, batch_size: int) -> bool:
+        """Not before the first episode has ended, as its goals come from there, unless the whole batch is demonstrated."""
+        return self.n_demonstrated(batch_size) == batch_size or bool(self.ep_length.any())
 
     def cut_running_episodes(self) -> None:
         """As :meth:`DemonstrationReplayBuffer.cut_running_episodes`."""
@@ -162,6 +170,11 @@ class DemonstratedAlgorithm(LearnsFromDemonstrations, StoresLastTransition):
         if issubclass(kind, NStepReplayBuffer):
             kwargs |= {"n_steps": self.n_steps, "gamma": self.gamma}  # SB3 adds those of an agent that is loaded
         if issubclass(kind, HerReplayBuffer):
+            if "desired_goal" not in getattr(self.observation_space, "spaces", {}):
+                raise ValueError(
+                    f"{type(self).__name__} with hindsight needs a goal task such as GoalReacher-v5, found observations of "
+                    f"{self.observation_space}"
+                )
             kwargs["env"] = self.env
         return kind(
             1 if is_played else size or self.buffer_size,

@@ -132,8 +132,6 @@ class HER(DDPGDemo):
         super().__init__(*args, **options)
 
     def _replay_class(self) -> type[DemonstrationHerReplayBuffer]:
-        if "desired_goal" not in getattr(self.observation_space, "spaces", {}):
-            raise ValueError(f"HER needs a goal task such as GoalReacher-v5, found observations of {self.observation_space}")
         return PrioritizedHerReplayBuffer if self.prioritized else DemonstrationHerReplayBuffer
 
     @property
@@ -152,9 +150,8 @@ class HER(DDPGDemo):
         return actions, scaled
 
     def train(self, gradient_steps: int, batch_size: int = 100) -> None:
-        """DDPG's updates; none before the first episode has ended, since hindsight needs one, unless all is demonstrated."""
-        buffer: Any = self.replay_buffer
-        if buffer.n_demonstrated(batch_size) == batch_size or buffer.ep_length.any():
+        """DDPG's updates, once the buffer can be sampled from."""
+        if self.replay_buffer.can_sample(batch_size):
             self.logger.record("rollout/random_action_probability", self.random_action_probability)
             super().train(gradient_steps, batch_size)
 

@@ -89,11 +89,7 @@ class RLPD(DemonstratedAlgorithm, SAC):
         super().__init__(*args, gradient_steps=gradient_steps, **options)
 
     def _replay_class(self) -> type[DemonstrationReplayBuffer]:
-        if not self.hindsight:
-            return super()._replay_class()
-        if "desired_goal" not in getattr(self.observation_space, "spaces", {}):
-            raise ValueError(f"hindsight=True needs a goal task, found observations of {self.observation_space}: use False")
-        return DemonstrationHerReplayBuffer
+        return DemonstrationHerReplayBuffer if self.hindsight else super()._replay_class()
 
     def _setup_model(self) -> None:
         self.device = get_device("cpu")  # of the replay buffer: SBX takes its batches as NumPy arrays
@@ -106,11 +102,8 @@ class RLPD(DemonstratedAlgorithm, SAC):
             self.policy.fit_normalization(self._fitted_demonstrations().observations)
 
     def train(self, gradient_steps: int, batch_size: int) -> None:
-        """The updates of one step; none before the first episode has ended where goals are relabelled, unless all is
-        demonstrated."""
-        buffer: Any = self.replay_buffer
-        n_rows = gradient_steps * batch_size
-        if not self.hindsight or buffer.n_demonstrated(n_rows) == n_rows or buffer.ep_length.any():
+        """The updates of one step, once the buffer can be sampled from."""
+        if self.replay_buffer.can_sample(gradient_steps * batch_size):
             super().train(gradient_steps, batch_size)
 
     def _train(self, tau: float, target_entropy: Any, gradient_steps: int, data: Any, *states: Any) -> Any:
