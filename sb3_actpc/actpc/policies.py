@@ -203,7 +203,8 @@ class ActPCPolicy(BasePolicy):
     :param circuit_class: a subclass of :class:`~sb3_actpc.ngc.NGCCircuit` for all circuits, or a dict with classes for some
         of ``actor``, ``critic``, ``generator`` and ``prior``
     :param circuit_kwargs: keywords of every circuit
-    :param actor_kwargs: the same for the actor alone, and ``learning_rate``, ``batch_size``
+    :param actor_kwargs: the same for the actor alone, and ``learning_rate``, ``batch_size`` and ``output_activation``, "tanh"
+        (the paper's and the default) or "clamp" (:mod:`~sb3_actpc.ngc.activations`)
     :param critic_kwargs: the same for the critic
     :param generator_kwargs: the same for the generator
     :param prior_kwargs: the same for the prior
@@ -287,7 +288,7 @@ class ActPCPolicy(BasePolicy):
         n_actions = int(np.prod(self.action_space.shape))
         memory = WorkingMemory(n_features, self.memory_history) if self.memory_history else None
         n_memory = memory.size if memory else 0
-        circuit = self._make_circuit("actor", n_features, n_actions, output_activation="tanh", n_memory=n_memory)
+        circuit = self._make_circuit("actor", n_features, n_actions, n_memory=n_memory)
         spaces_ = self.observation_space, self.action_space
         self.actor = ActPCActor(*spaces_, extractor, memory, circuit, self.is_gated, self.normalize_images)
         n_members = self.n_critics if self.n_critics > 1 else 0
@@ -338,6 +339,8 @@ class ActPCPolicy(BasePolicy):
             default["activation"] = "relu"
         if is_normalized:
             default["normalization"] = "layer"
+        if name == "actor":
+            extra["output_activation"] = own.pop("output_activation", "tanh")
         kwargs = {**default, **self.circuit_kwargs, **{k: own[k] for k in own if k not in NOT_OF_CIRCUITS}}
         known = sorted({*CIRCUIT_KEYWORDS, *constructor_keywords(kind)} - _SIZES)
         if unknown := sorted(set(kwargs) - set(known)):

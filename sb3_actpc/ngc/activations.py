@@ -4,6 +4,10 @@ Activation functions φ and the in-place multiplication by their derivatives, as
 Layer normalization acts on hidden latents: x = (z - mean) / std over the units of one layer, without learned scale or shift.
 Mean, variance and the sums of the backward pass are taken over one layer, so the operation is local to it (divisive
 normalization). With tied feedback the error that passes through it is, numerically, the one of autograd.
+
+"clamp" is for outputs alone: the prediction, cut to [-1, 1]. Its errors pass unchanged, but for those beyond a bound that
+point further out. So a target costs 1/2 (target - z)^2 within the bounds and grows linearly outside, where one at the bound
+costs nothing; and the push of a critic stops at the bound (projected gradient).
 """
 
 from collections.abc import Callable
@@ -57,9 +61,14 @@ _FUNCTIONS: dict[str, tuple[Function, Derivative]] = {
         lambda z, out: aten.elu.out(z, 1.0, 1.0, 1.0, out=out),
         lambda f, z, h: aten.elu_backward.grad_input(f, 1.0, 1.0, 1.0, False, z, grad_input=f),
     ),
+    "clamp": (
+        lambda z, out: th.clamp(z, -1.0, 1.0, out=out),
+        lambda f, z, h: f.masked_fill_(((z > 1.0) & (f > 0.0)) | ((z < -1.0) & (f < 0.0)), 0.0),
+    ),
     "tanh": (lambda z, out: th.tanh(z, out=out), lambda f, z, h: aten.tanh_backward.grad_input(f, h, grad_input=f)),
 }
 ACTIVATIONS = {name: Activation(name, apply, damp) for name, (apply, damp) in _FUNCTIONS.items()}
+HIDDEN = [name for name in ACTIVATIONS if name != "clamp"]
 
 
 def get_activation(name: str) -> Activation:

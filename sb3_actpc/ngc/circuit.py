@@ -9,7 +9,7 @@ from typing import Any
 import torch as th
 from torch import nn
 
-from sb3_actpc.ngc.activations import ACTIVATIONS, EPSILON, NORMALIZATIONS, normalize
+from sb3_actpc.ngc.activations import ACTIVATIONS, EPSILON, HIDDEN, NORMALIZATIONS, normalize
 from sb3_actpc.ngc.dynamics import DYNAMICS, SettledState, SettlingChain, damped, largest_norm_, settling_rates
 from sb3_actpc.ngc.krylov import settle_krylov
 from sb3_actpc.ngc.plasticity import SYNAPTIC_SCALINGS, HebbianChanges, bound_columns_, hebbian_changes, mirrored, soft_bound_
@@ -31,7 +31,8 @@ class NGCCircuit(nn.Module):
     :param n_outputs: size of the output
     :param hidden: sizes of the hidden layers, first to last; may be empty
     :param activation: φ of the hidden layers: relu6 (paper), relu, leaky_relu, elu, tanh or identity
-    :param output_activation: g of the output layer, same choices
+    :param output_activation: g of the output layer, same choices; with ``settling="scheduled"`` also "clamp", which cuts to
+        [-1, 1] and lets errors pass (:mod:`~sb3_actpc.ngc.activations`)
     :param settling: "iterative" (settle as ``dynamics`` says, then one change) or "scheduled" (each layer's change is
         taken when the error first reaches it, one ordered sweep; the zero-divergence schedule, Z-IL, of the predictive-coding
         literature; about K times cheaper). Scheduled with tied feedback is, numerically, the gradient of the output's loss;
@@ -417,7 +418,7 @@ def _uniform(shape: tuple[int, ...], fan_in: int) -> nn.Parameter:
 # ------------------------------------------------------------------ checks of the constructor's keywords
 
 _CHOICES: dict[str, Collection[str]] = {
-    "activation": ACTIVATIONS,
+    "activation": HIDDEN,
     "output_activation": ACTIVATIONS,
     "settling": ("iterative", "scheduled"),
     "dynamics": DYNAMICS,
@@ -466,6 +467,8 @@ def _check_agreement(given: dict[str, Any]) -> None:
     if given["synaptic_scaling"] != "none" and not given["weight_bound"]:
         refuse("weight_bound", "synaptic_scaling", "it must be above 0")
     is_scheduled = given["settling"] == "scheduled"
+    if given["output_activation"] == "clamp" and not is_scheduled:
+        refuse("output_activation", "settling", "use settling='scheduled' or output_activation='tanh'")
     for name, implied in _IMPLIED.items():
         if given[name] == implied:
             continue

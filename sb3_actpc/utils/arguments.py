@@ -249,6 +249,8 @@ def check_circuit(name: str, settings: Any) -> None:
             check_value(where, value, Size)
         elif key == "learning_rate":
             check_value(where, value, Annotated[float, Between(0, LARGEST_SIZE)])
+        elif key == "output_activation" and name == "actor_kwargs":
+            check_value(where, value, Literal["tanh", "clamp"])
 
 
 def check_optimizer(name: str, kind: Any) -> None:

@@ -744,6 +744,8 @@ def test_vec_normalize_relabels_the_task_reward_alone():
         ({"policy_kwargs": {"optimizer_kwargs": {"lr": 1.0}}}, "optimizer_kwargs has lr=1.0: use learning_rate="),
         ({"policy_kwargs": {"circuit_kwargs": {"settling": "iterative"}}}, "give settling= to the agent"),
         ({"policy_kwargs": {"actor_kwargs": {"settling": "iterative"}}}, "critic settling='scheduled' must agree"),
+        ({"policy_kwargs": {"actor_kwargs": {"output_activation": "relu"}}}, "choose one of .'tanh', 'clamp'"),
+        ({"policy_kwargs": {"critic_kwargs": {"output_activation": "tanh"}}}, "critic_kwargs: a circuit has no keywords"),
         ({"policy_kwargs": {"net_arch": {"vf": [8]}}}, "unknown keys"),
         ({"policy_kwargs": {"circuit_kwargs": {"activation": "gelu"}}}, "activation='gelu'"),
         ({"policy_kwargs": {"circuit_kwargs": {"n_steps": 3}}}, "a circuit has no keywords"),

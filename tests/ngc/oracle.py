@@ -37,15 +37,15 @@ def energy(circuit: NGCCircuit, weights, biases, latents, target) -> th.Tensor:
     return total
 
 
-def forward(circuit: NGCCircuit, weights, biases, x) -> th.Tensor:
-    """Feed-forward output."""
+def forward(circuit: NGCCircuit, weights, biases, x, output_activation: str | None = None) -> th.Tensor:
+    """Feed-forward output; with another ``output_activation`` than the circuit's if one is given."""
     for layer, (w, b) in enumerate(zip(weights, biases, strict=True)):
         if layer and circuit.normalization == "layer":
             x = F.layer_norm(x, x.shape[-1:])
         if layer:
             x = FUNCTIONS[circuit.activation.name](x)
         x = x @ w.t() + b
-    return FUNCTIONS[circuit.output_activation.name](x)
+    return FUNCTIONS[output_activation or circuit.output_activation.name](x)
 
 
 def cosine(a: th.Tensor, b: th.Tensor) -> float:

@@ -31,6 +31,44 @@ def test_scheduled_changes_equal_backprop(hidden, output_activation, activation,
         assert th.allclose(change, -synapse.grad, atol=1e-5)
 
 
+@pytest.mark.parametrize("hidden", [(), (16,), (16, 12)])
+def test_a_clamped_output_costs_quadratically_within_its_bounds_and_linearly_outside(hidden):
+    """With targets at a bound there is no cost beyond it."""
+    circuit = NGCCircuit(6, 3, hidden, settling="scheduled", output_activation="clamp")
+    circuit.weights[-1].mul_(8.0)
+    x, target = th.randn(64, 6), (2 * th.randn(64, 3)).clamp(-1, 1)
+    weights, biases = oracle.synapses(circuit)
+    z = oracle.forward(circuit, weights, biases, x, "identity")
+    bound = z.detach().clamp(-1, 1)
+    assert th.allclose(circuit.project(x), bound, atol=1e-6)
+    is_outside = z.abs() > 1
+    assert 0.1 < is_outside.float().mean() < 0.9 and (is_outside & (target == bound)).any()
+    cost = th.where(is_outside, (bound - target) * (z - bound), 0.5 * (z - target).square())
+    (cost.sum() / len(x)).backward()
+    changes = circuit.hebbian_update(circuit.settle(x, target))
+    for change, synapse in zip(changes.tensors(), [*weights, *biases], strict=True):
+        assert th.allclose(change, -synapse.grad, atol=1e-5)
+
+
+def test_a_clamped_actor_follows_the_projected_policy_gradient():
+    """An action at a bound moves into the range where the critic values that more, and never further out."""
+    actor = NGCCircuit(17, 6, (32,), settling="scheduled", output_activation="clamp")
+    critic = NGCCircuit(23, 6, (32,), settling="scheduled", n_feedback_inputs=6)
+    actor.weights[-1].mul_(8.0)
+    x = th.randn(64, 17)
+    weights, biases = oracle.synapses(actor)
+    z = oracle.forward(actor, weights, biases, x, "identity")
+    action = z.detach().clamp(-1, 1).requires_grad_()
+    value = oracle.forward(critic, *oracle.synapses(critic, False), th.cat([x, action], dim=1)).mean(1).mean()
+    (push,) = th.autograd.grad(value, action)
+    points_out = (z.abs() > 1) & (push * z > 0)
+    assert points_out.any() and ((z.abs() > 1) & ~points_out).any()
+    z.backward(push.masked_fill(points_out, 0.0))
+    changes = actor.hebbian_update(settle_coupled(actor, critic, x).actor)
+    for change, synapse in zip(changes.tensors(), [*weights, *biases], strict=True):
+        assert synapse.grad.abs().max() > 1e-4 and th.allclose(change, synapse.grad, atol=1e-6)
+
+
 def gradient_by_autograd(actor: NGCCircuit, critic: NGCCircuit, x: th.Tensor) -> list[th.Tensor]:
     """∂ mean_a Q(x, μ(x)) by the actor's weights and biases, by autograd."""
     weights, biases = oracle.synapses(actor)
