@@ -143,3 +143,12 @@ def test_a_loaded_agent_keeps_what_its_circuits_depend_on(tmp_path):
         with pytest.raises(ValueError, match=name):
             ActPC.from_weights(tmp_path / "agent", CountingEnv(), demonstrations=demonstrations(), **{name: value})
     assert ActPC.load(tmp_path / "agent", settling="scheduled", guidance="default").policy.is_gated
+
+
+def test_a_clamped_output_reaches_the_bounds_and_is_loaded(tmp_path):
+    model = imitating(policy_kwargs={"actor_kwargs": {"output_activation": "clamp"}}).learn(20)
+    rows = 100.0 * np.random.default_rng(0).normal(size=(50, *model.observation_space.shape)).astype(np.float32)
+    actions, _ = model.predict(rows)
+    assert (np.abs(model.policy.scale_action(actions)) == 1.0).any()
+    model.save(tmp_path / "agent")
+    assert np.array_equal(ActPC.load(tmp_path / "agent").predict(rows)[0], actions)
