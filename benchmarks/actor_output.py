@@ -1,11 +1,11 @@
-"""Behavior cloning with several bounded outputs, by local changes and by backprop: which part of the loss is the output's.
+"""Compares outputs of the actor in behavior cloning, trained by local changes and by backprop.
 
     python benchmarks/actor_output.py SparseWalker2d-v5
     python benchmarks/actor_output.py SparseHalfCheetah-v5 --file demonstrations.npz --seeds 21 22 23
 
-3,000 updates with batches of 256 steps, drawn uniformly, of two hidden layers of 256 units. Prints for each network the error
-on the demonstrations as a share of the variance of the actions, and the mean return of ten episodes of the same start states,
-seed by seed.
+Each network has two hidden layers of 256 units and gets 3,000 updates with batches of 256 steps, drawn uniformly. Local ones
+have a weight decay of 0.1, as ActPC's. Prints for each network the error on the demonstrations as a share of the variance of the
+actions, and the mean return of ten episodes from the same start states, seed by seed.
 """
 
 import argparse
@@ -23,6 +23,7 @@ from sb3_actpc.guidance.behavior_cloning import LEARNING_RATES
 from sb3_actpc.ngc import NGCCircuit
 
 UPDATES, BATCH_SIZE, EPISODES, HIDDEN = 3000, 256, 10, 256
+NETWORKS = ["local tanh", "local clamp", "backprop tanh", "backprop linear"]
 Policy = Callable[[th.Tensor], th.Tensor]
 
 
@@ -82,7 +83,7 @@ def main() -> None:
     parser.add_argument("env", help="Gymnasium id")
     parser.add_argument("--file", type=Path, help="demonstrations (default: the shipped ones)")
     parser.add_argument("--seeds", type=int, nargs="+", default=[21, 22, 23])
-    parser.add_argument("--only", nargs="+", default=["local tanh", "local clamp", "backprop tanh", "backprop linear"])
+    parser.add_argument("--only", nargs="+", choices=NETWORKS, default=NETWORKS)
     given = parser.parse_args()
     shown = Demonstrations.load(given.file or shipped_demonstrations(given.env))
     env = gym.make(given.env)

@@ -66,7 +66,7 @@ class DemonstrationReplayBuffer(ReplayBuffer):
 
     def can_sample(self, batch_size: int) -> bool:
         """Whether there are transitions to draw."""
-        return True
+        return self.n_demonstrated(batch_size) == batch_size or self.size() > 0
 
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> Any:
         """B transitions: those of the agent, then those of the demonstrations; ``env`` as SB3's."""
@@ -172,7 +172,7 @@ class DemonstratedAlgorithm(LearnsFromDemonstrations, StoresLastTransition):
         if issubclass(kind, HerReplayBuffer):
             if "desired_goal" not in getattr(self.observation_space, "spaces", {}):
                 raise ValueError(
-                    f"{type(self).__name__} with hindsight needs a goal task such as GoalReacher-v5, found observations of "
+                    f"{type(self).__name__}: hindsight needs a goal task such as GoalReacher-v5, found observations of "
                     f"{self.observation_space}"
                 )
             kwargs["env"] = self.env

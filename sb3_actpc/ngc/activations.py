@@ -5,9 +5,10 @@ Layer normalization acts on hidden latents: x = (z - mean) / std over the units 
 Mean, variance and the sums of the backward pass are taken over one layer, so the operation is local to it (divisive
 normalization). With tied feedback the error that passes through it is, numerically, the one of autograd.
 
-"clamp" is for outputs alone: the prediction, cut to [-1, 1]. Its errors pass unchanged, but for those beyond a bound that
-point further out. So a target costs 1/2 (target - z)^2 within the bounds and grows linearly outside, where one at the bound
-costs nothing; and the push of a critic stops at the bound (projected gradient).
+"clamp" is for outputs alone: the prediction z, cut to [-1, 1]. Errors pass unchanged, except that one is dropped where z is
+beyond a bound and the error points further out. So the cost is 1/2 (target - z)^2 within the bounds and rises linearly beyond
+them; beyond a bound it is zero where the target is that bound. A critic moves an action up to the bound and no further
+(projected gradient).
 """
 
 from collections.abc import Callable
@@ -31,7 +32,7 @@ class Activation:
     :param name: the name it is chosen by
     :param apply: ``apply(latents, out)`` writes φ(latents) into ``out`` and returns it (the identity returns ``latents``)
     :param damp: ``damp(signal, latents, activations)`` multiplies ``signal`` in place by φ'(latents), where
-        ``activations`` is φ(latents)
+        ``activations`` is φ(latents); of "clamp" as above
     """
 
     name: str
@@ -63,12 +64,12 @@ _FUNCTIONS: dict[str, tuple[Function, Derivative]] = {
     ),
     "clamp": (
         lambda z, out: th.clamp(z, -1.0, 1.0, out=out),
-        lambda f, z, h: f.masked_fill_(((z > 1.0) & (f > 0.0)) | ((z < -1.0) & (f < 0.0)), 0.0),
+        lambda f, z, h: f.masked_fill_((z - h) * f > 0.0, 0.0),
     ),
     "tanh": (lambda z, out: th.tanh(z, out=out), lambda f, z, h: aten.tanh_backward.grad_input(f, h, grad_input=f)),
 }
 ACTIVATIONS = {name: Activation(name, apply, damp) for name, (apply, damp) in _FUNCTIONS.items()}
-HIDDEN = [name for name in ACTIVATIONS if name != "clamp"]
+HIDDEN_ACTIVATIONS = [name for name in ACTIVATIONS if name != "clamp"]
 
 
 def get_activation(name: str) -> Activation:

@@ -9,7 +9,7 @@ from typing import Any
 import torch as th
 from torch import nn
 
-from sb3_actpc.ngc.activations import ACTIVATIONS, EPSILON, HIDDEN, NORMALIZATIONS, normalize
+from sb3_actpc.ngc.activations import ACTIVATIONS, EPSILON, HIDDEN_ACTIVATIONS, NORMALIZATIONS, normalize
 from sb3_actpc.ngc.dynamics import DYNAMICS, SettledState, SettlingChain, damped, largest_norm_, settling_rates
 from sb3_actpc.ngc.krylov import settle_krylov
 from sb3_actpc.ngc.plasticity import SYNAPTIC_SCALINGS, HebbianChanges, bound_columns_, hebbian_changes, mirrored, soft_bound_
@@ -32,7 +32,7 @@ class NGCCircuit(nn.Module):
     :param hidden: sizes of the hidden layers, first to last; may be empty
     :param activation: φ of the hidden layers: relu6 (paper), relu, leaky_relu, elu, tanh or identity
     :param output_activation: g of the output layer, same choices; with ``settling="scheduled"`` also "clamp", which cuts to
-        [-1, 1] and lets errors pass (:mod:`~sb3_actpc.ngc.activations`)
+        [-1, 1] and keeps the errors there (:mod:`~sb3_actpc.ngc.activations`)
     :param settling: "iterative" (settle as ``dynamics`` says, then one change) or "scheduled" (each layer's change is
         taken when the error first reaches it, one ordered sweep; the zero-divergence schedule, Z-IL, of the predictive-coding
         literature; about K times cheaper). Scheduled with tied feedback is, numerically, the gradient of the output's loss;
@@ -418,7 +418,7 @@ def _uniform(shape: tuple[int, ...], fan_in: int) -> nn.Parameter:
 # ------------------------------------------------------------------ checks of the constructor's keywords
 
 _CHOICES: dict[str, Collection[str]] = {
-    "activation": HIDDEN,
+    "activation": HIDDEN_ACTIVATIONS,
     "output_activation": ACTIVATIONS,
     "settling": ("iterative", "scheduled"),
     "dynamics": DYNAMICS,

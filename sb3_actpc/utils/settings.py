@@ -29,7 +29,7 @@ _OBJECTS: dict[str, tuple[Any, dict[str, str]]] = {
 }
 # chosen by the program that loads, or stored otherwise
 _NOT_STORED = {"env", "policy", "device", "verbose"}
-FIXED = ("settling",)  # keywords on which the networks depend, unseen in their shapes
+FIXED = ("settling", "policy_kwargs")  # keywords on which the networks depend, unseen in their shapes
 _ATTRIBUTE_OF = {"stats_window_size": "_stats_window_size"}
 
 
@@ -56,8 +56,8 @@ def read_settings(record: Mapping[str, Any], overrides: Mapping[str, Any]) -> di
     if missing:
         raise ValueError(f"{', '.join(missing)} could not be stored as plain values: pass the same again, {missing[0]}=...")
     for name in FIXED:
-        stored = record["keywords"].get(name)
-        if overrides.get(name, stored) != stored:
+        stored = _read_value(record["keywords"].get(name))
+        if name not in record["unnamed"] and (overrides.get(name, stored) or None) != (stored or None):
             raise ValueError(f"{name}={overrides[name]!r}: what was learned depends on {name}={stored!r}, leave it out")
     keywords = {name: _read_value(value) for name, value in record["keywords"].items() if name not in overrides}
     policy = overrides.get("policy", record["policy"])

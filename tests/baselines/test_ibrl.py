@@ -93,19 +93,33 @@ def test_observations_may_have_several_axes() -> None:
     assert model.learn(8).num_timesteps == 8
 
 
+class Unpaid(gym.RewardWrapper):
+    """The Pendulum without rewards."""
+
+    def __init__(self) -> None:
+        super().__init__(gym.make(ENV))
+
+    def reward(self, reward: Any) -> float:
+        return 0.0
+
+
 def test_one_pair_of_critics_chooses_the_next_action_and_another_values_it() -> None:
     """Of three target critics the first values the actor's action more, the others that of the BC policy. Pairs (0, 1) and
     (1, 2) choose the BC policy's action, of value 1 or 3, pair (0, 2) the actor's, of value 0 or 2. All nine choices of two
     pairs have a mean value of 4/3; if the pair that chooses also valued, it would be 2."""
-    model = make(policy_kwargs={"net_arch": [64], "n_critics": 3}, learning_rate=3e-3, gamma=0.9).learn(8)
+    shown = Demonstrations.record(lambda _: np.zeros(1), Unpaid(), 2)
+    small = {"policy_kwargs": {"net_arch": [16], "n_critics": 3}, "learning_starts": 5, "bc_steps": 5, "buffer_size": 100}
+    model = IBRL("MlpPolicy", Unpaid(), demonstrations=shown, gamma=0.9, batch_size=64, seed=1, **small).learn(8)
     table = th.tensor([[5.0, 1.0], [0.0, 3.0], [2.0, 4.0]])  # (critics, actions)
 
     def values(_: th.Tensor, actions: th.Tensor) -> tuple[th.Tensor, ...]:
         return tuple(critic.repeat_interleave(len(actions) // 2)[:, None] for critic in table)
 
     model.critic_target.forward = values  # type: ignore[method-assign]
-    model.train(800, 32)
-    batch = model.replay_buffer.sample(256)
-    with th.no_grad():
-        learned = th.cat(model.critic(batch.observations, batch.actions), dim=1)
-    assert ((learned - batch.rewards) / 0.9).mean() == pytest.approx(4 / 3, abs=0.2)
+    learned = []
+    for _ in range(10):
+        model.train(100, 64)
+        batch = model.replay_buffer.sample(64)
+        with th.no_grad():
+            learned.append(float(th.cat(model.critic(batch.observations, batch.actions)).mean()))
+    assert np.mean(learned[5:]) / 0.9 == pytest.approx(4 / 3, abs=0.2)

@@ -133,5 +133,5 @@ def test_hindsight_waits_for_the_end_of_an_episode(tmp_path: Path) -> None:
 
 
 def test_hindsight_needs_goals() -> None:
-    with pytest.raises(ValueError, match="RLPD with hindsight needs a goal task"):
+    with pytest.raises(ValueError, match="RLPD: hindsight needs a goal task"):
         make(hindsight=True)

@@ -154,7 +154,10 @@ def test_files_that_do_not_fit_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="was saved without VecNormalize: wrap"):
         ActPC.from_weights(path, VecNormalize(make_vec_env(CountingEnv)))
     with pytest.raises(ValueError, match="does not fit these settings"):
-        ActPC.from_weights(path, make_vec_env(CountingEnv), policy_kwargs={"net_arch": [16, 16], "n_critics": 3})
+        ActPC.from_weights(path, make_vec_env(CountingEnv), guidance="default")
+    with pytest.raises(ValueError, match=r"what was learned depends on policy_kwargs=.*leave it out"):
+        clamped = {"net_arch": [16, 16], "actor_kwargs": {"output_activation": "clamp"}}  # would act otherwise
+        ActPC.from_weights(path, make_vec_env(CountingEnv), policy_kwargs=clamped)
     (tmp_path / "bad.safetensors").write_bytes(path.read_bytes()[:100])
     with pytest.raises(ValueError, match="not a file of save_weights"):
         ActPC.from_weights(tmp_path / "bad.safetensors", make_vec_env(CountingEnv))
