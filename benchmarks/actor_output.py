@@ -4,7 +4,7 @@
     python benchmarks/actor_output.py SparseHalfCheetah-v5 --file demonstrations.npz --seeds 21 22 23
 
 Each network has two hidden layers of 256 units and gets 3,000 updates with batches of 256 steps, drawn uniformly. Local ones
-have a weight decay of 0.1, as ActPC's. Prints for each network the error on the demonstrations as a share of the variance of the
+have a weight decay of 0.1, as ActPC's. Prints for each the error on the demonstrations as a share of the variance of the
 actions, and the mean return of ten episodes from the same start states, seed by seed.
 """
 
