@@ -81,8 +81,33 @@ PRESENT_GATE = {
     "Walker2d": (("actor_return", "return"), 0),
     "Can-10": (("actor_success", "success"), 2),
 }
+# a clamped output of the actor: task -> its name, and the folders of the default output, and of RLPD and BC
+CLAMPED = {
+    "Hopper-303": ("Hopper, suboptimal (selection)", "clamped_output", "clamped_output"),
+    "Walker2d-303": ("Walker2d, suboptimal (selection)", "clamped_output", "clamped_output"),
+    "HalfCheetah-suboptimal": ("HalfCheetah, suboptimal", "checked_baselines", "checked_baselines"),
+    "Walker2d": ("Walker2d, shipped", "present_gate", "steps_10000"),
+}
 # no settings were chosen on them
 REPORTED = ("Hopper-suboptimal", "Walker2d-suboptimal", "Swimmer-suboptimal", "Walker2d", "Hopper-five", "Walker2d-five")
+
+
+def clamped_table() -> list[str]:
+    """Lines of the table of both outputs of the actor, with the same seeds: after BC, and after 10,000 steps."""
+    clamped, rows = load_results(FOLDER / "clamped_output"), []
+    for task, (name, folder, of_others) in CLAMPED.items():
+        default, others = load_results(FOLDER / folder), load_results(FOLDER / of_others)
+        runs = {"clamp": clamped.groups(task)["actpc_clamp"], "tanh": default.groups(task)["actpc"]}
+        seeds = set(runs["clamp"]["seed"])
+        assert seeds == set(runs["tanh"]["seed"]), f"{task}: other seeds"
+        for label, source in (("tanh", default), ("clamp", clamped)):
+            measures = (("return", 0), ("actor_return", 10_000), ("return", 10_000))
+            rows.append([name, f"ActPC, {label}", *(spread(source.at_step(runs[label], *measure)) for measure in measures)])
+        groups = {variant: group[group["seed"].isin(seeds)] for variant, group in others.groups(task).items()}
+        if "rlpd" in groups:
+            rows.append([name, "RLPD", "", spread(others.at_step(groups["rlpd"], "return", 10_000)), ""])
+        rows.append([name, "plain BC", spread(groups["bc"]["return"]), "", ""])
+    return lines_of(["demonstrations", "agent", "BC", "10,000 steps", "10,000 steps, deployed policy"], rows)
 
 
 def spread(values: pd.Series) -> str:
@@ -298,6 +323,7 @@ def tables() -> dict[str, list[str]]:
     found["checked_baselines: HalfCheetah"] = table(checked, "HalfCheetah-suboptimal", SHORT)
     found["checked_baselines: BC"] = bc_table(checked, (short, load_results(FOLDER / "door_50000")))
     found["checked_baselines: entropy"] = entropy_table(checked, short)
+    found["clamped_output"] = clamped_table()
     dense = load_results(FOLDER / "dense_50000")
     for task in DENSE_TASKS:
         found[f"dense_50000: {task}"] = dense_table(dense, task)
