@@ -66,7 +66,7 @@ class DemonstrationReplayBuffer(ReplayBuffer):
 
     def can_sample(self, batch_size: int) -> bool:
         """Whether there are transitions to draw."""
-        return self.n_demonstrated(batch_size) == batch_size or self.size() > 0
+        return self.n_demonstrated(batch_size) == batch_size or self._has_own()
 
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> Any:
         """B transitions: those of the agent, then those of the demonstrations; ``env`` as SB3's."""
@@ -77,6 +77,9 @@ class DemonstrationReplayBuffer(ReplayBuffer):
         if n_demonstrated == batch_size:
             return demonstrated
         return join_batches(self._sample_own(batch_size - n_demonstrated, env), demonstrated)
+
+    def _has_own(self) -> bool:
+        return self.size() > 0
 
     def _sample_own(self, batch_size: int, env: VecNormalize | None) -> Any:
         return super().sample(batch_size, env)
@@ -105,9 +108,8 @@ class DemonstrationHerReplayBuffer(DemonstrationReplayBuffer, HerReplayBuffer):
         if isinstance(self.demonstrated, HerReplayBuffer):
             self.demonstrated.set_env(env)
 
-    def can_sample(self, batch_size: int) -> bool:
-        """Not before the first episode has ended, as its goals come from there, unless the whole batch is demonstrated."""
-        return self.n_demonstrated(batch_size) == batch_size or bool(self.ep_length.any())
+    def _has_own(self) -> bool:
+        return bool(self.ep_length.any())  # goals come from episodes that have ended
 
     def cut_running_episodes(self) -> None:
         """As :meth:`DemonstrationReplayBuffer.cut_running_episodes`."""
