@@ -1,4 +1,6 @@
-"""Tables and figures of docs/results.md, from the evaluations in docs/results_data: ``python docs/result_tables.py``."""
+"""Tables and figures of docs/results.md and docs/results_details.md, from the evaluations in docs/results_data:
+``python docs/result_tables.py``.
+"""
 
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -41,20 +43,28 @@ NAMES = {
     "Walker2d-five": "Walker2d, five demonstrations",
     "SparseReacher-v5": "Reacher, shipped demonstrations",
 }
-# the other baselines: name -> variant, in a folder of their own, with fewer seeds
+# baselines at their present settings, same demonstrations and seeds: name -> variant and the column of its return
+COMPARED = {
+    **POLICIES,
+    "ActPC, clamped output, moving average": ("clamp", "actor_return"),
+    "ActPC, clamped output, deployed policy": ("clamp", "return"),
+    "IBRL": ("ibrl", "return"),
+    "TD3+BC": ("td3_bc", "return"),
+    "DDPG-Demo": ("ddpg_demo", "return"),
+    "plain BC": ("bc", "return"),
+    "plain BC, no early stopping": ("bc_all", "return"),
+}
+COMPARED_TASKS = ("Hopper-suboptimal", "Walker2d-suboptimal")
+# further baselines on the demonstrations of steps_10000, in a folder of their own, with fewer seeds: name -> variant
 OTHERS = {
     "ActPC without the gate": "no_gate",
     "imitation only": "imitation_only",
     "RLPD, ten critics, ten updates per step": "rlpd_utd10",
     "IBRL": "ibrl",
     "TD3+BC": "td3_bc",
-    "TD3+BC, stronger cloning, one update per step": "td3_bc_strong",
-    "DDPG-Demo": "ddpg_demo",
     "LOGO": "logo",
     "BC-RNN": "bc_rnn",
 }
-CLONE_FIRST = ("ibrl", "td3_bc_strong", "ddpg_demo")
-CLONED_LATER = ("Hopper-suboptimal", "Walker2d-suboptimal")  # there these were evaluated at step 0 before their BC
 # dense rewards without demonstrations: name of a row -> variant
 DENSE = {"ActPC, `n_steps=3`": "actpc", "TD3": "TD3", "SAC": "SAC"}
 DENSE_TASKS = ("HalfCheetah-v5", "Hopper-v5")
@@ -133,6 +143,39 @@ def table(results: Results, task: str, steps: Sequence[int]) -> list[str]:
     return lines_of(["steps", *(f"{step:,}" for step in steps)], rows)
 
 
+def compared_table(results: Results, task: str) -> list[str]:
+    """Lines of the table of all baselines on a task: returns at the steps, over seeds; BC has a single evaluation."""
+    rows = []
+    for policy, (variant, measure) in COMPARED.items():
+        runs = runs_of(results, task, variant)
+        if not len(runs):
+            continue
+        if variant in ("bc", "bc_all"):
+            cells = [spread(runs["return"]), *[""] * (len(SHORT) - 1)]
+        else:
+            cells = [spread(results.at_step(runs, measure, step)) for step in SHORT]
+        rows.append([policy, str(len(runs)), *cells])
+    return lines_of(["steps", "seeds", *(f"{step:,}" for step in SHORT)], rows)
+
+
+def over_each_table(results: Results) -> list[str]:
+    """Lines of the table of probabilities that ActPC has a higher return than each baseline after 10,000 steps."""
+
+    def last(variant: str, measure: str) -> list[np.ndarray]:
+        groups = [runs_of(results, task, variant) for task in COMPARED_TASKS]
+        if variant in ("bc", "bc_all"):
+            return [runs[measure].to_numpy() for runs in groups]
+        return [results.at_step(runs, measure, SHORT[-1]).to_numpy() for runs in groups]
+
+    own = [last(*POLICIES[policy]) for policy in list(POLICIES)[:2]]
+    rows = []
+    for policy, (variant, measure) in COMPARED.items():
+        if variant not in ("actpc", "clamp") and all(len(runs_of(results, task, variant)) for task in COMPARED_TASKS):
+            found = [probability_of_improvement(scores, last(variant, measure)) for scores in own]
+            rows.append([policy, *(f"{value:.2f} ({low:.2f} to {high:.2f})" for value, low, high in found)])
+    return lines_of(["over", *list(POLICIES)[:2]], rows)
+
+
 def others_table(others: Results, short: Results, task: str) -> list[str]:
     """Lines of the table of the other baselines, and of ActPC, RLPD and BC with the same seeds."""
     groups = others.groups(task)
@@ -150,7 +193,6 @@ def others_table(others: Results, short: Results, task: str) -> list[str]:
             cells = [spread(groups[variant]["return"]), *[""] * (len(steps) - 1)]
         else:
             cells = [spread(others.at_step(groups[variant], "return", step)) for step in steps]
-            cells[0] = "" if variant in CLONE_FIRST and task in CLONED_LATER else cells[0]
         rows.append([policy, str(len(groups[variant])), *cells])
     cloned = short.groups(task)["bc"]
     cloned = cloned[cloned["seed"].isin(seeds)]
@@ -316,6 +358,10 @@ def tables() -> dict[str, list[str]]:
         reported = [task for task in REPORTED if task in tasks]
         steps = [step for step in tasks[reported[0]] if step]
         found[f"{folder}: probability of improvement"] = improvement_table(results, steps, reported)
+    compared = load_results(FOLDER / "compared_10000")
+    for task in COMPARED_TASKS:
+        found[f"compared_10000: {task}"] = compared_table(compared, task)
+    found["compared_10000: probability of improvement"] = over_each_table(compared)
     others, short = load_results(FOLDER / "baselines_10000"), load_results(FOLDER / "steps_10000")
     for task in others.finished["task"].unique():
         found[f"baselines_10000: {task}"] = others_table(others, short, task)
