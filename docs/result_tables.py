@@ -54,6 +54,7 @@ COMPARED = {
     "plain BC": ("bc", "return"),
     "plain BC, no early stopping": ("bc_all", "return"),
 }
+OFFLINE = ("bc", "bc_all", "bc_rnn")  # variants without RL
 COMPARED_TASKS = ("Hopper-suboptimal", "Walker2d-suboptimal")
 # further baselines on the demonstrations of steps_10000, in a folder of their own, with fewer seeds: name -> variant
 OTHERS = {
@@ -132,14 +133,20 @@ def lines_of(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]
     return markdown(pd.DataFrame(rows, columns=columns)).splitlines()
 
 
+def cells(results: Results, runs: pd.DataFrame, measure: str, steps: Sequence[int]) -> list[str]:
+    """What runs of a variant reached at the steps, over seeds; without RL a single evaluation stands for all steps."""
+    if runs["variant"].isin(OFFLINE).all():
+        return [spread(runs[measure]), *[""] * (len(steps) - 1)]
+    return [spread(results.at_step(runs, measure, step)) for step in steps]
+
+
 def table(results: Results, task: str, steps: Sequence[int]) -> list[str]:
     """Lines of the table of a task: returns at the steps, over seeds; BC has a single evaluation."""
     groups = results.groups(task)
     rows = [
-        [policy, *(spread(results.at_step(groups[variant], measure, step)) for step in steps)]
-        for policy, (variant, measure) in POLICIES.items()
+        [policy, *cells(results, groups[variant], measure, steps)]
+        for policy, (variant, measure) in {**POLICIES, "plain BC": ("bc", "return")}.items()
     ]
-    rows.append(["plain BC", spread(groups["bc"]["return"]), *[""] * (len(steps) - 1)])
     return lines_of(["steps", *(f"{step:,}" for step in steps)], rows)
 
 
@@ -148,13 +155,7 @@ def compared_table(results: Results, task: str) -> list[str]:
     rows = []
     for policy, (variant, measure) in COMPARED.items():
         runs = runs_of(results, task, variant)
-        if not len(runs):
-            continue
-        if variant in ("bc", "bc_all"):
-            cells = [spread(runs["return"]), *[""] * (len(SHORT) - 1)]
-        else:
-            cells = [spread(results.at_step(runs, measure, step)) for step in SHORT]
-        rows.append([policy, str(len(runs)), *cells])
+        rows.append([policy, str(len(runs)), *cells(results, runs, measure, SHORT)])
     return lines_of(["steps", "seeds", *(f"{step:,}" for step in SHORT)], rows)
 
 
@@ -163,14 +164,14 @@ def over_each_table(results: Results) -> list[str]:
 
     def last(variant: str, measure: str) -> list[np.ndarray]:
         groups = [runs_of(results, task, variant) for task in COMPARED_TASKS]
-        if variant in ("bc", "bc_all"):
+        if variant in OFFLINE:
             return [runs[measure].to_numpy() for runs in groups]
         return [results.at_step(runs, measure, SHORT[-1]).to_numpy() for runs in groups]
 
     own = [last(*POLICIES[policy]) for policy in list(POLICIES)[:2]]
     rows = []
     for policy, (variant, measure) in COMPARED.items():
-        if variant not in ("actpc", "clamp") and all(len(runs_of(results, task, variant)) for task in COMPARED_TASKS):
+        if variant not in ("actpc", "clamp"):
             found = [probability_of_improvement(scores, last(variant, measure)) for scores in own]
             rows.append([policy, *(f"{value:.2f} ({low:.2f} to {high:.2f})" for value, low, high in found)])
     return lines_of(["over", *list(POLICIES)[:2]], rows)
@@ -182,21 +183,14 @@ def others_table(others: Results, short: Results, task: str) -> list[str]:
     steps = STEPS["steps_10000"][task]
     seeds = {seed for runs in groups.values() for seed in runs["seed"]}
     rows = []
-    for policy, (variant, measure) in POLICIES.items():
+    same = {**POLICIES, "plain BC": ("bc", "return")}
+    for policy, (variant, measure) in same.items():
         runs = short.groups(task)[variant]
         runs = runs[runs["seed"].isin(seeds)]
-        rows.append([policy, str(len(runs)), *(spread(short.at_step(runs, measure, step)) for step in steps)])
+        rows.append([policy, str(len(runs)), *cells(short, runs, measure, steps)])
     for policy, variant in OTHERS.items():
-        if variant not in groups:
-            continue
-        if variant == "bc_rnn":
-            cells = [spread(groups[variant]["return"]), *[""] * (len(steps) - 1)]
-        else:
-            cells = [spread(others.at_step(groups[variant], "return", step)) for step in steps]
-        rows.append([policy, str(len(groups[variant])), *cells])
-    cloned = short.groups(task)["bc"]
-    cloned = cloned[cloned["seed"].isin(seeds)]
-    rows.append(["plain BC", str(len(cloned)), spread(cloned["return"]), *[""] * (len(steps) - 1)])
+        if variant in groups:
+            rows.insert(-1, [policy, str(len(groups[variant])), *cells(others, groups[variant], "return", steps)])
     return lines_of(["steps", "seeds", *(f"{step:,}" for step in steps)], rows)
 
 
