@@ -90,7 +90,7 @@ class PolicySelection:
             if actor_differs:
                 self.exploration_returns = [*self.exploration_returns, episode_return][-self.budget :]
             n = min(len(self.exploration_returns), len(self.incumbent_returns))
-            if not self.support and n >= self.min_episodes and self._exceed(self.exploration_returns, self.promote_supported):
+            if not self.support and n and self._exceed(self.exploration_returns, self.promote_supported):
                 self.support = self.exploration_returns
                 self.has_challenger = False  # an older copy makes room
             return None

@@ -88,6 +88,19 @@ def test_one_evaluation_episode_confirms_an_average_with_far_better_exploration_
     assert selection.incumbent_returns == ([80.0] if expected == "promoted" else [30.0, 31.0])
 
 
+@pytest.mark.parametrize(("of_average", "begins"), [(200.0, True), (60.0, False)])
+def test_one_exploration_episode_is_enough_if_it_is_far_better(of_average, begins):
+    """An older copy, of which one evaluation episode is known, makes room."""
+    selection = PolicySelection(
+        1, incumbent_returns=[30.0, 31.0], challenger_returns=[40.0], has_challenger=True, worst=10.0, share=1.0
+    )
+    selection.step(0, of_average, True)
+    selection.end_episode(0, True)
+    assert selection.begin_episode(0, True) == begins
+    selection.step(0, of_average, True)
+    assert (selection.end_episode(0, False) == "promoted") == begins
+
+
 def test_a_part_of_an_episode_has_no_return():
     selection = PolicySelection(1)
     selection.step(0, 1.0, False)
