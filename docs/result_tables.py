@@ -270,19 +270,26 @@ def many_updates_table(results: Results) -> list[str]:
     return lines_of(["steps", *(f"{step:,}" for step in steps)], rows)
 
 
-def improvement(results: Results, policy: str, step: int, tasks: Sequence[str]) -> str:
-    """Probability that a policy has a higher return than RLPD, and its 95 % interval."""
-    variant, measure = POLICIES[policy]
-    own = [results.at_step(results.groups(task)[variant], measure, step).to_numpy() for task in tasks]
-    theirs = [results.at_step(results.groups(task)["rlpd"], "return", step).to_numpy() for task in tasks]
-    value, low, high = probability_of_improvement(own, theirs)
-    return f"{value:.2f} ({low:.2f} to {high:.2f})"
+def improvement_table(reported: Sequence[tuple[Results, str]], steps: Sequence[int]) -> list[str]:
+    """Lines of the table of probabilities that ActPC has a higher return than RLPD and plain BC, over tasks, each with the
+    results that have it; with 95 % intervals."""
 
+    def returns(variant: str, measure: str, step: int) -> list[np.ndarray]:
+        groups = [(results, results.groups(task)[variant]) for results, task in reported]
+        if variant in OFFLINE:
+            return [runs[measure].to_numpy() for _, runs in groups]
+        return [results.at_step(runs, measure, step).to_numpy() for results, runs in groups]
 
-def improvement_table(results: Results, steps: Sequence[int], tasks: Sequence[str]) -> list[str]:
-    """Lines of the table of probabilities that ActPC has a higher return than RLPD."""
-    rows = [[policy, *(improvement(results, policy, step, tasks) for step in steps)] for policy in list(POLICIES)[:2]]
-    return lines_of(["over RLPD after", *(f"{step:,}" for step in steps)], rows)
+    def cell(policy: str, variant: str, step: int) -> str:
+        value, low, high = probability_of_improvement(returns(*POLICIES[policy], step), returns(variant, "return", step))
+        return f"{value:.2f} ({low:.2f} to {high:.2f})"
+
+    rows = [
+        [f"{policy.removeprefix('ActPC, ')}, over {name}", *(cell(policy, variant, step) for step in steps)]
+        for name, variant in (("RLPD", "rlpd"), ("plain BC", "bc"))
+        for policy in list(POLICIES)[:2]
+    ]
+    return lines_of(["ActPC after", *(f"{step:,}" for step in steps)], rows)
 
 
 def first_times(results: Results, tasks: Iterable[str]) -> list[str]:
@@ -344,14 +351,17 @@ def summary(short: Results, long: Results) -> list[str]:
 def tables() -> dict[str, list[str]]:
     """What it shows -> the lines of every table of the page."""
     found = {}
+    checked = load_results(FOLDER / "checked_baselines")
     for folder, tasks in STEPS.items():
         results = load_results(FOLDER / folder)
         for task, steps in tasks.items():
             found[f"{folder}: {task}"] = table(results, task, steps)
         found[f"{folder}: 90 % of the best return"] = first_times(results, tasks)
-        reported = [task for task in REPORTED if task in tasks]
-        steps = [step for step in tasks[reported[0]] if step]
-        found[f"{folder}: probability of improvement"] = improvement_table(results, steps, reported)
+        reported = [(results, task) for task in REPORTED if task in tasks]
+        if folder == "steps_10000":
+            reported.append((checked, "HalfCheetah-suboptimal"))
+        steps = SHORT if folder == "steps_10000" else LONG
+        found[f"{folder}: probability of improvement"] = improvement_table(reported, steps[1:])
     compared = load_results(FOLDER / "compared_10000")
     for task in COMPARED_TASKS:
         found[f"compared_10000: {task}"] = compared_table(compared, task)
@@ -359,7 +369,6 @@ def tables() -> dict[str, list[str]]:
     others, short = load_results(FOLDER / "baselines_10000"), load_results(FOLDER / "steps_10000")
     for task in others.finished["task"].unique():
         found[f"baselines_10000: {task}"] = others_table(others, short, task)
-    checked = load_results(FOLDER / "checked_baselines")
     found["checked_baselines: HalfCheetah"] = table(checked, "HalfCheetah-suboptimal", SHORT)
     found["checked_baselines: BC"] = bc_table(checked, (short, load_results(FOLDER / "door_50000")))
     found["checked_baselines: entropy"] = entropy_table(checked, short)
