@@ -46,14 +46,13 @@ NAMES = {
 # baselines at their present settings, same demonstrations and seeds: name -> variant and the column of its return
 COMPARED = {
     **POLICIES,
-    "ActPC, clamped output, moving average": ("clamp", "actor_return"),
-    "ActPC, clamped output, deployed policy": ("clamp", "return"),
     "IBRL": ("ibrl", "return"),
     "TD3+BC": ("td3_bc", "return"),
     "DDPG-Demo": ("ddpg_demo", "return"),
     "plain BC": ("bc", "return"),
     "plain BC, no early stopping": ("bc_all", "return"),
 }
+MAIN_BASELINES = {"RLPD": "rlpd", "plain BC": "bc"}
 OFFLINE = ("bc", "bc_all", "bc_rnn")  # variants without RL
 COMPARED_TASKS = ("Hopper-suboptimal", "Walker2d-suboptimal")
 # further baselines on the demonstrations of steps_10000, in a folder of their own, with fewer seeds: name -> variant
@@ -86,10 +85,12 @@ DOOR = {
     "no critic term, deployed policy": ("imitation", "return"),
     "RLPD": ("rlpd", "return"),
 }
-# runs with the present gate: task -> the columns of moving average and deployed policy, and digits
-PRESENT_GATE = {
+# the gate with two exploration episodes and with one: task -> the columns of moving average and deployed policy, and digits
+GATES = {"two": "actpc", "one": "actpc_one"}
+GATE_TASKS = {
     "SparseReacher-v5": (("actor_return", "return"), 0),
     "Walker2d": (("actor_return", "return"), 0),
+    "HalfCheetah-suboptimal": (("actor_return", "return"), 0),
     "Can-10": (("actor_success", "success"), 2),
 }
 # a clamped output of the actor: task -> its name, and the folders of the default output, and of RLPD and BC
@@ -97,7 +98,7 @@ CLAMPED = {
     "Hopper-303": ("Hopper, suboptimal (selection)", "clamped_output", "clamped_output"),
     "Walker2d-303": ("Walker2d, suboptimal (selection)", "clamped_output", "clamped_output"),
     "HalfCheetah-suboptimal": ("HalfCheetah, suboptimal", "checked_baselines", "checked_baselines"),
-    "Walker2d": ("Walker2d, shipped", "present_gate", "steps_10000"),
+    "Walker2d": ("Walker2d, shipped", "gates", "steps_10000"),
 }
 # no settings were chosen on them
 REPORTED = ("Hopper-suboptimal", "Walker2d-suboptimal", "Swimmer-suboptimal", "Walker2d", "Hopper-five", "Walker2d-five")
@@ -159,24 +160,6 @@ def compared_table(results: Results, task: str) -> list[str]:
     return lines_of(["steps", "seeds", *(f"{step:,}" for step in SHORT)], rows)
 
 
-def over_each_table(results: Results) -> list[str]:
-    """Lines of the table of probabilities that ActPC has a higher return than each baseline after 10,000 steps."""
-
-    def last(variant: str, measure: str) -> list[np.ndarray]:
-        groups = [runs_of(results, task, variant) for task in COMPARED_TASKS]
-        if variant in OFFLINE:
-            return [runs[measure].to_numpy() for runs in groups]
-        return [results.at_step(runs, measure, SHORT[-1]).to_numpy() for runs in groups]
-
-    own = [last(*POLICIES[policy]) for policy in list(POLICIES)[:2]]
-    rows = []
-    for policy, (variant, measure) in COMPARED.items():
-        if variant not in ("actpc", "clamp"):
-            found = [probability_of_improvement(scores, last(variant, measure)) for scores in own]
-            rows.append([policy, *(f"{value:.2f} ({low:.2f} to {high:.2f})" for value, low, high in found)])
-    return lines_of(["over", *list(POLICIES)[:2]], rows)
-
-
 def others_table(others: Results, short: Results, task: str) -> list[str]:
     """Lines of the table of the other baselines, and of ActPC, RLPD and BC with the same seeds."""
     groups = others.groups(task)
@@ -215,16 +198,18 @@ def success_table(results: Results, task: str, policies: Mapping[str, tuple[str,
     return lines_of(["steps", *(f"{step:,}" for step in steps)], rows)
 
 
-def gate_table(results: Results) -> list[str]:
-    """Lines of the table of runs with the present gate: the policy after BC, and average and deployed policy at the end."""
+def gate_table(gates: Results, checked: Results) -> list[str]:
+    """Lines of the table of both gates: the policy after BC, and average and deployed policy at the end, every seed."""
     rows = []
-    for task, ((average, deployed), digits) in PRESENT_GATE.items():
-        runs = runs_of(results, task, "actpc")
-        last = int(runs["steps"].iloc[0])
-        at = ((deployed, 0), (average, last), (deployed, last))
-        cells = [listed(results.at_step(runs, column, step), digits) for column, step in at]
-        rows.append([task, ", ".join(str(seed) for seed in runs["seed"]), f"{last:,}", *cells])
-    return lines_of(["task", "seeds", "steps", "after BC", "moving average", "deployed policy"], rows)
+    for task, ((average, deployed), digits) in GATE_TASKS.items():
+        for episodes, variant in GATES.items():
+            found = [(results, runs_of(results, task, variant)) for results in (gates, checked)]
+            for results, runs in (pair for pair in found if len(pair[1])):
+                last = int(runs["steps"].iloc[0])
+                at = ((deployed, 0), (average, last), (deployed, last))
+                cells = [listed(results.at_step(runs, column, step), digits) for column, step in at]
+                rows.append([task, episodes, ", ".join(str(seed) for seed in runs["seed"]), f"{last:,}", *cells])
+    return lines_of(["task", "exploration episodes", "seeds", "steps", "after BC", "moving average", "deployed policy"], rows)
 
 
 def bc_table(checked: Results, folders: Sequence[Results]) -> list[str]:
@@ -270,12 +255,14 @@ def many_updates_table(results: Results) -> list[str]:
     return lines_of(["steps", *(f"{step:,}" for step in steps)], rows)
 
 
-def improvement_table(reported: Sequence[tuple[Results, str]], steps: Sequence[int]) -> list[str]:
-    """Lines of the table of probabilities that ActPC has a higher return than RLPD and plain BC, over tasks, each with the
-    results that have it; with 95 % intervals."""
+def improvement_table(
+    reported: Sequence[tuple[Results, str]], steps: Sequence[int], baselines: Mapping[str, str] = MAIN_BASELINES
+) -> list[str]:
+    """Lines of the table of probabilities that ActPC has a higher return than the baselines, over tasks, each with the results
+    that have it; with 95 % intervals."""
 
     def returns(variant: str, measure: str, step: int) -> list[np.ndarray]:
-        groups = [(results, results.groups(task)[variant]) for results, task in reported]
+        groups = [(results, runs_of(results, task, variant)) for results, task in reported]
         if variant in OFFLINE:
             return [runs[measure].to_numpy() for _, runs in groups]
         return [results.at_step(runs, measure, step).to_numpy() for results, runs in groups]
@@ -286,7 +273,7 @@ def improvement_table(reported: Sequence[tuple[Results, str]], steps: Sequence[i
 
     rows = [
         [f"{policy.removeprefix('ActPC, ')}, over {name}", *(cell(policy, variant, step) for step in steps)]
-        for name, variant in (("RLPD", "rlpd"), ("plain BC", "bc"))
+        for name, variant in baselines.items()
         for policy in list(POLICIES)[:2]
     ]
     return lines_of(["ActPC after", *(f"{step:,}" for step in steps)], rows)
@@ -365,7 +352,9 @@ def tables() -> dict[str, list[str]]:
     compared = load_results(FOLDER / "compared_10000")
     for task in COMPARED_TASKS:
         found[f"compared_10000: {task}"] = compared_table(compared, task)
-    found["compared_10000: probability of improvement"] = over_each_table(compared)
+    baselines = {name: variant for name, (variant, _) in COMPARED.items() if variant != "actpc"}
+    both = [(compared, task) for task in COMPARED_TASKS]
+    found["compared_10000: probability of improvement"] = improvement_table(both, SHORT[1:], baselines)
     others, short = load_results(FOLDER / "baselines_10000"), load_results(FOLDER / "steps_10000")
     for task in others.finished["task"].unique():
         found[f"baselines_10000: {task}"] = others_table(others, short, task)
@@ -382,7 +371,7 @@ def tables() -> dict[str, list[str]]:
         found[f"fetch_20000: {task}"] = success_table(fetch, task, FETCH, FETCH_STEPS)
     found["door_50000"] = success_table(load_results(FOLDER / "door_50000"), "door", DOOR, LONG)
     found["can_40000"] = success_table(load_results(FOLDER / "can_40000"), "Can-10", POLICIES, LONG[:-1])
-    found["present_gate"] = gate_table(load_results(FOLDER / "present_gate"))
+    found["gates"] = gate_table(load_results(FOLDER / "gates"), checked)
     long_runs = load_results(FOLDER / "steps_50000")
     found["steps_50000: steadiness"] = steadiness(long_runs, STEPS["steps_50000"], 15_000, 700)
     found["summary"] = summary(*(load_results(FOLDER / folder) for folder in STEPS))
