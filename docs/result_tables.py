@@ -371,6 +371,7 @@ def tables() -> dict[str, list[str]]:
         found[f"fetch_20000: {task}"] = success_table(fetch, task, FETCH, FETCH_STEPS)
     found["door_50000"] = success_table(load_results(FOLDER / "door_50000"), "door", DOOR, LONG)
     found["can_40000"] = success_table(load_results(FOLDER / "can_40000"), "Can-10", POLICIES, LONG[:-1])
+    found["forward_10000"] = table(load_results(FOLDER / "forward_10000"), "HalfCheetah-forward", SHORT)
     found["gates"] = gate_table(load_results(FOLDER / "gates"), checked)
     long_runs = load_results(FOLDER / "steps_50000")
     found["steps_50000: steadiness"] = steadiness(long_runs, STEPS["steps_50000"], 15_000, 700)
