@@ -1,8 +1,10 @@
 """From tasks, algorithms and seeds to a list of runs, each with an id made from its content and a folder of its own. Tasks and
 variants (named ways of running an algorithm) are parts of a :class:`~sb3_actpc.experiments.runs.Run`."""
 
+import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import closing
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -89,6 +91,8 @@ def plan_runs(comparison: Comparison, folder: Path | None = None) -> list[Run]:
     task is unknown."""
     folder = Path(comparison.output) if folder is None else folder
     filled = [_fill(comparison.shared, task, variant) for task in comparison.tasks for variant in comparison.variants]
+    for name, runs in groupby(filled, key=lambda run: run.task):
+        _warn_of_other_environments(str(name), list(runs))
     seeds = range(comparison.first_seed, comparison.first_seed + comparison.seeds)
     seeded = [run.model_copy(update={"seed": seed}) for seed in seeds for run in filled]
     own = [folder / folder_name(str(run.task)) / str(run.name) / f"seed{run.seed}_{run.id}" for run in seeded]
@@ -112,6 +116,17 @@ def _fill(shared: Run, task: Run, variant: Run) -> Run:
         return run
     except (ValueError, FileNotFoundError) as error:
         raise type(error)(f"{run.task}, {variant.name}: {error}") from error
+
+
+def _warn_of_other_environments(task: str, runs: Sequence[Run]) -> None:
+    """A preset can have keywords of its own for the environment; the returns of its variant then do not compare."""
+    if any(run.env_kwargs != runs[0].env_kwargs for run in runs):
+        given = ", ".join(f"{run.name} {run.env_kwargs}" for run in runs)
+        warnings.warn(
+            f"{task}: presets give the environment different keywords, so returns may not compare: {given}. "
+            f"env_kwargs in the entry of {task} make them equal",
+            stacklevel=3,
+        )
 
 
 def _list(given: dict[str, Any], name: str) -> list[Any]:

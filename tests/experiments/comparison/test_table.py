@@ -1,6 +1,7 @@
 """From names to a table of runs: ids, variants, the file, mistakes."""
 
 import re
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -51,6 +52,19 @@ def test_an_id_follows_the_content_of_a_run_and_nothing_else() -> None:
         plan(steps=500, seeds=2)[1:],
     ]
     assert len({run.id, *(other[0].id for other in others)}) == 1 + len(others)
+
+
+def test_variants_with_other_environments_warn_until_the_task_says_which() -> None:
+    """The preset of the paper's agent rewards forward motion on this task, the default distance."""
+    algos = ["actpc", "actpc_faithful"]
+    with pytest.warns(UserWarning, match=r"SparseHopper-v5: .*actpc \{\}, actpc_faithful \{'condition': 'forward'"):
+        plan(envs=["SparseHopper-v5"], algos=algos)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        equal = plan(
+            envs=[{"env": "SparseHopper-v5", "env_kwargs": {"condition": "displacement", "threshold": None}}], algos=algos
+        )
+    assert equal[0].env_kwargs == equal[1].env_kwargs
 
 
 def test_a_file_says_the_same_as_the_options(capsys: pytest.CaptureFixture[str]) -> None:
