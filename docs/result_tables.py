@@ -49,6 +49,7 @@ COMPARED = {
     "IBRL": ("ibrl", "return"),
     "TD3+BC": ("td3_bc", "return"),
     "DDPG-Demo": ("ddpg_demo", "return"),
+    "`actpc_faithful`": ("actpc_faithful", "return"),
     "plain BC": ("bc", "return"),
     "plain BC, no early stopping": ("bc_all", "return"),
 }
