@@ -204,12 +204,14 @@ def gate_table(gates: Results, checked: Results) -> list[str]:
     rows = []
     for task, ((average, deployed), digits) in GATE_TASKS.items():
         for episodes, variant in GATES.items():
-            found = [(results, runs_of(results, task, variant)) for results in (gates, checked)]
-            for results, runs in (pair for pair in found if len(pair[1])):
-                last = int(runs["steps"].iloc[0])
-                at = ((deployed, 0), (average, last), (deployed, last))
-                cells = [listed(results.at_step(runs, column, step), digits) for column, step in at]
-                rows.append([task, episodes, ", ".join(str(seed) for seed in runs["seed"]), f"{last:,}", *cells])
+            results = gates if len(runs_of(gates, task, variant)) else checked
+            runs = runs_of(results, task, variant)
+            if runs.empty:
+                continue
+            last = int(runs["steps"].iloc[0])
+            at = ((deployed, 0), (average, last), (deployed, last))
+            cells = [listed(results.at_step(runs, column, step), digits) for column, step in at]
+            rows.append([task, episodes, ", ".join(str(seed) for seed in runs["seed"]), f"{last:,}", *cells])
     return lines_of(["task", "exploration episodes", "seeds", "steps", "after BC", "moving average", "deployed policy"], rows)
 
 
